@@ -1,0 +1,40 @@
+# Everything a newcomer needs: `make demo` and `make test`. Each verb installs what it needs into .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+JOBS ?= 2
+
+.PHONY: help install demo test test-slow check format browser extras clean
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info < (3, 14) else "graspd needs Python 3.11, 3.12 or 3.13: make PYTHON=python3.12 ...")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+install: $(STAMP) ## .venv with graspd and its tools
+
+demo: $(STAMP) ## the main job on built-in data: grasps, scenes, pictures
+	$(BIN)/graspd demo --out demo-out
+
+test: $(STAMP) ## the tests (under 20 minutes on 2 cores)
+	$(BIN)/python -m pytest -n $(JOBS)
+
+test-slow: $(STAMP) ## the long accuracy and soak runs
+	$(BIN)/python -m pytest -m slow
+
+check: $(STAMP) ## format, lint, types, import contract
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP) ## rewrite the sources in the house style
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean: ## what the verbs above made
+	rm -rf $(VENV) build dist demo-out *.egg-info

@@ -1,0 +1,123 @@
+"""Hands and objects as the service keeps them: immutable archives in the store, and the built-in ones on disk.
+
+An archive is a ZIP made reproducibly: names sorted, fixed time stamps, no compression of attributes that vary.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from importlib import resources
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from service.digests import digest_files
+from service.domain import Asset, AssetKind
+from service.errors import InputError, LimitError, NotFoundError
+
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+#: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
+_BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
+MAX_FILES: Final = 2000
+
+
+def pack(files: dict[str, bytes]) -> bytes:
+    """ZIP of named files; equal files give equal bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        for name in sorted(files):
+            archive.writestr(zipfile.ZipInfo(check_path(name), _EPOCH), files[name], zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
+    """Files of a ZIP in memory; nothing is ever written where a name in the archive says.
+
+    Raises:
+        InputError: not a ZIP, encrypted, or a name that leaves the archive.
+        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+    except zipfile.BadZipFile:
+        raise InputError("the archive is not a readable ZIP file; zip the folder again") from None
+    entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+    if len(entries) > MAX_FILES:
+        raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
+    files: dict[str, bytes] = {}
+    total = 0
+    for entry in entries:
+        name = check_path(entry.filename)
+        if (entry.external_attr >> 16) & 0o170000 == 0o120000:
+            raise InputError(f"the archive entry {name!r} is a symbolic link; pack the file itself")
+        if entry.flag_bits & 1:
+            raise InputError(f"the archive entry {name!r} is encrypted; pack it without a password")
+        # The header's size may lie: read one byte past what is left of the limit and no further.
+        with archive.open(entry) as stream:
+            content = stream.read(limit_bytes - total + 1)
+        total += len(content)
+        if total > limit_bytes:
+            raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
+        files[name] = content
+    return files
+
+
+def check_path(name: str) -> str:
+    """The name itself, if it stays inside its folder; InputError otherwise."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    if not name or path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name:
+        raise InputError(f"the file name {name!r} leaves its folder; use plain relative names")
+    return str(path)
+
+
+def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
+    """Files of a built-in hand (`asset.json`, URDF) or object (`asset.json`, mesh).
+
+    Raises:
+        NotFoundError: no such built-in.
+    """
+    folder = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s" / name
+    if not (folder / "asset.json").is_file():
+        known = ", ".join(builtin_names(kind))
+        raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {known}")
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def builtin_names(kind: AssetKind) -> tuple[str, ...]:
+    """Names of the built-in hands or objects."""
+    root = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s"
+    return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
+
+
+def describe(kind: AssetKind, name: str, files: dict[str, bytes], *, created: str, builtin: bool = False) -> Asset:
+    """The asset record of a set of files with an `asset.json` that names the main file under `file`.
+
+    `asset.json` of a hand may also hold palm, approach, preshape, couplings, ...; of an object units and density.
+    """
+    try:
+        description = json.loads(files["asset.json"])
+        main = str(description["file"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{kind.value} {name!r}: asset.json must be a JSON object that names the main file") from None
+    if main not in files:
+        raise InputError(f"{kind.value} {name!r}: the main file {main!r} is not among its files")
+    return Asset(
+        kind=kind,
+        name=name,
+        digest=digest_files(kind, files),
+        filename=main,
+        files=tuple(sorted(files)),
+        size_bytes=sum(map(len, files.values())),
+        created=created,
+        builtin=builtin,
+        facts=description.get("facts", {}),
+    )
+
+
+def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:
+    """A built-in hand or object with its files."""
+    files = builtin_files(kind, name)
+    return describe(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files

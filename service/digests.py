@@ -1,0 +1,76 @@
+"""Content addresses: the digest of a result follows from its inputs alone, so a task run twice names one object."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+
+from service.domain import AssetKind, JobRequest, Stage
+from service.version import STAGE_REVISIONS
+
+
+def digest_bytes(data: bytes) -> str:
+    """First 32 hexadecimal digits of the SHA-256 of `data`."""
+    return hashlib.sha256(data).hexdigest()[:32]
+
+
+def digest_json(value: object) -> str:
+    """Digest of a JSON value in canonical form: sorted keys, no spaces, shortest round-trip floats."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
+    return digest_bytes(text.encode())
+
+
+def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
+    """Digest of a set of named files; independent of their order."""
+    return digest_json({"kind": kind, "files": {name: digest_bytes(data) for name, data in files.items()}})
+
+
+def shard_id(
+    stage: Stage,
+    *,
+    request: JobRequest,
+    hand_digest: str,
+    object_digest: str,
+    batch: int,
+    count: int,
+    inputs: Iterable[str] = (),
+) -> str:
+    """Address of the shard that a stage makes of its inputs.
+
+    Only what moves the result enters: scenes do not change the grasps, views do not change the scenes.
+    """
+    inputs_of: dict[str, object] = {
+        "stage": stage,
+        "revision": STAGE_REVISIONS[stage],
+        "hand": hand_digest,
+        "object": object_digest,
+        "names": [request.hand, request.object],  # written into the shard
+        "batch": batch,
+        "count": count,
+        "seed": request.seed,
+        "inputs": sorted(inputs),
+    }
+    if stage is Stage.SYNTHESIZE:
+        inputs_of |= {
+            "method": request.method,
+            "fidelity": request.knobs.model_dump(mode="json"),
+            "friction": request.friction,
+        }
+    elif stage is Stage.SCENE:
+        inputs_of |= {"scenes": request.scenes}
+    elif stage is Stage.RENDER:
+        inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height")}
+    return digest_json(inputs_of)
+
+
+def job_id(request: JobRequest, hand_digest: str, object_digest: str) -> str:
+    """Address of a job: the same request on the same hand and object is the same job."""
+    return digest_json(
+        {
+            "request": request.model_dump(mode="json"),
+            "hand": hand_digest,
+            "object": object_digest,
+            "revisions": STAGE_REVISIONS,
+        }
+    )

@@ -1,0 +1,165 @@
+"""The words of graspd as types: hands, objects, fidelities, jobs, tasks, states.
+
+Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: position x y z, then unit quaternion w x y z.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+BATCH_SIZE: Final = 32
+
+#: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+#: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+
+
+class State(StrEnum):
+    """State of a job or a task. A task that lost its worker goes from `running` back to `queued`."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def is_final(self) -> bool:
+        return self in (State.SUCCEEDED, State.FAILED, State.CANCELLED)
+
+
+class Stage(StrEnum):
+    """What a task does. `ingest` checks an uploaded hand or object; the others make shards."""
+
+    INGEST = "ingest"
+    SYNTHESIZE = "synthesize"
+    SCENE = "scene"
+    RENDER = "render"
+
+
+class AssetKind(StrEnum):
+    """The two kinds of things a user brings."""
+
+    HAND = "hand"
+    OBJECT = "object"
+
+
+class Model(BaseModel):
+    """Base of the domain models: frozen, and strict about unknown fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Fidelity(Model):
+    """How much is modelled, and so what a grasp costs. Each knob is priced by `graspd chart`."""
+
+    name: str = "custom"
+    coarse_points: int = Field(400, ge=16, le=8192, description="hand surface points in the first phase")
+    fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
+    object_points: int = Field(2000, ge=16, le=65536, description="object surface points tested against the links")
+    face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
+    coarse_iterations: int = Field(100, ge=0, le=100_000)
+    fine_iterations: int = Field(40, ge=0, le=100_000)
+    polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
+    velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
+    contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
+    optimizer: Literal["adam", "gd"] = "adam"
+    leak: Literal["one_sided", "two_sided"] = "one_sided"
+    phong_alpha: float = Field(0.5, ge=0, le=1)
+
+
+FIDELITIES: Final[dict[str, Fidelity]] = {
+    "draft": Fidelity(
+        name="draft", coarse_points=256, fine_points=800, object_points=1000, face_error_m=1e-3,
+        coarse_iterations=60, fine_iterations=20, polish_iterations=6,
+    ),
+    "standard": Fidelity(name="standard"),
+    "fine": Fidelity(
+        name="fine", coarse_points=600, fine_points=4000, object_points=4000, face_error_m=1e-4,
+        coarse_iterations=120, fine_iterations=60, polish_iterations=15,
+    ),
+}  # fmt: skip
+
+
+def resolve_fidelity(value: str | Fidelity) -> Fidelity:
+    """The knobs behind a fidelity's name.
+
+    Raises:
+        ValueError: if the name is not one of `FIDELITIES`.
+    """
+    if isinstance(value, Fidelity):
+        return value
+    if value not in FIDELITIES:
+        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give the knobs")
+    return FIDELITIES[value]
+
+
+class JobRequest(Model):
+    """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
+
+    hand: Name = Field(description="name of a hand known to the service")
+    object: Name = Field(description="name of an object known to the service")
+    grasps: int = Field(32, ge=1, le=1_000_000, description="number of grasps to synthesize")
+    method: Name = "fast_graspd"
+    fidelity: str | Fidelity = "standard"
+    seed: int = Field(0, ge=0, lt=2**31)
+    scenes: int = Field(0, ge=0, le=64, description="scenes per batch of grasps")
+    views: int = Field(0, ge=0, le=256, description="camera placements per scene")
+    stereo: bool = Field(False, description="a left and a right picture per placement instead of one")
+    width: int = Field(320, ge=16, le=4096, description="picture width [px]")
+    height: int = Field(240, ge=16, le=4096, description="picture height [px]")
+    friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
+
+    @field_validator("fidelity")
+    @classmethod
+    def _known(cls, value: str | Fidelity) -> str | Fidelity:
+        resolve_fidelity(value)
+        return value
+
+    @model_validator(mode="after")
+    def _views_need_scenes(self) -> Self:
+        if self.views and not self.scenes:
+            raise ValueError("views need scenes: ask for scenes >= 1")
+        return self
+
+    @property
+    def knobs(self) -> Fidelity:
+        return resolve_fidelity(self.fidelity)
+
+
+class Asset(Model):
+    """A hand or an object as the service keeps it: immutable bytes under the digest of their content."""
+
+    kind: AssetKind
+    name: Name
+    digest: Digest
+    filename: str = Field(description="file inside the archive that describes the asset: the URDF or the mesh")
+    files: tuple[str, ...] = Field(description="all files of the archive, relative paths")
+    size_bytes: int
+    created: str = Field(description="RFC 3339, UTC")
+    builtin: bool = False
+    facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
+
+
+class TaskMessage(Model):
+    """What travels through the queue: enough for a worker with the store alone to do the task."""
+
+    # `schema` is a field name in the message, an attribute of BaseModel in Python: hence the alias.
+    schema_: int = Field(alias="schema")
+    task_id: str
+    job_id: str
+    stage: Stage
+    batch: int = Field(ge=0)
+    count: int = Field(ge=1, description="grasps in this batch")
+    attempt: int = Field(1, ge=1)
+    request: JobRequest
+    hand_digest: Digest
+    object_digest: Digest
+    inputs: tuple[str, ...] = Field((), description="shard ids this task reads")
+    output: str = Field(description="shard id this task writes")
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)

@@ -1,0 +1,118 @@
+"""Every error graspd raises on purpose.
+
+    GraspdError
+    ├── InputError                the caller's mistake: exit 2, HTTP 422
+    │   ├── NotFoundError         unknown job, hand, object, shard: exit 2, HTTP 404
+    │   ├── ConflictError         the request clashes with what is there: exit 2, HTTP 409
+    │   ├── MeshError             an object mesh that cannot be used
+    │   ├── HandError             a hand description that cannot be used
+    │   └── LimitError            too large, too many: exit 2, HTTP 413
+    ├── UnavailableError          a part of the service does not answer: exit 1, HTTP 503
+    │   ├── QueueUnavailable
+    │   ├── StoreUnavailable
+    │   └── IndexUnavailable
+    ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
+    └── TaskError                 a task ended without a result: exit 1, HTTP 500
+        ├── TaskCancelled
+        └── TaskRefused           unknown schema or function: never retried
+
+A message is one line that names what is wrong and the mend. `exit_code` and `status` are the one table from errors to
+exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class GraspdError(Exception):
+    """Base of all errors that graspd reports to its user."""
+
+    slug: ClassVar[str] = "internal"
+    status: ClassVar[int] = 500
+    exit_code: ClassVar[int] = 1
+    title: ClassVar[str] = "Something went wrong"
+
+
+class InputError(GraspdError):
+    """The caller's mistake."""
+
+    slug, status, exit_code, title = "invalid-input", 422, 2, "The request cannot be used"
+
+
+class NotFoundError(InputError):
+    """The named thing does not exist."""
+
+    slug, status, title = "not-found", 404, "Not found"
+
+
+class ConflictError(InputError):
+    """The request clashes with the present state."""
+
+    slug, status, title = "conflict", 409, "Conflict"
+
+
+class MeshError(InputError):
+    """An object mesh that cannot be read or used."""
+
+    slug, title = "bad-mesh", "The mesh cannot be used"
+
+
+class HandError(InputError):
+    """A hand description that cannot be read or used."""
+
+    slug, title = "bad-hand", "The hand cannot be used"
+
+
+class LimitError(InputError):
+    """Larger or more than the service takes."""
+
+    slug, status, title = "too-large", 413, "Over the limit"
+
+
+class UnavailableError(GraspdError):
+    """A part of the service does not answer; the same request may succeed later."""
+
+    slug, status, title = "unavailable", 503, "Temporarily unavailable"
+
+
+class QueueUnavailable(UnavailableError):
+    """Redis does not answer."""
+
+    slug, title = "queue-unavailable", "The queue does not answer"
+
+
+class StoreUnavailable(UnavailableError):
+    """The object store does not answer or cannot be written."""
+
+    slug, title = "store-unavailable", "The object store does not answer"
+
+
+class IndexUnavailable(UnavailableError):
+    """The index database does not answer."""
+
+    slug, title = "index-unavailable", "The index does not answer"
+
+
+class BusyError(GraspdError):
+    """Another process owns the resource."""
+
+    slug, status, title = "busy", 409, "Already in use"
+
+
+class TaskError(GraspdError):
+    """A task ended without a result."""
+
+    slug, title = "task-failed", "The task failed"
+
+
+class TaskCancelled(TaskError):
+    """The task was cancelled while it ran."""
+
+    slug, title = "task-cancelled", "The task was cancelled"
+
+
+class TaskRefused(TaskError):
+    """The task must not run here: unknown schema, unknown function. Never retried."""
+
+    slug, title = "task-refused", "The task was refused"

@@ -1,0 +1,43 @@
+"""One model of every setting. Each is an environment variable: `GRASPD_` and the field's name in capitals."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+from pydantic import Field, SecretStr
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Settings of all processes of one graspd. Defaults run everything on one machine inside `data_dir`."""
+
+    model_config = SettingsConfigDict(env_prefix="GRASPD_", frozen=True)
+
+    data_dir: Path = Field(Path("graspd-data"), description="folder of everything graspd keeps on this machine")
+    redis_url: SecretStr | None = Field(None, description="Redis of the queue; unset: `graspd up` starts one")
+    store_url: str | None = Field(None, description="object store: file://, s3://, gs://, az://; unset: in data_dir")
+    index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
+    host: str = Field("127.0.0.1", description="address the API binds")
+    port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
+    api_url: str = Field("http://127.0.0.1:8000", description="where the client commands find the API")
+    api_key: SecretStr | None = Field(None, description="key the client commands send")
+    device: str = Field("auto", description="Warp device of a worker: cpu, cuda:0, or auto")
+    threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
+    lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
+    keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
+    task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
+    task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
+    retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
+    max_upload_bytes: int = Field(64 * 2**20, gt=0, description="largest hand or object taken over HTTP [bytes]")
+    log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
+
+    @cached_property
+    def resolved_store_url(self) -> str:
+        return self.store_url or (self.data_dir.resolve() / "store").as_uri()
+
+    @cached_property
+    def resolved_index_url(self) -> str:
+        if self.index_url is not None:
+            return self.index_url.get_secret_value()
+        return f"sqlite:///{self.data_dir.resolve() / 'index.sqlite'}"

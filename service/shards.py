@@ -1,0 +1,232 @@
+"""The HDF5 schema of shards: every dataset's shape, unit and meaning. Written and read here only."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, Literal
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError
+from service.version import PACKAGE_VERSION
+
+ShardKind = Literal["base", "scene", "views"]
+Arrays = Mapping[str, NDArray[np.generic]]
+Attribute = str | int | float | list[str]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One dataset of a shard. Letters of `shape` that repeat must have one length throughout the shard."""
+
+    shape: str
+    dtype: str
+    units: str
+    frame: str
+    description: str
+    optional: bool = False
+
+
+_POSE = "position x y z [m] and unit quaternion w x y z of the hand's root link"
+
+
+def _posture(prefix: str, what: str) -> dict[str, Column]:
+    return {
+        f"{prefix}/hand_pose": Column("N 7", "f8", "m, 1", "object", f"{what}: {_POSE}"),
+        f"{prefix}/joint_positions": Column(
+            "N J", "f8", "rad or m", "joint", f"{what}: all moving joints, order in attribute joint_names"
+        ),
+    }
+
+
+SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
+    "base": {
+        **_posture("grasp", "posture at contact"),
+        **_posture("pregrasp", "posture before contact, fingers clear of the object"),
+        **_posture("squeeze", "commanded posture that presses on the object"),
+        "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
+        "quality/contact_area_cm2": Column(
+            "N T", "f8", "cm^2", "none", "hand surface closer to the object than the threshold"
+        ),
+        "quality/intersection_volume_cm3": Column("N", "f8", "cm^3", "none", "volume shared by hand and object"),
+        "quality/epsilon": Column(
+            "N T",
+            "f8",
+            "1",
+            "none",
+            "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
+        ),
+        "quality/wrench_volume": Column("N T", "f8", "1", "none", "volume of the L1 grasp wrench space"),
+        "quality/simulated_displacement_cm": Column(
+            "N", "f8", "cm", "none", "object's way in the displacement test; nan: not tested", optional=True
+        ),
+        "quality/penetration_depth_mm": Column("N", "f8", "mm", "none", "deepest hand-object penetration"),
+        "quality/self_penetration_depth_mm": Column("N", "f8", "mm", "none", "deepest hand-hand penetration"),
+        "quality/contact_links": Column("N", "i4", "1", "none", "hand bodies within 2 mm of the object"),
+        "quality/stability_loss": Column("N", "f8", "1", "none", "planner's L_stable; nan: the planner has none"),
+        "quality/valid": Column("N", "u1", "bool", "none", "1: passed the geometric gate of the synthesis stage"),
+        "quality/success": Column(
+            "N",
+            "i1",
+            "bool",
+            "none",
+            "verdict of the referee: 1 held, 0 dropped, -1 not tested",
+            optional=True,
+        ),
+    },
+    "scene": {
+        "scene/object_pose": Column("S 7", "f8", "m, 1", "table", "object frame at rest; table top is z = 0"),
+        "scene/rest_probability": Column(
+            "S", "f8", "1", "none", "share of drops that come to rest on the same face of the convex hull"
+        ),
+        "scene/drop_seconds": Column("S", "f8", "s", "none", "simulated time until rest"),
+        "grasp/base_index": Column("K", "i4", "1", "none", "row of the grasp in the base shard"),
+        "grasp/scene_index": Column("K", "i4", "1", "none", "row of the scene in /scene"),
+        "grasp/hand_pose": Column("K 7", "f8", "m, 1", "table", f"posture at contact: {_POSE}"),
+        "grasp/table_clearance_m": Column(
+            "K", "f8", "m", "table", "lowest point of the hand above the table at contact and on the way in"
+        ),
+        "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear of the table at contact and on approach"),
+    },
+    "views": {
+        "camera/intrinsics": Column("V 3 3", "f8", "px", "image", "pinhole K; pixel centres at +0.5"),
+        "camera/extrinsics": Column(
+            "V 4 4",
+            "f8",
+            "m, 1",
+            "table -> camera",
+            "x_camera = E x_table; camera x right, y down, z forward",
+        ),
+        "camera/scene_index": Column("V", "i4", "1", "none", "row of the scene in the scene shard"),
+        "camera/eye": Column("V", "u1", "enum", "none", "0 mono, 1 left, 2 right"),
+        "camera/stereo_baseline_m": Column(
+            "V", "f8", "m", "camera", "distance of the right eye from the left; 0: mono"
+        ),
+        "image/rgb": Column("V H W 3", "u1", "sRGB", "image", "colour"),
+        "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: nothing there"),
+        "image/segmentation": Column("V H W", "u1", "enum", "image", "0 background, 1 table, 2 object"),
+        "box/bounding_box_2d_tight": Column(
+            "V 4",
+            "f4",
+            "px",
+            "image",
+            "x_min y_min x_max y_max of the visible object pixels; nan: not visible",
+        ),
+        "box/bounding_box_2d_loose": Column(
+            "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
+        ),
+        "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
+    },
+}
+
+
+def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
+    """HDF5 bytes of a shard.
+
+    Args:
+        kind: base, scene or views.
+        arrays: one array for each column of `SCHEMAS[kind]`; optional columns may be absent.
+        attributes: root attributes besides `schema`, `created` and `code_version`; `joint_names` also goes to
+            the joint datasets.
+
+    Raises:
+        InputError: a column is missing, unknown, of the wrong rank, or lengths clash.
+    """
+    check_columns(kind, arrays)
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", libver="v110") as file:
+        file.attrs["schema"] = f"graspd/{kind}@1"
+        file.attrs["code_version"] = PACKAGE_VERSION
+        file.attrs["created"] = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        for name, value in attributes.items():
+            file.attrs[name] = value
+        for path, array in arrays.items():
+            column = SCHEMAS[kind][path]
+            data = np.ascontiguousarray(array, dtype=column.dtype)
+            # Pictures compress well; shuffling bytes first makes float depth compress at all.
+            options = (
+                {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                if data.ndim >= 3 and data.nbytes > 65536
+                else {}
+            )
+            dataset = file.create_dataset(path, data=data, track_times=False, **options)
+            dataset.attrs["units"] = column.units
+            dataset.attrs["frame"] = column.frame
+            dataset.attrs["description"] = column.description
+            if path.endswith("joint_positions") and "joint_names" in attributes:
+                dataset.attrs["joint_names"] = attributes["joint_names"]
+    return buffer.getvalue()
+
+
+def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
+    """Lengths of the shape letters (N, T, S, ...); raises InputError where the arrays do not fit the schema."""
+    schema = SCHEMAS[kind]
+    if unknown := set(arrays) - set(schema):
+        raise InputError(f"a {kind} shard has no dataset {sorted(unknown)[0]!r}")
+    if missing := [path for path, column in schema.items() if not column.optional and path not in arrays]:
+        raise InputError(f"a {kind} shard needs the dataset {missing[0]!r}")
+    lengths: dict[str, int] = {}
+    for path, array in arrays.items():
+        letters = schema[path].shape.split()
+        if len(letters) != array.ndim:
+            raise InputError(f"{path} has {array.ndim} axes; the schema says ({', '.join(letters)})")
+        for letter, length in zip(letters, array.shape, strict=True):
+            expected = int(letter) if letter.isdigit() else lengths.setdefault(letter, length)
+            if expected != length:
+                raise InputError(f"{path}: axis {letter} has length {length}, expected {expected}")
+    return lengths
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A shard in memory."""
+
+    kind: ShardKind
+    attributes: dict[str, Attribute]
+    arrays: dict[str, NDArray[np.generic]]
+
+    def __getitem__(self, path: str) -> NDArray[np.generic]:
+        return self.arrays[path]
+
+
+def read_shard(source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = ()) -> Shard:
+    """Read a shard whole, except the datasets named in `without`.
+
+    Raises:
+        InputError: not HDF5, not a graspd shard, or not of the wanted kind.
+    """
+    name = "shard" if isinstance(source, bytes) else str(source)
+    try:
+        file = h5py.File(io.BytesIO(source) if isinstance(source, bytes) else source, "r")
+    except OSError as error:
+        raise InputError(f"{name} is not a readable HDF5 file: {error}") from None
+    with file:
+        schema = str(file.attrs.get("schema", ""))
+        found = schema.removeprefix("graspd/").partition("@")[0]
+        if not schema.startswith("graspd/") or found not in SCHEMAS:
+            raise InputError(f"{name} is no graspd shard (attribute schema is {schema!r})")
+        if kind is not None and found != kind:
+            raise InputError(f"{name} is a {found} shard; a {kind} shard is needed here")
+        arrays = {p: np.asarray(file[p]) for p in SCHEMAS[found] if p in file and p not in without}
+        attributes = {k: _attribute(v) for k, v in file.attrs.items()}
+    return Shard(found, attributes, arrays)
+
+
+def _attribute(value: object) -> Attribute:
+    if isinstance(value, np.ndarray):
+        return [str(v) for v in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value if isinstance(value, int | float) else str(value)
+
+
+def json_attribute(value: object) -> str:
+    """A JSON text fit for an HDF5 attribute."""
+    return json.dumps(value, sort_keys=True)

@@ -1,0 +1,137 @@
+"""A hand as the engine sees it: a tree of rigid bodies, the map from degrees of freedom to joints, convex pieces.
+
+Links joined by fixed joints are merged into one body, so every body except the root has one moving joint.
+Frames: body frame = frame of the link that the moving joint carries; root frame = frame of the named root link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+class JointType(IntEnum):
+    """Type of the joint that carries a body; `FIXED` only on the root."""
+
+    FIXED = 0
+    REVOLUTE = 1
+    PRISMATIC = 2
+
+
+@dataclass(frozen=True)
+class ConvexPiece:
+    """One convex solid rigidly attached to a body."""
+
+    body: int
+    kind: str  # box, sphere, cylinder, capsule or hull
+    size: tuple[float, ...]
+    """Box: full extents x y z. Sphere: radius. Cylinder and capsule: radius, length along z without caps. Hull: ()."""
+    pose: Floats
+    """(7,) pose of the primitive's frame in the body frame; identity for hulls."""
+    vertices: Floats
+    """(V, 3) corners of the solid (of a fine tessellation, for round kinds) in the body frame [m]."""
+    faces: Ints
+    """(F, 3) outward triangles."""
+    link: str
+    """URDF link the piece comes from."""
+
+
+@dataclass(frozen=True)
+class PalmFrame:
+    """Where the hand takes hold: a point on the palm's surface and the direction in which it approaches."""
+
+    centre: Floats
+    """(3,) point on the palm surface in the root frame [m]."""
+    approach: Floats
+    """(3,) unit vector out of the palm, root frame."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """A fixed sample of the hand's surface, N points. Interior parts (inside another piece) carry no points."""
+
+    body: Ints
+    """(N,)"""
+    position: Floats
+    """(N, 3) in the body frame [m]."""
+    normal: Floats
+    """(N, 3) unit, outward, body frame."""
+    area: Floats
+    """(N,) surface area that the point stands for [m^2]."""
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+
+@dataclass(frozen=True)
+class HandModel:
+    """Kinematic tree of L bodies with D independent degrees of freedom (dofs) that drive J moving joints.
+
+    Joint value of body l: ``multiplier[l] * q[dof[l]] + offset[l]`` (mimic chains and couplings are folded in).
+    """
+
+    name: str
+    digest: str
+    root_link: str
+    body_names: tuple[str, ...]
+    parent: Ints
+    """(L,) index of the parent body, smaller than the body's own; -1 for the root, which is body 0."""
+    joint_type: Ints
+    """(L,) `JointType` values."""
+    origin: Floats
+    """(L, 7) pose of the joint frame in the parent's body frame."""
+    axis: Floats
+    """(L, 3) unit joint axis in the joint frame."""
+    dof: Ints
+    """(L,) degree of freedom that drives the body's joint; -1 for the root."""
+    multiplier: Floats
+    offset: Floats
+    dof_names: tuple[str, ...]
+    lower: Floats
+    """(D,) limits [rad or m], with the limits of mimicking joints folded in."""
+    upper: Floats
+    effort: Floats
+    """(D,) torque or force limit [N m or N]; positive."""
+    stiffness: Floats
+    """(D,) position gain of the controller, Kp [N m/rad or N/m]."""
+    preshape: Floats
+    """(D,) posture in which the hand approaches."""
+    closing: Floats
+    """(D,) -1, 0 or +1: the direction in which the dof closes the hand; 0 for spreads."""
+    joint_names: tuple[str, ...]
+    """(J,) all moving joints of the URDF, mimicking ones included, in URDF order."""
+    joint_body: Ints
+    """(J,) the body each joint carries."""
+    palm: PalmFrame
+    fingertips: tuple[int, ...]
+    """Bodies at the end of each finger."""
+    pieces: tuple[ConvexPiece, ...]
+    neighbours: frozenset[tuple[int, int]]
+    """Pairs of bodies (a < b) whose contact does not count: adjacent ones and those that touch in every posture."""
+    masses: Floats
+    """(L,) [kg] of each body, from the URDF or, where it gives none, from volume at 1000 kg/m^3."""
+
+    @property
+    def bodies(self) -> int:
+        return len(self.parent)
+
+    @property
+    def dofs(self) -> int:
+        return len(self.dof_names)
+
+    def expand(self, q: Floats) -> Floats:
+        """Joint positions (..., J) in `joint_names` order from dof values (..., D)."""
+        body = self.joint_body
+        return np.asarray(q)[..., self.dof[body]] * self.multiplier[body] + self.offset[body]
+
+    def reduce(self, joints: Floats) -> Floats:
+        """Dof values (..., D) from joint positions (..., J): each dof read off the first joint it drives."""
+        first = [int(np.flatnonzero(self.dof[self.joint_body] == d)[0]) for d in range(self.dofs)]
+        body = self.joint_body[first]
+        return (np.asarray(joints)[..., first] - self.offset[body]) / self.multiplier[body]
