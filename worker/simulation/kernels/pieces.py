@@ -1,0 +1,196 @@
+"""Signed distance to the hand's convex pieces, and the penalties made of it: object points inside links, links inside
+links. Thin parts of an object pass between hand points; they do not pass between the pieces' faces."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+BOX = wp.constant(0)
+SPHERE = wp.constant(1)
+CYLINDER = wp.constant(2)
+CAPSULE = wp.constant(3)
+HULL = wp.constant(4)
+
+
+@wp.struct
+class Pieces:
+    """P convex pieces on the device."""
+
+    body: wp.array(dtype=wp.int32)
+    kind: wp.array(dtype=wp.int32)
+    size: wp.array(dtype=wp.vec3)  # box: half extents; sphere: r; cylinder, capsule: r, half length
+    pose_p: wp.array(dtype=wp.vec3)  # frame of the piece in the body frame; origin: centre of its box
+    pose_q: wp.array(dtype=wp.quat)
+    half: wp.array(dtype=wp.vec3)  # half extents of the bounding box in the piece's frame
+    first_plane: wp.array(dtype=wp.int32)
+    planes: wp.array(dtype=wp.vec4)  # outward unit normal and offset: n.x = d on the face, piece frame
+    apart: wp.array2d(dtype=wp.int32)  # (L, L): 1 where contact of two bodies counts
+
+
+@wp.func
+def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
+    """Signed distance at x (piece frame) and its gradient, as (gradient, distance). Inside it is exact; outside a hull
+    it is the largest plane distance, a lower bound."""
+    kind = pieces.kind[piece]
+    size = pieces.size[piece]
+    n = wp.vec3(1.0, 0.0, 0.0)
+    d = float(0.0)
+    if kind == BOX:
+        a = wp.vec3(wp.abs(x[0]) - size[0], wp.abs(x[1]) - size[1], wp.abs(x[2]) - size[2])
+        outside = wp.vec3(wp.max(a[0], 0.0), wp.max(a[1], 0.0), wp.max(a[2], 0.0))
+        d = wp.length(outside)
+        if d > 0.0:
+            n = wp.vec3(outside[0] * wp.sign(x[0]), outside[1] * wp.sign(x[1]), outside[2] * wp.sign(x[2])) / d
+        elif a[0] >= a[1] and a[0] >= a[2]:
+            d = a[0]
+            n = wp.vec3(wp.sign(x[0]), 0.0, 0.0)
+        elif a[1] >= a[2]:
+            d = a[1]
+            n = wp.vec3(0.0, wp.sign(x[1]), 0.0)
+        else:
+            d = a[2]
+            n = wp.vec3(0.0, 0.0, wp.sign(x[2]))
+    elif kind == SPHERE:
+        length = wp.length(x)
+        d = length - size[0]
+        if length > 1.0e-9:
+            n = x / length
+    elif kind == CAPSULE:
+        y = wp.vec3(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1]))
+        length = wp.length(y)
+        d = length - size[0]
+        if length > 1.0e-9:
+            n = y / length
+    elif kind == CYLINDER:
+        radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+        side = wp.vec3(1.0, 0.0, 0.0)
+        if radial > 1.0e-9:
+            side = wp.vec3(x[0] / radial, x[1] / radial, 0.0)
+        cap = wp.vec3(0.0, 0.0, wp.sign(x[2]))
+        a = radial - size[0]
+        c = wp.abs(x[2]) - size[1]
+        if a > 0.0 and c > 0.0:
+            d = wp.sqrt(a * a + c * c)
+            n = (a * side + c * cap) / d
+        elif a > c:
+            d = a
+            n = side
+        else:
+            d = c
+            n = cap
+    else:
+        d = float(-1.0e9)
+        for k in range(pieces.first_plane[piece], pieces.first_plane[piece + 1]):
+            plane = pieces.planes[k]
+            normal = wp.vec3(plane[0], plane[1], plane[2])
+            value = wp.dot(normal, x) - plane[3]
+            if value > d:
+                d = value
+                n = normal
+    return wp.vec4(n[0], n[1], n[2], d)
+
+
+@wp.kernel
+def object_in_pieces(
+    pieces_in: Pieces,
+    bvh_in: wp.uint64,
+    sample_in: wp.array(dtype=wp.vec3),
+    sample_weight_in: wp.float32,
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    weight_in: wp.array(dtype=wp.float32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    force_inout: wp.array2d(dtype=wp.vec3),
+    torque_inout: wp.array2d(dtype=wp.vec3),
+    depth_inout: wp.array(dtype=wp.float32),
+):
+    """Gradient of w sum depth^2 over object surface samples inside a piece; deepest depth per grasp. Launch over (B, P).
+
+    Moving the body by +n deepens a sample that is nearest to the face with outward normal n, so the gradient at the
+    sample is 2 w depth n.
+    """
+    b, piece = wp.tid()
+    if active_in[b] == 0:
+        return
+    body = pieces_in.body[piece]
+    q = body_q_in[b, body] * pieces_in.pose_q[piece]
+    p = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], pieces_in.pose_p[piece])
+    half = pieces_in.half[piece]
+    ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
+    ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
+    ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
+    extent = wp.vec3(
+        wp.abs(ex[0]) + wp.abs(ey[0]) + wp.abs(ez[0]),
+        wp.abs(ex[1]) + wp.abs(ey[1]) + wp.abs(ez[1]),
+        wp.abs(ex[2]) + wp.abs(ey[2]) + wp.abs(ez[2]),
+    )
+    weight = 2.0 * sample_weight_in * weight_in[iteration_in[0]]
+    force = wp.vec3(0.0)
+    torque = wp.vec3(0.0)
+    deepest = float(0.0)
+    query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
+    index = wp.int32(0)
+    while wp.bvh_query_next(query, index):
+        x = sample_in[index]
+        local = wp.quat_rotate_inv(q, x - p)
+        if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+            nd = piece_distance(pieces_in, piece, local)
+            depth = -nd[3]
+            if depth > 0.0:
+                n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                f = (weight * depth) * n
+                force += f
+                torque += wp.cross(x, f)
+                deepest = wp.max(deepest, depth)
+    if deepest > 0.0:
+        wp.atomic_add(force_inout, b, body, force)
+        wp.atomic_add(torque_inout, b, body, torque)
+        wp.atomic_max(depth_inout, b, deepest)
+
+
+@wp.kernel
+def pieces_in_pieces(
+    pieces_in: Pieces,
+    margin_in: wp.float32,
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    weight_in: wp.array(dtype=wp.float32),
+    point_body_in: wp.array(dtype=wp.int32),
+    point_in: wp.array(dtype=wp.vec3),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    force_inout: wp.array2d(dtype=wp.vec3),
+    torque_inout: wp.array2d(dtype=wp.vec3),
+    depth_inout: wp.array(dtype=wp.float32),
+):
+    """Gradient of w sum (depth + margin)^2 over hand points inside pieces of bodies they must stay clear of.
+
+    Launch over (B, points).
+    """
+    b, i = wp.tid()
+    if active_in[b] == 0:
+        return
+    own = point_body_in[i]
+    x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], point_in[i])
+    weight = 2.0 * weight_in[iteration_in[0]]
+    for piece in range(pieces_in.body.shape[0]):
+        other = pieces_in.body[piece]
+        if pieces_in.apart[own, other] == 1:
+            bq = body_q_in[b, other]
+            centre = body_p_in[b, other] + wp.quat_rotate(bq, pieces_in.pose_p[piece])
+            half = pieces_in.half[piece]
+            offset = x - centre
+            reach = wp.length(half) + margin_in
+            if wp.dot(offset, offset) < reach * reach:
+                q = bq * pieces_in.pose_q[piece]
+                nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, offset))
+                depth = margin_in - nd[3]
+                if depth > 0.0:
+                    f = (weight * depth) * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                    t = wp.cross(x, f)
+                    wp.atomic_add(force_inout, b, other, f)
+                    wp.atomic_add(torque_inout, b, other, t)
+                    wp.atomic_add(force_inout, b, own, -f)
+                    wp.atomic_add(torque_inout, b, own, -t)
+                    wp.atomic_max(depth_inout, b, -nd[3])

@@ -1,0 +1,194 @@
+"""Signed distance of hand points to the object's mesh, smoothed by Phong projection (paper, section III-B).
+
+With the closest point b on a face, barycentric weights w_k, and corner normals n_k, the projection onto the tangent
+plane of corner k is pi_k(b) = b - ((b - v_k).n_k) n_k and the smoothed surface point is
+r* = (1 - alpha) b + alpha sum_k w_k pi_k(b)   (Boubekeur & Alexa 2008; the paper's formula drops the first b).
+The distance is sign |r - b| + (b - r*).n with n the interpolated normal: unlike sign |r - r*| it is continuous across
+the surface. Corner normals stop at creases, so boxes and cylinders keep their edges.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Surface:
+    """The object's surface on the device."""
+
+    mesh: wp.uint64
+    corner_normals: wp.array(dtype=wp.vec3)  # (3 F,)
+    alpha: wp.float32
+    field: wp.array3d(dtype=wp.float32)  # coarse grid of distances; empty: not used
+    field_origin: wp.vec3
+    field_cell: wp.float32
+    field_error: wp.float32  # a point whose grid distance is above `exact below` + this is never asked of the mesh
+
+
+@wp.struct
+class Sample:
+    """Distance and outward unit normal of the object at a point."""
+
+    distance: wp.float32
+    normal: wp.vec3
+
+
+@wp.func
+def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
+    """Smoothed signed distance and normal; distance = reach and normal 0 where the surface is farther than `reach`."""
+    out = Sample()
+    out.distance = reach
+    out.normal = wp.vec3(0.0)
+    query = wp.mesh_query_point_sign_normal(surface.mesh, point, reach)
+    if query.result:
+        face = query.face
+        u = query.u
+        v = query.v
+        w = 1.0 - u - v
+        closest = wp.mesh_eval_position(surface.mesh, face, u, v)
+        n0 = surface.corner_normals[3 * face]
+        n1 = surface.corner_normals[3 * face + 1]
+        n2 = surface.corner_normals[3 * face + 2]
+        v0 = wp.mesh_get_point(surface.mesh, 3 * face)
+        v1 = wp.mesh_get_point(surface.mesh, 3 * face + 1)
+        v2 = wp.mesh_get_point(surface.mesh, 3 * face + 2)
+        smooth = wp.normalize(u * n0 + v * n1 + w * n2)
+        # b - r* = alpha sum_k w_k ((b - v_k).n_k) n_k
+        lift = (
+            (u * wp.dot(closest - v0, n0)) * n0
+            + (v * wp.dot(closest - v1, n1)) * n1
+            + (w * wp.dot(closest - v2, n2)) * n2
+        )
+        offset = point - closest
+        gap = wp.length(offset)
+        out.distance = query.sign * gap + surface.alpha * wp.dot(lift, smooth)
+        # Far from the surface the direction to the closest point is the gradient; on it that is 0/0.
+        share = wp.min(gap / 1.0e-3, 1.0)
+        direction = (1.0 - share) * smooth
+        if gap > 1.0e-9:
+            direction = direction + (share * query.sign / gap) * offset
+        length = wp.length(direction)
+        if length > 1.0e-6:
+            out.normal = direction / length
+        else:
+            out.normal = smooth
+    return out
+
+
+@wp.func
+def field_distance(surface: Surface, point: wp.vec3):
+    """Trilinear interpolation of the grid with its exact gradient; distance 1e3 m outside the grid."""
+    out = Sample()
+    out.distance = 1.0e3
+    out.normal = wp.vec3(0.0)
+    x = (point - surface.field_origin) / surface.field_cell
+    i = int(wp.floor(x[0]))
+    j = int(wp.floor(x[1]))
+    k = int(wp.floor(x[2]))
+    if (
+        i >= 0
+        and j >= 0
+        and k >= 0
+        and i + 1 < surface.field.shape[0]
+        and j + 1 < surface.field.shape[1]
+        and k + 1 < surface.field.shape[2]
+    ):
+        a = x[0] - float(i)
+        b = x[1] - float(j)
+        c = x[2] - float(k)
+        f000 = surface.field[i, j, k]
+        f100 = surface.field[i + 1, j, k]
+        f010 = surface.field[i, j + 1, k]
+        f110 = surface.field[i + 1, j + 1, k]
+        f001 = surface.field[i, j, k + 1]
+        f101 = surface.field[i + 1, j, k + 1]
+        f011 = surface.field[i, j + 1, k + 1]
+        f111 = surface.field[i + 1, j + 1, k + 1]
+        f00 = f000 + a * (f100 - f000)
+        f10 = f010 + a * (f110 - f010)
+        f01 = f001 + a * (f101 - f001)
+        f11 = f011 + a * (f111 - f011)
+        f0 = f00 + b * (f10 - f00)
+        f1 = f01 + b * (f11 - f01)
+        out.distance = f0 + c * (f1 - f0)
+        gx0 = (f100 - f000) + b * ((f110 - f010) - (f100 - f000))
+        gx1 = (f101 - f001) + b * ((f111 - f011) - (f101 - f001))
+        gy = (f10 - f00) + c * ((f11 - f01) - (f10 - f00))
+        out.normal = wp.normalize(wp.vec3(gx0 + c * (gx1 - gx0), gy, f1 - f0))
+    return out
+
+
+@wp.func
+def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: wp.float32):
+    """The mesh's distance near the surface, the grid's where that is good enough, `reach` beyond it."""
+    if surface.field.shape[0] > 0:
+        coarse = field_distance(surface, point)
+        if coarse.distance > exact_below + surface.field_error:
+            if coarse.distance > reach:
+                coarse.distance = reach
+                coarse.normal = wp.vec3(0.0)
+            return coarse
+    return mesh_distance(surface, point, reach)
+
+
+@wp.kernel
+def sample_field(
+    surface_in: Surface, origin_in: wp.vec3, cell_in: wp.float32, reach_in: wp.float32,
+    field_out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Fill a grid with mesh distances. Launch over the grid."""
+    i, j, k = wp.tid()
+    point = origin_in + cell_in * wp.vec3(float(i), float(j), float(k))
+    field_out[i, j, k] = mesh_distance(surface_in, point, reach_in).distance
+
+
+@wp.kernel
+def probe(
+    surface_in: Surface, point_in: wp.array(dtype=wp.vec3), reach_in: wp.float32, exact_below_in: wp.float32,
+    distance_out: wp.array(dtype=wp.float32), normal_out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Distances and normals at given points. Launch over the points."""
+    i = wp.tid()
+    sample = distance(surface_in, point_in[i], reach_in, exact_below_in)
+    distance_out[i] = sample.distance
+    normal_out[i] = sample.normal
+
+
+@wp.kernel
+def gather(
+    surface_in: Surface,
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    band_in: wp.float32,
+    exact_in: wp.float32,
+    body_in: wp.array(dtype=wp.int32),
+    position_in: wp.array(dtype=wp.vec3),
+    weight_in: wp.array(dtype=wp.float32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    count_inout: wp.array(dtype=wp.int32),
+    contact_body_out: wp.array2d(dtype=wp.int32),
+    contact_point_out: wp.array2d(dtype=wp.vec3),
+    contact_normal_out: wp.array2d(dtype=wp.vec3),
+    contact_distance_out: wp.array2d(dtype=wp.float32),
+    contact_weight_out: wp.array2d(dtype=wp.float32),
+    gradient_out: wp.array2d(dtype=wp.float32),
+):
+    """Candidate contacts: hand points nearer to the object than dilation + band, packed per grasp. Launch over (B, N)."""
+    b, i = wp.tid()
+    if active_in[b] == 0:
+        return
+    body = body_in[i]
+    point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+    dilation = dilation_in[iteration_in[0]]
+    reach = dilation + band_in
+    sample = distance(surface_in, point, reach, dilation + exact_in)
+    if sample.distance < reach:
+        k = wp.atomic_add(count_inout, b, 1)
+        contact_body_out[b, k] = body
+        contact_point_out[b, k] = point
+        contact_normal_out[b, k] = sample.normal
+        contact_distance_out[b, k] = sample.distance
+        contact_weight_out[b, k] = weight_in[i]
+        gradient_out[b, k] = 0.0
