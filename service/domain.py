@@ -156,6 +156,7 @@ class TaskMessage(Model):
     batch: int = Field(ge=0)
     count: int = Field(ge=1, description="grasps in this batch")
     attempt: int = Field(1, ge=1)
+    max_attempt: int = Field(3, ge=1, description="number of the attempt that is the last")
     request: JobRequest
     hand_digest: Digest
     object_digest: Digest
@@ -163,3 +164,25 @@ class TaskMessage(Model):
     output: str = Field(description="shard id this task writes")
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+class IngestMessage(Model):
+    """A task that checks an uploaded hand or object in a child process."""
+
+    schema_: int = Field(alias="schema")
+    task_id: str
+    stage: Literal[Stage.INGEST] = Stage.INGEST
+    kind: AssetKind
+    name: Name
+    digest: Digest
+    attempt: int = Field(1, ge=1)
+    max_attempt: int = Field(3, ge=1)
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+class Lane(StrEnum):
+    """Priority of a task: a worker takes `bulk` only when nothing `interactive` waits."""
+
+    INTERACTIVE = "interactive"
+    BULK = "bulk"

@@ -1,0 +1,1 @@
+"""The index: SQL rows derived from the store, made to answer the API fast."""

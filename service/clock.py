@@ -1,0 +1,10 @@
+"""Wall-clock time as text. Durations and leases never use it: they use `time.monotonic`."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+
+def timestamp() -> str:
+    """Now, RFC 3339 in UTC with milliseconds; such texts sort by time."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,0 +1,39 @@
+"""What grasps may be filtered and sorted by."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from service.domain import Model
+
+Metric = Literal[
+    "epsilon",
+    "wrench_volume",
+    "contact_area_cm2",
+    "intersection_volume_cm3",
+    "penetration_depth_mm",
+    "self_penetration_depth_mm",
+    "stability_loss",
+]
+
+
+class GraspFilter(Model):
+    """All conditions hold at once. `at_least` and `at_most` bound metrics, inclusive; a missing value never matches."""
+
+    hand: str | None = None
+    object: str | None = None
+    job: str | None = None
+    shard: str | None = None
+    valid: bool | None = None
+    success: bool | None = None
+    at_least: dict[Metric, float] = Field(default_factory=dict)
+    at_most: dict[Metric, float] = Field(default_factory=dict)
+
+
+class GraspSort(Model):
+    """Order of grasps; those without the metric come last."""
+
+    by: Metric | Literal["created"] = "epsilon"
+    descending: bool = True

@@ -1,0 +1,206 @@
+"""What the index answers: plain frozen records, ready for JSON. Times are RFC 3339 in UTC."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.domain import AssetKind, JobRequest, Lane, Stage, State
+
+T = TypeVar("T")
+
+
+class View(BaseModel):
+    """Base of the answers."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class Page(View, Generic[T]):
+    """Part of a list. `next` is the cursor of what follows, None at the end."""
+
+    items: list[T]
+    next: str | None = None
+
+
+class StageProgress(View):
+    """Tasks of one stage of a job, by state. `done` counts finished tasks plus the shares of the running ones."""
+
+    stage: Stage
+    tasks: int
+    queued: int = 0
+    running: int = 0
+    succeeded: int = 0
+    failed: int = 0
+    cancelled: int = 0
+    done: float = 0.0
+    seconds: float = Field(0.0, description="sum over the finished tasks")
+
+
+class JobView(View):
+    id: str
+    state: State
+    lane: Lane
+    request: JobRequest
+    hand_digest: str
+    object_digest: str
+    created: str
+    finished: str | None
+    reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
+    stages: list[StageProgress] = []
+    grasps: int = Field(0, description="grasps made so far")
+    valid: int = Field(0, description="of these, past the geometric gate")
+
+
+class TaskView(View):
+    id: str
+    job_id: str
+    stage: Stage
+    batch: int
+    count: int
+    state: State
+    shard_id: str
+    attempt: int = Field(description="number of the present or next attempt, from 1")
+    worker: str | None
+    device: str | None
+    done: float
+    total: float
+    message: str | None
+    reason: str | None
+    seconds: float | None
+    finished: str | None
+
+
+class AttemptView(View):
+    """A failed attempt of a task."""
+
+    task_id: str
+    number: int
+    reason: str
+    kind: str = Field(description="name of the error, or WorkerLost")
+    trace: str | None
+    worker: str
+    started: str | None
+    ended: str
+    last: bool
+
+
+class ShardView(View):
+    id: str
+    kind: str = Field(description="base, scene or views")
+    stage: Stage
+    key: str
+    sha256: str
+    size_bytes: int
+    count: int = Field(
+        description="grasps of a base shard, transferred grasps of a scene shard, pictures of a view shard"
+    )
+    hand: str
+    object: str
+    hand_digest: str
+    object_digest: str
+    batch: int
+    seed: int
+    inputs: list[str]
+    device: str
+    worker: str
+    seconds: float
+    created: str
+    manifest: dict[str, Any] = Field(default_factory=dict, description="whole, only in `get_shard`")
+
+
+class GraspView(View):
+    """One grasp with the quality that the index holds; the contact thresholds are those of the manifest (5 mm)."""
+
+    shard_id: str
+    row: int
+    hand: str
+    object: str
+    epsilon: float | None
+    wrench_volume: float | None
+    contact_area_cm2: float | None
+    intersection_volume_cm3: float | None
+    penetration_depth_mm: float | None
+    self_penetration_depth_mm: float | None
+    stability_loss: float | None
+    contact_links: int | None
+    valid: bool
+    success: bool | None = Field(description="verdict of the referee; None: not tested")
+    created: str
+
+
+class AssetView(View):
+    kind: AssetKind
+    name: str
+    digest: str
+    filename: str
+    files: list[str]
+    size_bytes: int
+    created: str
+    builtin: bool
+    verdict: str | None = Field(description="accept, repair or refuse; None: the check is still to come")
+    message: str | None
+    repairs: list[str]
+    facts: dict[str, Any]
+
+
+class WorkerView(View):
+    name: str
+    host: str
+    pid: int
+    device: str
+    device_name: str
+    stages: list[Stage]
+    version: str
+    state: str = Field(description="idle, busy, stopping or lost")
+    task_id: str | None
+    started: str
+    seen: str
+
+
+class FailureGroup(View):
+    """Failed attempts that share an error name and stage."""
+
+    stage: str
+    kind: str
+    attempts: int
+    tasks: int
+    example: str
+    task_id: str
+    last_seen: str
+
+
+class Stats(View):
+    """The whole service in a few numbers."""
+
+    jobs: dict[State, int]
+    tasks: dict[State, int]
+    grasps: int
+    valid: int
+    shards: int
+    bytes: int
+    workers: int
+
+
+class Throughput(View):
+    """What was made in one interval."""
+
+    start: str
+    grasps: int
+    valid: int
+    tasks: int
+    seconds: float
+
+
+class MatrixCell(View):
+    """One hand x object of the matrix."""
+
+    hand: str
+    object: str
+    jobs: int
+    queued: int
+    running: int
+    failed: int
+    grasps: int
+    valid: int

@@ -1,0 +1,74 @@
+"""Hands and objects in the store: publish, load, and the names they go by."""
+
+from __future__ import annotations
+
+import json
+from typing import Final
+
+from service import names
+from service.assets import builtin_asset, builtin_names, describe, pack, unpack
+from service.clock import timestamp
+from service.digests import digest_files
+from service.domain import Asset, AssetKind
+from service.errors import ConflictError, InputError
+from service.store import Store
+
+#: An archive the service packed itself is bounded by the upload limit; this only stops a store that was tampered with.
+UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
+
+
+def publish_asset(
+    store: Store, kind: AssetKind, name: str, files: dict[str, bytes], *, builtin: bool = False, created: str = ""
+) -> Asset:
+    """Put a hand or object into the store: the archive first, its record last. Doing it twice changes nothing.
+
+    Args:
+        files: `asset.json` (names the main file) and all files it needs.
+
+    Raises:
+        InputError: `asset.json` is missing or wrong.
+        ConflictError: the same content is known under another name.
+    """
+    asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
+    record = names.asset_record(kind, asset.digest)
+    store.put(names.asset_files(kind, asset.digest), pack(files))
+    if store.put(record, asset.model_dump_json().encode()):
+        return asset
+    known = load_asset(store, kind, asset.digest)
+    if known.name != name:
+        raise ConflictError(f"this {kind.value} is already known as {known.name!r}; use that name")
+    return known
+
+
+def publish_builtins(store: Store) -> list[Asset]:
+    """Put the hands and objects that come with graspd into the store."""
+    published = []
+    for kind in AssetKind:
+        for name in builtin_names(kind):
+            asset, files = builtin_asset(kind, name)
+            published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+    return published
+
+
+def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
+    """The record of a hand or object; NotFoundError if there is none."""
+    return Asset.model_validate_json(store.get(names.asset_record(kind, digest)))
+
+
+def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
+    """All files of a hand or object, checked against its digest.
+
+    Raises:
+        NotFoundError: no such asset.
+        InputError: the archive in the store is not what its name says.
+    """
+    files = unpack(store.get(names.asset_files(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
+    if digest_files(kind, files) != digest:
+        raise InputError(f"the archive of {kind.value} {digest} in the store is damaged; upload it again")
+    return files
+
+
+def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
+    """What ingest found (`verdict`, `message`, `repairs`, `facts`); None while it has not run."""
+    key = names.asset_check(kind, digest)
+    return json.loads(store.get(key)) if store.exists(key) else None

@@ -1,0 +1,65 @@
+"""Names of things in the object store: every key graspd writes is made here (table in ARCHITECTURE.md)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from service.domain import AssetKind, Stage
+
+ASSETS: Final = "assets"
+JOBS: Final = "jobs"
+TASKS: Final = "tasks"
+SHARDS: Final = "shards"
+
+#: Folder under `shards/` and HDF5 kind of what each stage makes.
+SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
+
+
+def asset_files(kind: AssetKind, digest: str) -> str:
+    """ZIP of all files of a hand or object."""
+    return f"{ASSETS}/{kind.value}/{digest}/files.zip"
+
+
+def asset_record(kind: AssetKind, digest: str) -> str:
+    """`Asset` as JSON, put after the files."""
+    return f"{ASSETS}/{kind.value}/{digest}/asset.json"
+
+
+def asset_check(kind: AssetKind, digest: str) -> str:
+    """What ingest found."""
+    return f"{ASSETS}/{kind.value}/{digest}/check.json"
+
+
+def job_record(job: str) -> str:
+    """The request with the digests of hand and object."""
+    return f"{JOBS}/{job}/job.json"
+
+
+def job_events(job: str) -> str:
+    """Prefix of what a user did to the job later."""
+    return f"{JOBS}/{job}/events"
+
+
+def job_event(job: str, number: int, what: str) -> str:
+    """One of `job_events`; numbers start at 1."""
+    return f"{job_events(job)}/{number:06}-{what}.json"
+
+
+def attempts(task: str) -> str:
+    """Prefix of a task's failed attempts."""
+    return f"{TASKS}/{task}/attempts"
+
+
+def attempt(task: str, number: int) -> str:
+    """A failed attempt; numbers start at 1."""
+    return f"{attempts(task)}/{number}.json"
+
+
+def shard_file(stage: Stage, shard: str) -> str:
+    """HDF5 bytes of a shard."""
+    return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.h5"
+
+
+def shard_manifest(stage: Stage, shard: str) -> str:
+    """Manifest of a shard: the shard exists for its readers once this does."""
+    return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"

@@ -1,0 +1,133 @@
+"""The queue as the rest of graspd sees it: tasks in, leases and events out. Adapters: `rq_queue`, `memory`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+from pydantic import ConfigDict
+
+from service.domain import IngestMessage, Lane, Model, Stage, TaskMessage
+
+Message = TaskMessage | IngestMessage
+
+
+class EventKind(StrEnum):
+    """What happened. Events of a task come from its worker, `job` events from the keeper and the API."""
+
+    STARTED = "started"
+    PROGRESS = "progress"
+    FINISHED = "finished"
+    FAILED = "failed"
+    """An attempt ended in an error and is recorded in the store."""
+    DEFERRED = "deferred"
+    """A part of the service did not answer; the attempt does not count."""
+    RETURNED = "returned"
+    """The worker was told to stop and handed the task back; the attempt does not count."""
+    CANCELLED = "cancelled"
+    JOB = "job"
+    """The job's state changed; `message` is the new state."""
+
+
+class Event(Model):
+    """One thing that happened to a task or a job. `total` is 0 where progress is unknown."""
+
+    kind: EventKind
+    at: str
+    task_id: str = ""
+    job_id: str = ""
+    stage: Stage | None = None
+    batch: int = 0
+    attempt: int = 0
+    worker: str = ""
+    done: float = 0.0
+    total: float = 0.0
+    message: str = ""
+    last: bool = False
+    seconds: float = 0.0
+
+    # A newer worker may say more than an older keeper knows.
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+@dataclass(frozen=True)
+class Lease:
+    """A worker's hold on a task. `beat` changes with every sign of life; only its change has a meaning."""
+
+    task_id: str
+    attempt: int
+    worker: str
+    key: str
+    beat: str
+    message: Message | None
+    """What was asked of the worker; None if Redis no longer knows."""
+
+
+@dataclass(frozen=True)
+class WorkerBeat:
+    """What a living worker says about itself."""
+
+    name: str
+    host: str
+    pid: int
+    device: str
+    device_name: str
+    stages: tuple[Stage, ...]
+    version: str
+    state: str
+    """idle, busy or stopping."""
+    task_id: str
+    started: str
+    seen: str
+
+
+class TaskQueue(Protocol):
+    """Carries tasks to workers and their events back. Every method raises QueueUnavailable when Redis is away.
+
+    Nothing here is the truth: whatever is lost is queued again from the index.
+    """
+
+    def ping(self) -> float:
+        """Seconds a round trip takes."""
+
+    def enqueue(self, messages: Sequence[Message], lane: Lane) -> int:
+        """Append tasks to a lane. A task (by id and attempt) that already waits is not queued twice.
+
+        Returns:
+            number of tasks added.
+        """
+
+    def discard(self, task_ids: Collection[str]) -> None:
+        """Take waiting tasks off the queue and tell the workers that run one of them to stop at the next launch."""
+
+    def waiting(self) -> set[str]:
+        """Ids of the tasks in the queue."""
+
+    def depths(self) -> dict[tuple[Lane, Stage], int]:
+        """Number of waiting tasks of each lane and stage."""
+
+    def leases(self) -> list[Lease]:
+        """Tasks held by workers, living or dead. Reading changes nothing."""
+
+    def release(self, lease: Lease) -> None:
+        """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
+
+    def workers(self) -> list[WorkerBeat]:
+        """Workers that gave a sign of life within the last lease."""
+
+    def publish(self, event: Event) -> None:
+        """Append to the bounded stream of events."""
+
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Next events for the keeper, oldest first; those never acknowledged come again after its restart."""
+
+    def acknowledge(self, event_ids: Sequence[str]) -> None:
+        """Say that the events are in the index."""
+
+    def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        """Events after an id, for any number of readers (SSE). `"$"`: only what comes from now on; `"0"`: all kept."""
+
+    def close(self) -> None:
+        """Give the connections back."""
