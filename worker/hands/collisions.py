@@ -1,0 +1,63 @@
+"""Which bodies of a hand touch each other at rest, and so are not to be kept apart."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from scipy.optimize import nnls
+
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel
+from worker.transforms import IDENTITY_POSE, apply
+
+#: Pieces closer than this [m] at rest count as touching.
+TOUCH_M = 1e-4
+
+
+def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
+    """Pairs of bodies (a < b): parent and child, grandparent and grandchild, and those that touch at rest.
+
+    Rest is the pre-shape and the middle of the limits: what touches in both has no room to be apart.
+    """
+    pairs: set[tuple[int, int]] = set()
+    for body in range(1, hand.bodies):
+        parent = int(hand.parent[body])
+        pairs.add((parent, body))
+        if parent > 0:
+            pairs.add((int(hand.parent[parent]), body))
+    postures = (hand.preshape, (hand.lower + hand.upper) / 2)
+    touching = [touching_bodies(hand, q, TOUCH_M) for q in postures]
+    return frozenset(pairs | (touching[0] & touching[1]))
+
+
+def touching_bodies(hand: HandModel, q: Floats, margin: float) -> set[tuple[int, int]]:
+    """Pairs of bodies (a < b) with pieces closer than `margin` [m] at posture q (D,)."""
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
+    corners = [apply(poses[piece.body], piece.vertices) for piece in hand.pieces]
+    boxes = [(c.min(axis=0) - margin, c.max(axis=0) + margin) for c in corners]
+    found: set[tuple[int, int]] = set()
+    for i, j in itertools.combinations(range(len(corners)), 2):
+        a, b = sorted((hand.pieces[i].body, hand.pieces[j].body))
+        if a == b or (a, b) in found or (boxes[i][0] > boxes[j][1]).any() or (boxes[j][0] > boxes[i][1]).any():
+            continue
+        if hull_distance(corners[i], corners[j]) < margin:
+            found.add((a, b))
+    return found
+
+
+def hull_distance(a: Floats, b: Floats) -> float:
+    """Distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 where they overlap.
+
+    Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1, the sums as heavy extra rows.
+    """
+    scale = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))
+    middle = a.mean(axis=0)
+    weight = 1e3
+    rows = np.zeros((5, len(a) + len(b)))
+    rows[:3, : len(a)] = (a - middle).T / scale
+    rows[:3, len(a) :] = -(b - middle).T / scale
+    rows[3, : len(a)] = weight
+    rows[4, len(a) :] = weight
+    solution, _ = nnls(rows, np.array([0, 0, 0, weight, weight]), maxiter=20 * rows.shape[1])
+    return float(np.linalg.norm(rows[:3] @ solution) * scale)

@@ -1,0 +1,149 @@
+"""Guesses for what a URDF does not say: fingertips, closing directions, palm and pre-shape. Each can be overridden."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import HandError
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel, PalmFrame
+from worker.hands.options import HandOptions
+from worker.hands.tree import Tree
+from worker.transforms import IDENTITY_POSE, apply, compose, quat_rotate
+
+#: Share of the way from open to closed at which the hand approaches.
+PRESHAPE_SHARE = 0.25
+
+
+def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
+    """The hand with fingertips, closing, palm and preshape filled in: as stated, else as guessed."""
+    hand = replace(hand, fingertips=_fingertips(hand, tree, options))
+    hand = replace(hand, closing=_closing_by_limits(hand))
+    approach = _stated_approach(tree, options)
+    if approach is None:
+        approach = _guess_approach(hand)
+    # A dof that turns a whole finger about the approach direction spreads it; it closes nothing.
+    axes, at_base = _dof_axes(hand)
+    spread = at_base & (np.abs(axes @ approach) > 0.8)
+    closing = np.where(spread, 0.0, hand.closing)
+    for name, value in options.closing.items():
+        closing[_dof(hand, name)] = np.sign(value)
+    hand = replace(hand, closing=closing)
+    hand = replace(hand, preshape=_preshape(hand, options))
+    return replace(hand, palm=_palm(hand, tree, options, approach))
+
+
+def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
+    """Bodies of the stated links, else the leaves of the tree."""
+    for name in options.fingertips:
+        if name not in tree.links:
+            raise HandError(f"asset.json names the fingertip link {name!r}, which the hand does not have")
+    if options.fingertips:
+        return tuple(dict.fromkeys(tree.links[name][0] for name in options.fingertips))
+    return tuple(body for body in range(1, hand.bodies) if body not in set(hand.parent.tolist()))
+
+
+def _closing_by_limits(hand: HandModel) -> Floats:
+    """Fingers bend far one way and little the other; what moves as far both ways spreads."""
+    up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
+    return np.where(up > 2 * down, 1.0, np.where(down > 2 * up, -1.0, 0.0))
+
+
+def _posture(hand: HandModel, share: float) -> Floats:
+    """(D,) posture at a share of the way from open (0) to closed (1); dofs that close nothing stay near 0."""
+    start = np.where(hand.closing < 0, hand.upper, hand.lower)
+    end = np.where(hand.closing < 0, hand.lower, hand.upper)
+    rest = np.clip(0.0, hand.lower, hand.upper)
+    return np.where(hand.closing == 0, rest, start + share * (end - start))
+
+
+def _tips(hand: HandModel, q: Floats) -> Floats:
+    """(T, 3) centres of the fingertip bodies in the root frame."""
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
+    centre = {p.body: p.vertices.mean(axis=0) for p in hand.pieces}
+    return np.array([apply(poses[b], centre.get(b, np.zeros(3))) for b in hand.fingertips])
+
+
+def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
+    """(D, 3) axis of each dof's own joint in the root frame, hand open; (D,) whether its finger starts there."""
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(_posture(hand, 0.0)))[0]
+    axes, at_base = np.zeros((hand.dofs, 3)), np.zeros(hand.dofs, dtype=bool)
+    for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
+        if name in hand.dof_names:
+            dof = hand.dof_names.index(name)
+            axes[dof] = quat_rotate(poses[body, 3:], hand.axis[body])
+            at_base[dof] = hand.parent[body] == 0
+    return axes, at_base
+
+
+def _guess_approach(hand: HandModel) -> Floats:
+    """Mean direction in which the fingertips move as the hand closes, snapped to a root axis within 40 degrees."""
+    motion = _tips(hand, _posture(hand, 0.6)) - _tips(hand, _posture(hand, 0.1))
+    mean = motion.sum(axis=0)
+    if np.linalg.norm(mean) < 1e-6:
+        return np.array([0.0, 0, 1])
+    mean /= np.linalg.norm(mean)
+    axis = int(np.argmax(np.abs(mean)))
+    if abs(mean[axis]) > np.cos(np.deg2rad(40)):
+        return np.sign(mean[axis]) * np.eye(3)[axis]
+    return mean
+
+
+def _stated_approach(tree: Tree, options: HandOptions) -> Floats | None:
+    stated = options.palm.approach if options.palm and options.palm.approach else options.approach
+    if stated is None:
+        return None
+    if np.linalg.norm(stated) < 1e-9:
+        raise HandError("the palm's approach direction is zero; give a direction such as [0, 0, 1]")
+    _, pose = _palm_link(tree, options)
+    direction = quat_rotate(pose[3:], np.asarray(stated))
+    return direction / np.linalg.norm(direction)
+
+
+def _palm_link(tree: Tree, options: HandOptions) -> tuple[int, Floats]:
+    if options.palm is None:
+        return 0, IDENTITY_POSE
+    if options.palm.link not in tree.links:
+        raise HandError(f"asset.json names the palm link {options.palm.link!r}, which the hand does not have")
+    return tree.links[options.palm.link]
+
+
+def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -> PalmFrame:
+    """The stated palm; else the point where a ray between the finger bases leaves the palm along the approach."""
+    body, link_pose = _palm_link(tree, options)
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
+    pose = compose(poses[body], link_pose)
+    if options.palm and options.palm.centre is not None:
+        return PalmFrame(apply(pose, np.asarray(options.palm.centre)), approach)
+    if options.palm is None:
+        children = np.bincount(hand.parent[1:], minlength=hand.bodies)
+        body = int(np.argmax(children))
+    parts = [apply(poses[body], p.vertices) for p in hand.pieces if p.body == body]
+    bases = poses[[b for b in range(1, hand.bodies) if hand.parent[b] == body], :3]
+    corners = np.concatenate(parts) if parts else poses[body, None, :3]
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    through = (middle + bases.mean(axis=0)) / 2 if len(bases) else middle
+    height = float((corners @ approach).max())
+    return PalmFrame(through + (height - through @ approach) * approach, approach)
+
+
+def _preshape(hand: HandModel, options: HandOptions) -> Floats:
+    q = _posture(hand, PRESHAPE_SHARE)
+    for name, value in options.preshape.items():
+        dof = _dof(hand, name)
+        if not hand.lower[dof] - 1e-6 <= value <= hand.upper[dof] + 1e-6:
+            raise HandError(
+                f"preshape of {name!r} is {value:g}, outside its limits {hand.lower[dof]:.3g} .. {hand.upper[dof]:.3g}"
+            )
+        q[dof] = value
+    return np.clip(q, hand.lower, hand.upper)
+
+
+def _dof(hand: HandModel, name: str) -> int:
+    if name not in hand.dof_names:
+        known = ", ".join(hand.dof_names[:8])
+        raise HandError(f"asset.json names {name!r}, which is no independent joint of the hand ({known}, ...)")
+    return hand.dof_names.index(name)

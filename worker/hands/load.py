@@ -1,0 +1,235 @@
+"""A hand from its files: URDF, meshes, `asset.json`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from service.assets import builtin_files, builtin_names, unpack
+from service.digests import digest_files
+from service.domain import AssetKind
+from service.errors import HandError, NotFoundError
+from service.settings import Settings
+from worker.hands.collisions import resting_neighbours
+from worker.hands.guess import complete
+from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
+from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, PLACEHOLDER_EFFORT, HandOptions, parse_options
+from worker.hands.primitives import volume
+from worker.hands.shapes import find_mesh, make_piece
+from worker.hands.tree import Tree, build_tree, joint_type
+from worker.hands.urdf import Urdf, read_urdf
+from worker.transforms import compose
+
+#: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
+DENSITY = 1000.0
+
+
+def load_hand(
+    files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None
+) -> HandModel:
+    """The hand that `files` describe.
+
+    Args:
+        files: the URDF, its collision meshes and, if there is more to say, `asset.json` (see `HandOptions`).
+        name: name of the hand.
+        digest: digest of its files.
+        options: keys that go over those of `asset.json`.
+
+    Raises:
+        HandError: the files describe no usable hand; the message names what is wrong and the mend.
+    """
+    settings = parse_options(files, options)
+    main = main_file(files, settings)
+    urdf = read_urdf(files[main], main)
+    return assemble(urdf, settings, files, main, name=name, digest=digest)
+
+
+def assemble(
+    urdf: Urdf, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
+) -> HandModel:
+    """The model of a checked URDF and options."""
+    tree = build_tree(urdf, options)
+    pieces = _pieces(urdf, tree, files, str(PurePosixPath(main).parent).removeprefix("."))
+    if not pieces:
+        raise HandError("no link of the hand has collision geometry, so nothing can touch; drop less")
+    moving = [tree.drives[joint.name] if joint else None for joint in tree.joint]
+    dofs = len(tree.dof_names)
+    hand = HandModel(
+        name=name,
+        digest=digest,
+        root_link=tree.body_names[0],
+        body_names=tree.body_names,
+        parent=np.array(tree.parent, dtype=np.int32),
+        joint_type=np.array([joint_type(joint) for joint in tree.joint], dtype=np.int32),
+        origin=np.array(tree.origin),
+        axis=np.array([joint.axis if joint else (1.0, 0, 0) for joint in tree.joint]),
+        dof=np.array([tree.dof_names.index(d.dof) if d else -1 for d in moving], dtype=np.int32),
+        multiplier=np.array([d.multiplier if d else 0.0 for d in moving]),
+        offset=np.array([d.offset if d else 0.0 for d in moving]),
+        dof_names=tree.dof_names,
+        lower=tree.lower,
+        upper=tree.upper,
+        effort=_effort(urdf, tree, options),
+        stiffness=_stiffness(tree, options),
+        preshape=np.clip(np.zeros(dofs), tree.lower, tree.upper),
+        closing=np.zeros(dofs),
+        joint_names=tree.joint_names,
+        joint_body=np.array([_body_of(tree, joint) for joint in tree.joint_names], dtype=np.int32),
+        palm=PalmFrame(np.zeros(3), np.array([0.0, 0, 1])),
+        fingertips=(),
+        pieces=pieces,
+        neighbours=frozenset(),
+        masses=_masses(urdf, tree, pieces),
+    )
+    hand = complete(hand, tree, options)
+    return replace(hand, neighbours=resting_neighbours(hand))
+
+
+def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
+    """Name of the URDF: as `asset.json` says, else the only one."""
+    if options.file:
+        if options.file not in files:
+            raise HandError(f"asset.json names the file {options.file!r}, which is not there")
+        return options.file
+    found = sorted(name for name in files if name.lower().endswith((".urdf", ".xml")))
+    if len(found) != 1:
+        raise HandError(f'{len(found)} URDF files among the hand\'s files; name one in asset.json under "file"')
+    return found[0]
+
+
+def _pieces(urdf: Urdf, tree: Tree, files: Mapping[str, bytes], base: str) -> tuple[ConvexPiece, ...]:
+    pieces = []
+    for link, (body, pose) in tree.links.items():
+        for shape in urdf.links[link].shapes:
+            placed = compose(pose, shape.pose)
+            pieces.append(make_piece(shape, body=body, pose=placed, link=link, files=files, base=base))
+    return tuple(pieces)
+
+
+def _body_of(tree: Tree, joint: str) -> int:
+    return next(body for body, carried in enumerate(tree.joint) if carried and carried.name == joint)
+
+
+def _effort(urdf: Urdf, tree: Tree, options: HandOptions) -> Floats:
+    """(D,) stated, else the URDF's unless that is a placeholder."""
+    stated = options.effort if isinstance(options.effort, dict) else {}
+    values = []
+    for dof in tree.dof_names:
+        effort = urdf.joints[dof].effort
+        if isinstance(options.effort, float):
+            effort = options.effort
+        elif dof in stated:
+            effort = stated[dof]
+        elif effort <= 0 or effort >= PLACEHOLDER_EFFORT:
+            effort = DEFAULT_EFFORT
+        if effort <= 0:
+            raise HandError(f"the effort of {dof!r} is {effort:g}; it must be positive")
+        values.append(effort)
+    return np.array(values)
+
+
+def _stiffness(tree: Tree, options: HandOptions) -> Floats:
+    stated = options.stiffness
+    values = [stated.get(d, DEFAULT_STIFFNESS) if isinstance(stated, dict) else stated for d in tree.dof_names]
+    if min(values) <= 0:
+        raise HandError("a stiffness in asset.json is not positive")
+    return np.array(values)
+
+
+def _masses(urdf: Urdf, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats:
+    masses = np.zeros(len(tree.body_names))
+    for link, (body, _) in tree.links.items():
+        mass = urdf.links[link].mass
+        if mass is None:
+            mine = [p for p in pieces if p.link == link]
+            mass = DENSITY * sum(volume(p.kind, p.size, p.vertices, p.faces) for p in mine)
+        masses[body] += mass
+    # A body of empty frames only still needs a mass in simulations that move it.
+    return np.maximum(masses, 1e-3)
+
+
+def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None) -> HandModel:
+    """A hand for the command line: name of a built-in, a URDF, or a ZIP of its folder.
+
+    Raises:
+        NotFoundError: neither a file nor a built-in hand.
+        HandError: see `load_hand`.
+    """
+    name, files, stated = files_from_path(path)
+    return load_hand(
+        files, name=name, digest=digest_files(AssetKind.HAND, files), options={**stated, **(options or {})}
+    )
+
+
+def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
+    """Name, files and further options of the hand at `path`; only files inside the URDF's folder are read."""
+    path = Path(path)
+    if not path.is_file():
+        if str(path) in builtin_names(AssetKind.HAND):
+            return str(path), builtin_files(AssetKind.HAND, str(path)), {}
+        known = ", ".join(builtin_names(AssetKind.HAND))
+        raise NotFoundError(f"{path} is neither a file nor a built-in hand ({known})")
+    if path.suffix.lower() == ".zip":
+        return path.stem, unpack(path.read_bytes(), limit_bytes=8 * Settings().max_upload_bytes), {}
+    files = {path.name: path.read_bytes()}
+    folder = path.parent.resolve()
+    for reference in mesh_references(files[path.name], path.name):
+        for mesh in sorted(_candidates(folder, reference)):
+            files[mesh] = (folder / mesh).read_bytes()
+    beside = folder / "asset.json"
+    if beside.is_file():
+        files["asset.json"] = beside.read_bytes()
+        return path.stem, files, {"file": path.name}
+    described = folder / "hand.json"
+    return (
+        path.stem,
+        files,
+        {"file": path.name, **(read_hand_json(described, path.name) if described.is_file() else {})},
+    )
+
+
+def mesh_references(urdf: bytes, filename: str) -> list[str]:
+    """Names of the collision meshes as the URDF writes them."""
+    links = read_urdf(urdf, filename).links.values()
+    return sorted({shape.filename for link in links for shape in link.shapes if shape.filename})
+
+
+def _candidates(folder: Path, reference: str) -> set[str]:
+    """Relative names of existing files that the reference may mean; links that lead out of the folder are not."""
+    path = reference.partition("://")[2] or reference
+    shorter = "/".join(PurePosixPath(path).parts[1:]) if "://" in reference else ""
+    found = set()
+    for name in filter(None, (path, shorter)):
+        target = (folder / name).resolve()
+        if target.is_file() and target.is_relative_to(folder):
+            found.add(PurePosixPath(name).as_posix())
+    return found
+
+
+def read_hand_json(path: Path, urdf_name: str) -> dict[str, Any]:
+    """Options from a `hand.json` of reference data: palm link and normal, fingertip links, torque limit."""
+    try:
+        facts = json.loads(path.read_bytes())
+        if facts.get("urdf", urdf_name) != urdf_name:
+            return {}
+        options: dict[str, Any] = {}
+        if "palm_link" in facts:
+            options["palm"] = {"link": facts["palm_link"], "approach": facts.get("palm_normal_in_palm_link")}
+            # Forearm and wrist carry no grasp: what lies above the palm is left out.
+            options["root"] = facts["palm_link"]
+        if facts.get("fingertips"):
+            options["fingertips"] = list(dict(facts["fingertips"]).values())
+        limits = [v for k, v in facts.get("physical", {}).items() if k.startswith("torque_limit_Nm")]
+        if limits:
+            options["effort"] = float(limits[0])
+    except (ValueError, TypeError, AttributeError):
+        raise HandError(f"{path} is not a readable description of a hand; correct or remove it") from None
+    return options
+
+
+__all__ = ["files_from_path", "find_mesh", "hand_from_path", "load_hand"]

@@ -1,0 +1,156 @@
+"""Convex solids: tessellation, area, surface samples and signed distance, exact for the round kinds.
+
+All functions work in the solid's own frame; cylinders and capsules stand along z, centred.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from service.errors import HandError
+from worker.hands.model import Floats, Ints
+
+#: Corners of a circle in tessellations: the chord stays within 0.5 % of the radius.
+SEGMENTS = 32
+
+
+def hull(points: Floats) -> tuple[Floats, Ints]:
+    """Corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
+
+    Raises:
+        HandError: the points lie in a plane.
+    """
+    scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if len(points) < 4 or scale <= 0:
+        raise HandError("a collision shape has no volume; give it at least four points that are not in one plane")
+    try:
+        qhull = ConvexHull((points - points.mean(axis=0)) / scale)
+    except QhullError:
+        raise HandError("a collision shape is flat; give it a thickness") from None
+    keep, faces = np.unique(qhull.simplices, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    vertices = points[keep]
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), qhull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces.astype(np.int32)
+
+
+def tessellate(kind: str, size: tuple[float, ...]) -> tuple[Floats, Ints]:
+    """Corners and outward triangles of a primitive; corners of round kinds lie on the true surface."""
+    if kind == "box":
+        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        return hull(corners * np.asarray(size))
+    radius = size[0]
+    angle = np.arange(SEGMENTS) * (2 * math.pi / SEGMENTS)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)], axis=1)
+    if kind == "cylinder":
+        return hull(np.concatenate([ring * radius + [0, 0, z] for z in (-size[1] / 2, size[1] / 2)]))
+    half = size[1] / 2 if kind == "capsule" else 0.0
+    latitude = np.linspace(0, math.pi / 2, SEGMENTS // 4 + 1)[:-1]
+    cap = np.concatenate([ring * math.cos(t) + [0, 0, math.sin(t)] for t in latitude] + [np.array([[0.0, 0, 1]])])
+    top = cap * radius + [0, 0, half]
+    return hull(np.concatenate([top, top * [1, 1, -1]]))
+
+
+def area(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
+    """Surface area [m^2]; closed form for primitives, sum of triangles for hulls."""
+    match kind:
+        case "box":
+            x, y, z = size
+            return 2 * (x * y + y * z + z * x)
+        case "sphere":
+            return 4 * math.pi * size[0] ** 2
+        case "cylinder":
+            return 2 * math.pi * size[0] * (size[0] + size[1])
+        case "capsule":
+            return 2 * math.pi * size[0] * (2 * size[0] + size[1])
+        case _:
+            return float(triangle_areas(vertices, faces).sum())
+
+
+def volume(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
+    """Volume [m^3]; closed form for primitives."""
+    match kind:
+        case "box":
+            return float(np.prod(size))
+        case "sphere":
+            return 4 / 3 * math.pi * size[0] ** 3
+        case "cylinder":
+            return math.pi * size[0] ** 2 * size[1]
+        case "capsule":
+            return math.pi * size[0] ** 2 * (4 / 3 * size[0] + size[1])
+        case _:
+            a, b, c = np.moveaxis(vertices[faces] - vertices[0], 1, 0)
+            return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def triangle_areas(vertices: Floats, faces: Ints) -> Floats:
+    """(F,) areas."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def sample(
+    kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, count: int, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Area-uniform points (count, 3) on the surface with outward normals (count, 3)."""
+    if kind in ("sphere", "cylinder", "capsule"):
+        return _sample_round(kind, size, count, rng)
+    areas = triangle_areas(vertices, faces)
+    # Stratified over the faces: the number on each is its share, rounded up or down.
+    ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
+    face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
+    a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
+    u, v = rng.random((2, count, 1))
+    root = np.sqrt(u)
+    points = a * (1 - root) + b * (root * (1 - v)) + c * (root * v)
+    normals = np.cross(b - a, c - a)
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _sample_round(kind: str, size: tuple[float, ...], count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    radius, length = size[0], size[1] if len(size) > 1 else 0.0
+    angle = rng.random(count) * 2 * math.pi
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    up = np.array([0.0, 0, 1])
+    if kind == "cylinder":
+        side = 2 * math.pi * radius * length
+        on_side = np.sort(rng.random(count)) < side / (side + 2 * math.pi * radius**2)
+        end = np.where(rng.random((count, 1)) < 0.5, -1.0, 1.0)
+        wall = around * radius + up * ((rng.random((count, 1)) - 0.5) * length)
+        cap = around * (radius * np.sqrt(rng.random((count, 1)))) + up * (end * length / 2)
+        return np.where(on_side[:, None], wall, cap), np.where(on_side[:, None], around, up * end)
+    # By Archimedes a sphere's area is uniform in height, and so is the area of a cylinder of the same radius.
+    height = (rng.random(count) - 0.5) * (2 * radius + length)
+    offset = np.clip(height, -length / 2, length / 2)
+    z = np.clip((height - offset) / radius, -1, 1)
+    normal = around * np.sqrt(1 - z**2)[:, None] + up * z[:, None]
+    return normal * radius + up * offset[:, None], normal
+
+
+def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, points: Floats) -> Floats:
+    """(N,) distance of points (N, 3), negative inside.
+
+    Exact inside every kind and everywhere for spheres and capsules; outside boxes, cylinders and hulls it is a lower
+    bound with the right sign.
+    """
+    match kind:
+        case "box":
+            return (np.abs(points) - np.asarray(size) / 2).max(axis=1)
+        case "sphere":
+            return np.linalg.norm(points, axis=1) - size[0]
+        case "cylinder":
+            radial = np.linalg.norm(points[:, :2], axis=1) - size[0]
+            return np.maximum(radial, np.abs(points[:, 2]) - size[1] / 2)
+        case "capsule":
+            axis = np.clip(points[:, 2], -size[1] / 2, size[1] / 2)
+            return np.linalg.norm(points - np.stack([axis * 0, axis * 0, axis], axis=1), axis=1) - size[0]
+        case _:
+            a, b, c = np.moveaxis(vertices[faces], 1, 0)
+            normals = np.cross(b - a, c - a)
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            return (points @ normals.T - np.einsum("ij,ij->i", normals, a)).max(axis=1)

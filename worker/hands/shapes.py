@@ -1,0 +1,130 @@
+"""Collision elements of a URDF as convex pieces: primitives stay exact, meshes become reduced convex hulls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import PurePosixPath
+from typing import Final
+
+import numpy as np
+
+from service.assets import check_path
+from service.errors import HandError, InputError, MeshError
+from worker.hands.model import ConvexPiece, Floats, Ints
+from worker.hands.primitives import hull, tessellate, volume
+from worker.hands.urdf import Shape
+from worker.objects.formats import read_mesh
+from worker.transforms import IDENTITY_POSE, apply
+
+#: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
+MAX_HULL_VERTICES: Final = 50
+#: A link longer than this [m] is a mesh in millimetres without a scale.
+MAX_PIECE_M: Final = 2.0
+
+
+def make_piece(
+    shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str
+) -> ConvexPiece:
+    """The convex piece of a collision element.
+
+    Args:
+        shape: the element.
+        body: index of the body it moves with.
+        pose: (7,) pose of the element's frame in the body frame.
+        link: URDF link it comes from.
+        files: all files of the hand.
+        base: folder of the URDF inside `files`.
+
+    Raises:
+        HandError: a mesh is missing, outside the upload, unreadable, flat or far too large.
+    """
+    if shape.kind != "mesh":
+        vertices, faces = tessellate(shape.kind, shape.size)
+        return ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)
+    name = find_mesh(shape.filename, files, base, link)
+    try:
+        points = read_mesh(name, files[name]).vertices * np.asarray(shape.size)
+    except MeshError as error:
+        raise HandError(f"collision mesh of link {link!r}: {error}") from None
+    if np.ptp(points, axis=0).max() > MAX_PIECE_M:
+        raise HandError(
+            f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
+            'if it is in millimetres give it scale="0.001 0.001 0.001"'
+        )
+    vertices, faces = reduce_hull(points)
+    return ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
+
+
+def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
+    """Name in `files` of a mesh as the URDF writes it; `package://NAME/rest` is sought as rest and as NAME/rest."""
+    scheme, separator, rest = filename.partition("://")
+    path = rest if separator else filename
+    if separator and scheme not in ("package", "model", "file"):
+        raise HandError(f"mesh {filename!r} of link {link!r} is no file of this hand; put it beside the URDF")
+    try:
+        path = check_path(path.lstrip("/") if scheme == "file" else path) if ".." not in path else _inside(path, base)
+    except InputError:
+        raise HandError(f"mesh {filename!r} of link {link!r} lies outside the hand's folder; put it inside") from None
+    tries = [path]
+    if separator:
+        # The folder of a ROS package may be packed with or without its name.
+        tries += [str(PurePosixPath(*PurePosixPath(path).parts[1:]))]
+    for name in tries:
+        for folder in (base, ""):
+            full = str(PurePosixPath(folder) / name) if folder else name
+            if full in files:
+                return full
+    hint = "unknown package: " if scheme == "package" else ""
+    raise HandError(f"mesh {filename!r} of link {link!r} is not there ({hint}looked for {tries[-1]!r}); add the file")
+
+
+def _inside(path: str, base: str) -> str:
+    """`../meshes/x` resolved against the URDF's folder, if that stays inside the upload."""
+    parts = list(PurePosixPath(base).parts)
+    for part in PurePosixPath(path).parts:
+        if part == "..":
+            if not parts:
+                raise InputError("outside")
+            parts.pop()
+        else:
+            parts.append(part)
+    return check_path("/".join(parts))
+
+
+def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:
+    """Convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
+
+    The corners are chosen one by one where the hull so far is farthest from the full one, then grown about their
+    centroid until the volumes agree: the surface errs to both sides by half of what an inscribed hull would.
+    """
+    vertices, faces = hull(points)
+    if len(vertices) <= limit:
+        return vertices, faces
+    return _reduced(vertices.tobytes(), limit)
+
+
+@lru_cache(maxsize=64)
+def _reduced(data: bytes, limit: int) -> tuple[Floats, Ints]:
+    """Cached, because a hand often uses one fingertip mesh several times."""
+    vertices = np.frombuffer(data).reshape(-1, 3)
+    full = volume("hull", (), *hull(vertices))
+    directions = np.concatenate([np.eye(3), -np.eye(3)])
+    chosen = list(dict.fromkeys(np.argmax(vertices @ directions.T, axis=0).tolist()))
+    while len(chosen) < limit:
+        corners, faces = hull(vertices[chosen]) if len(chosen) >= 4 else (vertices[chosen], None)
+        if faces is None:
+            outside = np.linalg.norm(vertices[:, None] - corners[None], axis=2).min(axis=1)
+        else:
+            a, b, c = np.moveaxis(corners[faces], 1, 0)
+            normal = np.cross(b - a, c - a)
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            outside = (vertices @ normal.T - np.einsum("ij,ij->i", normal, a)).max(axis=1)
+        farthest = int(np.argmax(outside))
+        if farthest in chosen:
+            break
+        chosen.append(farthest)
+    corners, faces = hull(vertices[chosen])
+    centre = corners.mean(axis=0)
+    growth = (full / volume("hull", (), corners, faces)) ** (1 / 3)
+    return centre + (corners - centre) * growth, faces

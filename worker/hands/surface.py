@@ -1,0 +1,161 @@
+"""A fixed sample of the hand's outer surface: even, with normals and the area each point stands for."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from service.errors import HandError
+from worker.hands import primitives
+from worker.hands.kinematics import body_poses
+from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints
+from worker.transforms import IDENTITY_POSE, apply, invert, quat_rotate
+
+#: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
+OVERSAMPLING: Final = 5
+#: Candidates on the whole hand at least: what the exterior area is measured with.
+MIN_CANDIDATES: Final = 12_000
+#: A point this deep inside another body at rest can never touch an object [m].
+BURIED_M: Final = 5e-4
+#: Two faces of one body this close are the same face [m].
+COINCIDENT_M: Final = 1e-6
+
+
+def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoints:
+    """Exactly `count` points on the union of the hand's pieces.
+
+    Area-uniform candidates are thinned to a blue-noise subset, body by body, by farthest-point selection; each point
+    then gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside
+    another piece carry no points. The same arguments give the same points, bit for bit.
+
+    Raises:
+        HandError: the hand has no outer surface.
+    """
+    key = (hand.digest, hand.root_link, hand.dofs, len(hand.pieces), count, seed)
+    cached = _CACHE.get(key)
+    if cached is None or cached[0] is not hand.pieces:
+        cached = (hand.pieces, _sample(hand, count, seed))
+        if len(_CACHE) >= _CACHE_SIZE:
+            _CACHE.pop(next(iter(_CACHE)))
+        _CACHE[key] = cached
+    return cached[1]
+
+
+_CACHE_SIZE: Final = 32
+_CACHE: dict[tuple[object, ...], tuple[tuple[ConvexPiece, ...], SurfacePoints]] = {}
+
+
+def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
+    candidates = _candidates(hand, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
+    if len(candidates) < count:
+        # Most of the surface is hidden inside other pieces: look harder once, in proportion.
+        more = max(OVERSAMPLING * count, MIN_CANDIDATES) * count * OVERSAMPLING // max(len(candidates), 1)
+        candidates = _candidates(hand, min(more, 5_000_000), seed)
+    if len(candidates) < count:
+        raise HandError(f"the hand's outer surface gives {len(candidates)} points of {count}; ask for fewer")
+    area_of_body = np.bincount(candidates.body, candidates.area, minlength=hand.bodies).astype(float)
+    available = np.bincount(candidates.body, minlength=hand.bodies)
+    quota = apportion(area_of_body, count, available)
+    chosen: list[NDArray[np.intp]] = []
+    areas: list[Floats] = []
+    for body in np.flatnonzero(quota):
+        mine = np.flatnonzero(candidates.body == body)
+        spacing = np.sqrt(area_of_body[body] / quota[body])
+        # Normals enter the distance, so that the two sides of a thin plate do not thin each other out.
+        place = np.hstack([candidates.position[mine], 0.5 * spacing * candidates.normal[mine]])
+        picked = farthest_points(place, int(quota[body]))
+        _, owner = cKDTree(place[picked]).query(place)
+        areas.append(np.bincount(owner, candidates.area[mine], minlength=len(picked)).astype(float))
+        chosen.append(mine[picked])
+    index = np.concatenate(chosen)
+    return SurfacePoints(
+        candidates.body[index], candidates.position[index], candidates.normal[index], np.concatenate(areas)
+    )
+
+
+def _candidates(hand: HandModel, count: int, seed: int) -> SurfacePoints:
+    """About `count` area-uniform points on the pieces, without those that are buried."""
+    rng = np.random.default_rng([seed, 0x5EED])
+    shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])
+    numbers = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 8)
+    rest = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
+    bodies, positions, normals, areas = [], [], [], []
+    for i, (piece, number) in enumerate(zip(hand.pieces, numbers, strict=True)):
+        local, direction = primitives.sample(
+            piece.kind, piece.size, _local_vertices(piece), piece.faces, int(number), rng
+        )
+        position = apply(piece.pose, local)
+        normal = quat_rotate(piece.pose[3:], direction)
+        keep = ~_buried(hand, i, position, normal, rest)
+        bodies.append(np.full(int(keep.sum()), piece.body, dtype=np.int32))
+        positions.append(position[keep])
+        normals.append(normal[keep])
+        areas.append(np.full(int(keep.sum()), shares[i] / number))
+    return SurfacePoints(*(np.concatenate(parts) for parts in (bodies, positions, normals, areas)))
+
+
+def _local_vertices(piece: ConvexPiece) -> Floats:
+    return apply(invert(piece.pose), piece.vertices)
+
+
+def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
+    """(N,) signed distance of points (N, 3) in the body frame to a piece, negative inside [m]."""
+    local = apply(invert(piece.pose), points)
+    return primitives.signed_distance(piece.kind, piece.size, _local_vertices(piece), piece.faces, local)
+
+
+def _buried(hand: HandModel, own: int, position: Floats, normal: Floats, rest: Floats) -> NDArray[np.bool_]:
+    """(N,) whether points of piece `own` lie inside another piece, or on a face that an earlier piece already has."""
+    mine = hand.pieces[own]
+    above = position + COINCIDENT_M * normal
+    below = position - COINCIDENT_M * normal
+    world = apply(rest[mine.body], position)
+    low, high = world.min(axis=0), world.max(axis=0)
+    buried = np.zeros(len(position), dtype=bool)
+    for other, piece in enumerate(hand.pieces):
+        if other == own:
+            continue
+        corners = apply(rest[piece.body], piece.vertices)
+        if (corners.min(axis=0) > high + BURIED_M).any() or (corners.max(axis=0) < low - BURIED_M).any():
+            continue
+        if piece.body != mine.body:
+            local = apply(invert(rest[piece.body]), world)
+            buried |= piece_distance(piece, local) < -BURIED_M
+            continue
+        buried |= piece_distance(piece, above) < 0
+        if other < own:
+            buried |= (piece_distance(piece, below) < 0) & (np.abs(piece_distance(piece, position)) < COINCIDENT_M)
+    return buried
+
+
+def apportion(weights: Floats, count: int, available: NDArray[np.intp]) -> NDArray[np.int64]:
+    """`count` seats by largest remainder in proportion to weights (L,), none above what is available (L,)."""
+    seats = np.zeros(len(weights), dtype=np.int64)
+    while (left := count - int(seats.sum())) > 0:
+        open_weights = np.where(seats < available, weights, 0.0)
+        if open_weights.sum() <= 0:
+            open_weights = (seats < available).astype(float)
+        exact = left * open_weights / open_weights.sum()
+        more = np.floor(exact).astype(np.int64)
+        order = np.argsort(more - exact, kind="stable")
+        more[order[: left - int(more.sum())]] += 1
+        seats = np.minimum(seats + more, available)
+    return seats
+
+
+def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
+    """Indices of `count` points of (N, K), each chosen farthest from those before it (Gonzalez 1985)."""
+    chosen = np.empty(count, dtype=np.intp)
+    chosen[0] = int(np.argmax(((points - points.mean(axis=0)) ** 2).sum(axis=1)))
+    nearest = np.full(len(points), np.inf)
+    squares = np.einsum("ij,ij->i", points, points)
+    for i in range(1, count):
+        last = points[chosen[i - 1]]
+        np.minimum(nearest, squares - 2 * (points @ last) + last @ last, out=nearest)
+        # Rounding may leave the point itself a hair above another: it must not come twice.
+        nearest[chosen[i - 1]] = -1.0
+        chosen[i] = int(np.argmax(nearest))
+    return chosen

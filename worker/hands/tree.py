@@ -1,0 +1,196 @@
+"""From URDF joints to a tree of bodies: fixed joints merged, mimic chains resolved, dropped links left out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.errors import HandError
+from worker.hands.model import Floats, JointType
+from worker.hands.options import HandOptions
+from worker.hands.urdf import Joint, Mimic, Urdf
+from worker.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How a moving joint follows a degree of freedom: multiplier * value of joint `dof` + offset."""
+
+    dof: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Bodies in an order in which parents come first; body 0 is the root."""
+
+    body_names: tuple[str, ...]
+    parent: tuple[int, ...]
+    joint: tuple[Joint | None, ...]
+    """The moving joint that carries each body; None for the root."""
+    origin: tuple[Floats, ...]
+    """(7,) pose of the joint frame in the parent's body frame."""
+    links: dict[str, tuple[int, Floats]]
+    """Each kept link: its body and its pose in the body's frame."""
+    drives: dict[str, Drive]
+    """Each moving joint."""
+    joint_names: tuple[str, ...]
+    """Moving joints in URDF order."""
+    dof_names: tuple[str, ...]
+    """Independent joints in URDF order."""
+    lower: Floats
+    upper: Floats
+
+
+def build_tree(urdf: Urdf, options: HandOptions) -> Tree:
+    """The body tree of a hand.
+
+    Raises:
+        HandError: an option names a joint or link that is not there, nothing is left to move, or couplings leave a
+            degree of freedom no room.
+    """
+    _check_names(urdf, options)
+    mimics = {name: joint.mimic for name, joint in urdf.joints.items()}
+    mimics |= {name: Mimic(c.of, c.multiplier, c.offset) for name, c in options.couplings.items()}
+    root = _pick_root(urdf, options)
+    kept = _kept_joints(urdf, root, set(options.drop))
+    drives = {j.name: _resolve(j.name, mimics, urdf, options) for j in kept if j.type != "fixed"}
+    frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
+    moving = {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
+    for name, drive in moving.items():
+        if drive.dof not in moving:
+            raise HandError(f"joint {name!r} follows {drive.dof!r}, which is dropped; fix it: --fix {name}=0")
+    if not moving:
+        raise HandError("no moving joint is left; fix or drop less")
+    names = tuple(name for name in urdf.joints if name in moving)
+    dofs = tuple(name for name in names if moving[name].dof == name)
+    lower, upper = np.array([_fold_limits(dof, moving, urdf) for dof in dofs]).T
+    bodies, parents, joints, origins, links = _walk(urdf, root, kept, frozen)
+    return Tree(bodies, parents, joints, origins, links, moving, names, dofs, lower, upper)
+
+
+def _check_names(urdf: Urdf, options: HandOptions) -> None:
+    joints = [*options.fix, *options.couplings, *(c.of for c in options.couplings.values())]
+    links = [*options.drop, *([options.root] if options.root else [])]
+    for kind, names, known in (("joint", joints, set(urdf.joints)), ("link", links, set(urdf.links))):
+        for name in names:
+            if name not in known:
+                raise HandError(f"asset.json names the {kind} {name!r}, which the URDF does not have")
+            if kind == "joint" and urdf.joints[name].type == "fixed":
+                raise HandError(f"asset.json names the joint {name!r}, which cannot move")
+
+
+def _pick_root(urdf: Urdf, options: HandOptions) -> str:
+    """The chosen root; else the URDF's, moved down past dropped links and empty frames joined by fixed joints."""
+    if options.root:
+        return options.root
+    root, drop = urdf.root, set(options.drop)
+    while root in drop:
+        children = [j.child for j in urdf.joints.values() if j.parent == root]
+        if len(children) != 1:
+            raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
+        root = children[0]
+    return root
+
+
+def _kept_joints(urdf: Urdf, root: str, drop: set[str]) -> list[Joint]:
+    """Joints below the root and not below a dropped link, in URDF order."""
+    children: dict[str, list[Joint]] = {}
+    for joint in urdf.joints.values():
+        children.setdefault(joint.parent, []).append(joint)
+    kept: set[str] = set()
+    stack = [root]
+    while stack:
+        for joint in children.get(stack.pop(), []):
+            if joint.child not in drop:
+                kept.add(joint.name)
+                stack.append(joint.child)
+    return [joint for joint in urdf.joints.values() if joint.name in kept]
+
+
+def _resolve(name: str, mimics: dict[str, Mimic | None], urdf: Urdf, options: HandOptions) -> Drive | float:
+    """The drive of a joint through a chain of mimics, or its constant value if the chain ends at a fixed joint.
+
+    q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
+    """
+    multiplier, offset, at = 1.0, 0.0, name
+    seen = {name}
+    while True:
+        if at in options.fix:
+            return multiplier * options.fix[at] + offset
+        mimic = mimics[at]
+        if mimic is None:
+            break
+        offset += multiplier * mimic.offset
+        multiplier *= mimic.multiplier
+        at = mimic.joint
+        if at in seen:
+            raise HandError(f"joint {name!r} mimics itself through {at!r}; free one of them")
+        seen.add(at)
+    return Drive(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
+
+
+def _fold_limits(dof: str, moving: dict[str, Drive], urdf: Urdf) -> tuple[float, float]:
+    """Range of a dof in which every joint that follows it stays inside its own limits."""
+    lower, upper = -math.inf, math.inf
+    for name, drive in moving.items():
+        if drive.dof != dof:
+            continue
+        joint = urdf.joints[name]
+        ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
+        lower, upper = max(lower, ends[0]), min(upper, ends[1])
+    if lower > upper:
+        raise HandError(
+            f"the limits of the joints that follow {dof!r} leave it no room; correct the coupling or limits"
+        )
+    return lower, upper
+
+
+def _walk(
+    urdf: Urdf, root: str, kept: list[Joint], frozen: dict[str, float]
+) -> tuple[
+    tuple[str, ...], tuple[int, ...], tuple[Joint | None, ...], tuple[Floats, ...], dict[str, tuple[int, Floats]]
+]:
+    """Bodies by depth-first descent; a link behind a fixed or frozen joint joins its parent's body."""
+    names, parents = [root], [-1]
+    joints: list[Joint | None] = [None]
+    origins = [IDENTITY_POSE.copy()]
+    links = {root: (0, IDENTITY_POSE.copy())}
+    children: dict[str, list[Joint]] = {}
+    for joint in kept:
+        children.setdefault(joint.parent, []).append(joint)
+    stack = children.get(root, [])[::-1]
+    while stack:
+        joint = stack.pop()
+        body, pose = links[joint.parent]
+        frame = compose(pose, joint.origin)
+        if joint.type == "fixed" or joint.name in frozen:
+            links[joint.child] = (body, compose(frame, joint_motion(joint, frozen.get(joint.name, 0.0))))
+        else:
+            links[joint.child] = (len(names), IDENTITY_POSE.copy())
+            names.append(joint.child)
+            parents.append(body)
+            joints.append(joint)
+            origins.append(frame)
+        stack += children.get(joint.child, [])[::-1]
+    return tuple(names), tuple(parents), tuple(joints), tuple(origins), links
+
+
+def joint_motion(joint: Joint, value: float) -> Floats:
+    """(7,) pose of the child's frame in the joint frame at a joint value [rad or m]."""
+    motion = IDENTITY_POSE.copy()
+    if joint.type == "prismatic":
+        motion[:3] = joint.axis * value
+    elif joint.type != "fixed":
+        motion[3:] = quat_from_axis_angle(joint.axis, np.asarray(value))
+    return motion
+
+
+def joint_type(joint: Joint | None) -> JointType:
+    """Type in the model: a continuous joint is a revolute one."""
+    if joint is None:
+        return JointType.FIXED
+    return JointType.PRISMATIC if joint.type == "prismatic" else JointType.REVOLUTE

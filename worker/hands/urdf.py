@@ -1,0 +1,314 @@
+"""Read a URDF written by a stranger: every value is checked here, so that nothing behind this module has to.
+
+The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
+wrongly; this reader refuses each by name. It knows only what a hand needs: links with collision shapes and masses, and
+joints.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from defusedxml import ElementTree as SafeTree
+from defusedxml.common import DefusedXmlException
+
+from service.errors import HandError, LimitError
+from worker.transforms import Floats, quat_from_axis_angle, quat_multiply
+
+MAX_BYTES: Final = 4 * 2**20
+MAX_LINKS: Final = 256
+MAX_SHAPES: Final = 1024
+#: No part of a robot hand lies farther than this from its parent [m]; larger numbers are a unit mistake.
+MAX_LENGTH_M: Final = 10.0
+MOVING: Final = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One collision element. Size: box x y z; sphere r; cylinder and capsule r, length [m]; mesh: its scale."""
+
+    kind: str
+    size: tuple[float, ...]
+    pose: Floats
+    filename: str = ""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A link; mass is None where the URDF gives none."""
+
+    name: str
+    shapes: tuple[Shape, ...]
+    mass: float | None
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """value = multiplier * value of `joint` + offset."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint; the axis has length 1, limits are finite and ordered for moving joints."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: Floats
+    axis: Floats
+    lower: float
+    upper: float
+    effort: float
+    mimic: Mimic | None
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A checked URDF: links and joints form one tree."""
+
+    name: str
+    links: dict[str, Link]
+    joints: dict[str, Joint]
+    root: str
+    notes: tuple[str, ...] = field(default=())
+    """Oddities that were taken but should be told to the user."""
+
+
+def read_urdf(data: bytes, filename: str = "the URDF") -> Urdf:
+    """Checked contents of a URDF.
+
+    Raises:
+        HandError: not XML, not a robot, or a value that no hand can have; the message names it.
+        LimitError: larger than the limits of this module.
+    """
+    robot = _parse_xml(data, filename)
+    notes: list[str] = []
+    links: dict[str, Link] = {}
+    for element in robot.findall("link"):
+        link = _read_link(element)
+        if link.name in links:
+            raise HandError(f"{filename}: duplicate link name {link.name!r}; rename one of them")
+        links[link.name] = link
+    joints: dict[str, Joint] = {}
+    for element in robot.findall("joint"):
+        joint = _read_joint(element, notes)
+        if joint.name in joints:
+            raise HandError(f"{filename}: duplicate joint name {joint.name!r}; rename one of them")
+        joints[joint.name] = joint
+    if len(links) > MAX_LINKS or sum(len(link.shapes) for link in links.values()) > MAX_SHAPES:
+        raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
+    root = _check_tree(links, joints, filename)
+    _check_mimics(joints, filename)
+    if not any(joint.type in MOVING for joint in joints.values()):
+        raise HandError(f"{filename}: no moving joint; a hand needs at least one revolute or prismatic joint")
+    if not any(link.shapes for link in links.values()):
+        raise HandError(f"{filename}: no link has collision geometry, so nothing can touch; add <collision> elements")
+    return Urdf(robot.get("name", ""), links, joints, root, tuple(notes))
+
+
+def _parse_xml(data: bytes, filename: str) -> ElementTree.Element:
+    if len(data) > MAX_BYTES:
+        raise LimitError(f"{filename}: {len(data)} bytes of XML; at most {MAX_BYTES} are taken")
+    try:
+        root: ElementTree.Element = SafeTree.fromstring(data)
+    except DefusedXmlException:
+        raise HandError(f"{filename}: XML entities are refused; write the text out") from None
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise HandError(f"{filename}: not well-formed XML ({error}); export the URDF again") from None
+    if root.tag != "robot":
+        raise HandError(f"{filename}: the XML root is <{root.tag[:40]}>, a URDF begins with <robot>")
+    return root
+
+
+def _read_link(element: ElementTree.Element) -> Link:
+    name = _name(element, "link")
+    shapes = tuple(_read_shape(collision, name) for collision in element.findall("collision"))
+    mass_element = element.find("inertial/mass")
+    mass = None if mass_element is None else _number(mass_element, "value", f"mass of link {name!r}")
+    if mass is not None and mass < 0:
+        raise HandError(f"mass of link {name!r} is negative; give it in kilograms")
+    return Link(name, shapes, mass if mass else None)
+
+
+def _read_shape(collision: ElementTree.Element, link: str) -> Shape:
+    what = f"collision of link {link!r}"
+    pose = _origin(collision, what)
+    geometry = collision.find("geometry")
+    shape = None if geometry is None else next(iter(geometry), None)
+    if shape is None:
+        raise HandError(f"{what} has no geometry; give a box, cylinder, sphere, capsule or mesh")
+    match shape.tag:
+        case "box":
+            size = _vector(shape, "size", what)
+        case "sphere":
+            size = (_number(shape, "radius", what),)
+        case "cylinder" | "capsule":
+            size = (_number(shape, "radius", what), _number(shape, "length", what))
+        case "mesh":
+            filename = shape.get("filename", "")
+            if not filename or len(filename) > 1000:
+                raise HandError(f"{what}: the mesh has no file name")
+            scale = _vector(shape, "scale", what, default=(1.0, 1.0, 1.0))
+            if not all(1e-6 <= abs(s) <= 1e6 for s in scale):
+                raise HandError(f"{what}: mesh scale {scale} is not usable; 0.001 turns millimetres into metres")
+            return Shape("mesh", scale, pose, filename)
+        case _:
+            raise HandError(f"{what}: geometry <{shape.tag[:40]}> is not known; use a box, cylinder, sphere or mesh")
+    if not all(1e-5 <= s <= MAX_LENGTH_M for s in size):
+        raise HandError(f"{what}: {shape.tag} of size {size} m; sizes must lie between 0.01 mm and {MAX_LENGTH_M:g} m")
+    return Shape(shape.tag, size, pose)
+
+
+def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
+    name = _name(element, "joint")
+    what = f"joint {name!r}"
+    kind = element.get("type", "")
+    if kind != "fixed" and kind not in MOVING:
+        raise HandError(f"{what}: type {kind[:40]!r} cannot be used; a hand has revolute, prismatic and fixed joints")
+    ends = [element.find(tag) for tag in ("parent", "child")]
+    parent, child = ("" if end is None else end.get("link", "") for end in ends)
+    origin = _origin(element, what)
+    if kind == "fixed":
+        return Joint(name, kind, parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
+    lower, upper, effort = _limits(element, kind, what)
+    return Joint(
+        name, kind, parent, child, origin, _axis(element, what, notes), lower, upper, effort, _mimic(element, what)
+    )
+
+
+def _axis(element: ElementTree.Element, what: str, notes: list[str]) -> Floats:
+    node = element.find("axis")
+    axis = np.array([1.0, 0, 0]) if node is None else np.array(_vector(node, "xyz", f"axis of {what}"))
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise HandError(f"{what}: the axis is zero; give a direction such as 0 0 1")
+    if abs(length - 1) > 1e-3:
+        notes.append(f"the axis of {what} has length {length:.3g} and was normalised")
+    return axis / length
+
+
+def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
+    """Lower and upper limit [rad or m] and effort [N m or N]; a continuous joint gets one turn."""
+    limit = element.find("limit")
+    if kind == "continuous":
+        effort = 0.0 if limit is None else _number(limit, "effort", f"limit of {what}", default=0.0)
+        return -math.pi, math.pi, abs(effort)
+    if limit is None or (limit.get("lower") is None and limit.get("upper") is None):
+        raise HandError(f'{what}: no <limit>; a {kind} joint needs <limit lower=".." upper=".." effort=".."/>')
+    lower = _number(limit, "lower", f"limit of {what}", default=0.0)
+    upper = _number(limit, "upper", f"limit of {what}", default=0.0)
+    effort = abs(_number(limit, "effort", f"limit of {what}", default=0.0))
+    if lower > upper:
+        raise HandError(f"{what}: lower limit {lower:g} lies above the upper limit {upper:g}; exchange them")
+    if max(abs(lower), abs(upper)) > (4 * math.pi if kind == "revolute" else MAX_LENGTH_M):
+        raise HandError(f"{what}: limits {lower:g} .. {upper:g} are too large; give radians and metres")
+    return lower, upper, effort
+
+
+def _mimic(element: ElementTree.Element, what: str) -> Mimic | None:
+    node = element.find("mimic")
+    if node is None:
+        return None
+    multiplier = _number(node, "multiplier", f"mimic of {what}", default=1.0)
+    offset = _number(node, "offset", f"mimic of {what}", default=0.0)
+    return Mimic(node.get("joint", ""), multiplier, offset)
+
+
+def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str) -> str:
+    """Name of the one root link; every other link hangs on it by exactly one joint."""
+    parent_of: dict[str, str] = {}
+    for joint in joints.values():
+        for end, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in links:
+                raise HandError(f"{filename}: joint {joint.name!r} names the {end} link {link!r}, which is not there")
+        if joint.child in parent_of:
+            raise HandError(f"{filename}: link {joint.child!r} has two parents, a kinematic loop; cut one joint")
+        parent_of[joint.child] = joint.parent
+    roots = [name for name in links if name not in parent_of]
+    if len(roots) != 1:
+        found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
+        raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
+    for link in links:
+        seen, at = {link}, link
+        while at in parent_of:
+            at = parent_of[at]
+            if at in seen:
+                raise HandError(f"{filename}: the joints around link {at!r} form a loop without a root")
+            seen.add(at)
+    return roots[0]
+
+
+def _check_mimics(joints: dict[str, Joint], filename: str) -> None:
+    for joint in joints.values():
+        seen, at = {joint.name}, joint
+        while at.mimic is not None:
+            target = joints.get(at.mimic.joint)
+            if target is None or target.type not in MOVING:
+                raise HandError(f"{filename}: joint {at.name!r} mimics {at.mimic.joint!r}, which is no moving joint")
+            if target.name in seen:
+                raise HandError(f"{filename}: joint {target.name!r} mimics itself through a cycle; free one joint")
+            seen.add(target.name)
+            at = target
+
+
+def _name(element: ElementTree.Element, what: str) -> str:
+    name = element.get("name", "")
+    if not name or len(name) > 128 or not name.isprintable():
+        raise HandError(f"a {what} has no usable name ({name[:20]!r}); give 1 to 128 printable characters")
+    return name
+
+
+def _number(element: ElementTree.Element, key: str, what: str, default: float | None = None) -> float:
+    text = element.get(key)
+    if text is None and default is not None:
+        return default
+    try:
+        value = float(text or "")
+    except ValueError:
+        raise HandError(f"{what}: {key}={(text or '')[:40]!r} is not a number") from None
+    if not math.isfinite(value):
+        raise HandError(f"{what}: {key} is {text}; it must be finite")
+    return value
+
+
+def _vector(
+    element: ElementTree.Element, key: str, what: str, default: tuple[float, ...] | None = None
+) -> tuple[float, ...]:
+    text = element.get(key)
+    if text is None and default is not None:
+        return default
+    try:
+        values = tuple(float(part) for part in (text or "")[:400].split())
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise HandError(f"{what}: {key}={(text or '')[:40]!r} must be three finite numbers")
+    return values
+
+
+def _origin(element: ElementTree.Element, what: str) -> Floats:
+    node = element.find("origin")
+    if node is None:
+        return np.array([0.0, 0, 0, 1, 0, 0, 0])
+    xyz = _vector(node, "xyz", f"origin of {what}", default=(0.0, 0.0, 0.0))
+    rpy = _vector(node, "rpy", f"origin of {what}", default=(0.0, 0.0, 0.0))
+    if max(map(abs, xyz)) > MAX_LENGTH_M:
+        raise HandError(f"origin of {what} lies {max(map(abs, xyz)):g} m away; URDF lengths are metres")
+    return np.concatenate([xyz, quat_from_rpy(*rpy)])
+
+
+def quat_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
+    """Unit quaternion w x y z of rotations about the fixed axes x, then y, then z [rad]."""
+    x, y, z = (
+        quat_from_axis_angle(axis, np.asarray(angle)) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True)
+    )
+    return quat_multiply(z, quat_multiply(y, x))

@@ -1,0 +1,48 @@
+"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB. The input may be hostile: no header's word is trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import PurePosixPath
+from typing import Final
+
+from service.errors import GraspdError, MeshError
+from worker.objects.formats import glb, obj, off, ply, stl
+from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
+
+__all__ = ["MAX_FACES", "READERS", "Soup", "read_mesh"]
+
+READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
+    ".stl": stl.read,
+    ".obj": obj.read,
+    ".ply": ply.read,
+    ".off": off.read,
+    ".glb": glb.read,
+}
+
+
+def read_mesh(filename: str, data: bytes) -> Soup:
+    """Vertices and triangles of a mesh file; the extension names the format.
+
+    Raises:
+        MeshError: unknown format, unreadable, no faces, a bad index or a coordinate that is not finite.
+        LimitError: more than `MAX_FACES` faces.
+    """
+    suffix = PurePosixPath(filename).suffix.lower()
+    reader = READERS.get(suffix)
+    if reader is None:
+        known = ", ".join(READERS)
+        raise MeshError(f"{filename}: meshes of type {suffix or '(none)'} are not read; convert to one of {known}")
+    if not data:
+        raise MeshError(f"{filename}: the file is empty; export the mesh again")
+    try:
+        return check_soup(reader(data))
+    except GraspdError as error:
+        raise type(error)(f"{filename}: {error}") from None
+    except (ValueError, IndexError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        # Readers lean on NumPy and json for the odd cases: whatever they choke on is the file's fault.
+        raise MeshError(f"{filename}: not a readable {suffix[1:].upper()} file ({_one_line(error)})") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -1,0 +1,133 @@
+"""GLB (binary glTF 2.0): triangles of all meshes of the scene, in the scene's frame and metres."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from service.errors import MeshError
+from worker.objects.formats.soup import Soup, check_face_count
+from worker.transforms import quat_to_matrix
+
+_INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
+_FLOAT, _TRIANGLES, _MAX_DEPTH = 5126, 4, 32
+_MAX_INSTANCES = 10_000
+
+
+def read(data: bytes) -> Soup:
+    """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
+    document, binary = _chunks(data)
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    total = 0
+    for mesh, matrix in _instances(document):
+        for primitive in _list(document, "meshes")[mesh]["primitives"]:
+            points, triangles = _primitive(document, binary, primitive)
+            if np.linalg.det(matrix[:3, :3]) < 0:
+                triangles = triangles[:, ::-1]
+            faces.append(triangles + sum(map(len, vertices)))
+            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+            total += len(triangles)
+            check_face_count(total)
+            check_face_count(sum(map(len, vertices)) // 3)
+    if not faces:
+        raise MeshError("the mesh has no faces; export a scene with a mesh")
+    return Soup(np.concatenate(vertices), np.concatenate(faces))
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    if len(data) < 20 or data[:4] != b"glTF" or struct.unpack_from("<I", data, 4)[0] != 2:
+        raise MeshError("not binary glTF of version 2")
+    length, kind = struct.unpack_from("<II", data, 12)
+    if kind != 0x4E4F534A or 20 + length > len(data):
+        raise MeshError("truncated: the JSON chunk is not whole")
+    document = json.loads(data[20 : 20 + length])
+    if not isinstance(document, dict):
+        raise MeshError("the JSON chunk holds no object")
+    at = 20 + length
+    if at + 8 > len(data):
+        return document, b""
+    size, kind = struct.unpack_from("<II", data, at)
+    if kind != 0x004E4942 or at + 8 + size > len(data):
+        raise MeshError("truncated: the binary chunk is not whole")
+    return document, data[at + 8 : at + 8 + size]
+
+
+def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
+    """(mesh, 4x4 matrix) of every node of the scene that shows a mesh."""
+    nodes = _list(document, "nodes")
+    scenes = _list(document, "scenes")
+    roots = scenes[int(document.get("scene", 0))].get("nodes", []) if scenes else range(len(nodes))
+    stack = [(int(root), np.eye(4), 0) for root in roots]
+    found: list[tuple[int, np.ndarray]] = []
+    visited = 0
+    while stack:
+        index, parent, depth = stack.pop()
+        visited += 1
+        if depth > _MAX_DEPTH or visited > _MAX_INSTANCES or index < 0:
+            raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
+        node = nodes[index]
+        matrix = parent @ _matrix(node)
+        if "mesh" in node:
+            found.append((int(node["mesh"]), matrix))
+        stack += [(int(child), matrix, depth + 1) for child in node.get("children", [])]
+    return found
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=float).reshape(4, 4).T
+    matrix = np.eye(4)
+    x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+    scale = np.array(node.get("scale", (1, 1, 1)), dtype=float).reshape(3)
+    matrix[:3, :3] = quat_to_matrix(np.array([w, x, y, z])) * scale
+    matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), dtype=float).reshape(3)
+    return matrix
+
+
+def _primitive(document: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
+        raise MeshError("only triangles are read; export without points, lines, strips and fans")
+    if primitive.get("extensions"):
+        raise MeshError("compressed primitives are not read; export without Draco or quantisation")
+    points = _accessor(document, binary, primitive["attributes"]["POSITION"], "VEC3")
+    if "indices" in primitive:
+        order = _accessor(document, binary, primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
+    else:
+        order = np.arange(len(points), dtype=np.int64)
+    if len(order) % 3 or (len(order) and order.max() >= len(points)):
+        raise MeshError("a face has an index outside the vertices, or the last face is not whole")
+    return points.astype(float), order.reshape(-1, 3)
+
+
+def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -> np.ndarray:
+    accessor = _list(document, "accessors")[int(index)]
+    if "sparse" in accessor or accessor.get("type") != shape or "bufferView" not in accessor:
+        raise MeshError(f"an accessor is sparse, without data or not {shape}; export plain buffers")
+    kind = accessor["componentType"]
+    dtype = np.dtype("<f4") if shape == "VEC3" and kind == _FLOAT else np.dtype(_INDEX_TYPES[kind])
+    width = 3 if shape == "VEC3" else 1
+    view = _list(document, "bufferViews")[int(accessor["bufferView"])]
+    if view.get("buffer", 0) != 0:
+        raise MeshError("the data lie in another file; export one GLB that holds everything")
+    count, item = int(accessor["count"]), dtype.itemsize * width
+    stride = int(view.get("byteStride", item))
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    if min(count, start) < 0 or stride < item or start + stride * (count - 1) + item > len(binary):
+        raise MeshError("truncated: an accessor reaches beyond the binary chunk")
+    if not count:
+        return np.zeros((0, width))
+    rows = np.lib.stride_tricks.as_strided(
+        np.frombuffer(binary, np.uint8, offset=start), (count, item), (stride, 1), writeable=False
+    )
+    return np.ascontiguousarray(rows).view(dtype).reshape(count, width)
+
+
+def _list(document: dict[str, Any], key: str) -> list[Any]:
+    value = document.get(key, [])
+    if not isinstance(value, list):
+        raise MeshError(f"{key} is no list")
+    return value

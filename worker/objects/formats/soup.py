@@ -1,0 +1,60 @@
+"""Triangles as a file gives them, checked for what no later step could survive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import LimitError, MeshError
+
+MAX_FACES: Final = 2_000_000
+#: Coordinates beyond this are no length in any unit.
+MAX_COORDINATE: Final = 1e9
+
+
+@dataclass(frozen=True)
+class Soup:
+    """Vertices (V, 3) in the file's unit and triangles (F, 3) as indices; nothing is known of their topology."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+
+def check_soup(soup: Soup) -> Soup:
+    """The soup itself if it has faces, sound indices and finite vertices."""
+    vertices, faces = soup.vertices, soup.faces
+    if not len(faces):
+        raise MeshError("the mesh has no faces; export the surface, not points alone")
+    check_face_count(len(faces))
+    bad = (faces < 0) | (faces >= len(vertices))
+    if bad.any():
+        row = int(np.flatnonzero(bad.any(axis=1))[0])
+        raise MeshError(f"face {row} has an index outside the {len(vertices)} vertices; export the mesh again")
+    used = vertices[np.unique(faces)]
+    if not np.isfinite(used).all():
+        raise MeshError("a vertex is not finite (NaN or infinity); repair the mesh where it was made")
+    if np.abs(used).max() > MAX_COORDINATE:
+        raise MeshError(f"a coordinate exceeds {MAX_COORDINATE:g}; the file is damaged or in no known unit")
+    return soup
+
+
+def check_face_count(count: int) -> None:
+    """LimitError for more faces than are taken."""
+    if count > MAX_FACES:
+        raise LimitError(f"{count} faces; at most {MAX_FACES} are taken: decimate the mesh first")
+
+
+def fan(counts: NDArray[np.int64], corners: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles (F, 3) of polygons with `counts` corners each, laid out one after another in `corners`.
+
+    Faces with fewer than three corners are dropped.
+    """
+    triangles = np.maximum(counts - 2, 0)
+    check_face_count(int(triangles.sum()))
+    starts = np.cumsum(counts) - counts
+    start = np.repeat(starts, triangles)
+    step = np.arange(len(start)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
