@@ -1,0 +1,69 @@
+"""Small hands and objects made by hand, for tests of the parts that only read them."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from worker.hands.model import ConvexPiece, HandModel, PalmFrame
+from worker.objects.model import ObjectModel
+
+CREASE_RAD = 0.6
+
+
+def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
+    """An `ObjectModel` of a watertight mesh as it stands: nothing repaired, nothing simplified."""
+    hull = mesh.convex_hull
+    mass = float(mesh.volume)
+    return ObjectModel(
+        name=name,
+        digest=f"{mesh.identifier_hash[:32]:0>32}",
+        vertices=np.asarray(mesh.vertices, float),
+        faces=np.asarray(mesh.faces, np.int32),
+        corner_normals=corner_normals(mesh),
+        volume=mass,
+        centre_of_mass=np.asarray(mesh.center_mass, float),
+        inertia=np.asarray(mesh.moment_inertia, float) / mass,
+        radius=float(np.linalg.norm(mesh.vertices - mesh.center_mass, axis=1).max()),
+        hull_vertices=np.asarray(hull.vertices, float),
+        hull_faces=np.asarray(hull.faces, np.int32),
+    )
+
+
+def corner_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(F, 3, 3): vertex normals where they lie close to the face normal, else the face normal."""
+    smooth = np.asarray(mesh.vertex_normals)[mesh.faces]
+    flat = np.repeat(np.asarray(mesh.face_normals)[:, None], 3, axis=1)
+    near = (smooth * flat).sum(-1, keepdims=True) > np.cos(CREASE_RAD)
+    return np.where(near, smooth, flat)
+
+
+def piece(
+    body: int, mesh: trimesh.Trimesh, kind: str, size: tuple[float, ...], position: tuple[float, ...]
+) -> ConvexPiece:
+    """A convex piece of a body whose primitive frame is the body frame moved by `position`."""
+    pose = np.array([*position, 1.0, 0, 0, 0])
+    vertices = np.asarray(mesh.vertices, float) + np.asarray(position)
+    return ConvexPiece(body, kind, size, pose, vertices, np.asarray(mesh.faces, np.int32), f"link_{body}")
+
+
+def two_finger_hand() -> HandModel:
+    """A palm box with two fingers that close towards each other; the palm looks along +z."""
+    palm = trimesh.creation.box((0.09, 0.06, 0.03))
+    shaft = trimesh.creation.cylinder(radius=0.009, height=0.06, sections=48)
+    tip = trimesh.creation.icosphere(subdivisions=3, radius=0.011)
+    pieces = [piece(0, palm, "box", (0.09, 0.06, 0.03), (0, 0, -0.015))]
+    for body in (1, 2):
+        pieces.append(piece(body, shaft, "cylinder", (0.009, 0.06), (0, 0, 0.035)))
+        pieces.append(piece(body, tip, "sphere", (0.011,), (0, 0, 0.068)))
+    origin = np.array([[0, 0, 0, 1, 0, 0, 0], [-0.04, 0, 0, 1, 0, 0, 0], [0.04, 0, 0, 1, 0, 0, 0]], float)
+    return HandModel(
+        name="two_finger", digest="0" * 32, root_link="palm", body_names=("palm", "left", "right"),
+        parent=np.array([-1, 0, 0], np.int32), joint_type=np.array([0, 1, 1], np.int32), origin=origin,
+        axis=np.array([[0, 0, 1], [0, 1, 0], [0, -1, 0]], float), dof=np.array([-1, 0, 1], np.int32),
+        multiplier=np.ones(3), offset=np.zeros(3), dof_names=("left", "right"), lower=np.full(2, -0.3),
+        upper=np.full(2, 1.2), effort=np.ones(2), stiffness=np.full(2, 10.0), preshape=np.zeros(2),
+        closing=np.ones(2), joint_names=("left", "right"), joint_body=np.array([1, 2], np.int32),
+        palm=PalmFrame(np.zeros(3), np.array([0.0, 0, 1])), fingertips=(1, 2), pieces=tuple(pieces),
+        neighbours=frozenset({(0, 1), (0, 2)}), masses=np.array([0.3, 0.05, 0.05]),
+    )  # fmt: skip

@@ -1,0 +1,151 @@
+"""Grasps on a table: base grasps moved by the object's rest pose and checked against the table.
+
+The lowest point of a convex piece is exact: corners for boxes and hulls, closed forms for round pieces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.transforms import compose, quat_rotate, quat_to_matrix
+
+#: A grasp is kept if the hand stays at least this far above the table [m].
+MARGIN_M: Final = 0.002
+#: Postures checked on the straight way from pregrasp to grasp, both ends included.
+PATH_POSTURES: Final = 9
+_CHUNK: Final = 64
+
+
+@dataclass(frozen=True)
+class _Balls:
+    """Points with a radius, fixed to bodies: corners (radius 0), spheres, ends of capsules."""
+
+    body: NDArray[np.intp]
+    centre: Floats
+    radius: Floats
+
+
+@dataclass(frozen=True)
+class _Cylinders:
+    body: NDArray[np.intp]
+    centre: Floats
+    axis: Floats
+    half_length: Floats
+    radius: Floats
+
+
+def transfer(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> dict[str, NDArray[np.generic]]:
+    """Every grasp in every scene, with the hand's clearance above the table.
+
+    Args:
+        hand: the hand.
+        grasp: N postures at contact, object frame.
+        pregrasp: N postures before contact, object frame; the hand moves straight from it to the grasp.
+        object_pose: (S, 7) rest poses in the table frame.
+
+    Returns:
+        Datasets of the scene shard with K = S N rows, scene-major: `grasp/base_index`, `grasp/scene_index`,
+        `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): lowest point of the hand at the grasp, the pregrasp
+        and between them; `grasp/valid` (K,): 1 where that is at least `MARGIN_M`.
+
+    Raises:
+        InputError: grasps and pregrasps differ in number.
+    """
+    if len(grasp) != len(pregrasp):
+        raise InputError(f"{len(grasp)} grasps come with {len(pregrasp)} pregrasps; each grasp needs its own")
+    poses = np.asarray(object_pose, float).reshape(-1, 7)
+    clearance = np.concatenate(
+        [np.empty((len(poses), 0))]
+        + [
+            _clearance(hand, _rows(grasp, part), _rows(pregrasp, part), poses)
+            for part in np.array_split(np.arange(len(grasp)), max(1, -(-len(grasp) // _CHUNK)))
+            if len(part)
+        ],
+        axis=1,
+    )
+    scenes, grasps = len(poses), len(grasp)
+    return {
+        "grasp/base_index": np.tile(np.arange(grasps, dtype=np.int32), scenes),
+        "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), grasps),
+        "grasp/hand_pose": compose(poses[:, None], grasp.hand_pose[None]).reshape(-1, 7),
+        "grasp/table_clearance_m": clearance.reshape(-1),
+        "grasp/valid": (clearance >= MARGIN_M).astype(np.uint8).reshape(-1),
+    }
+
+
+def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
+    """(N * postures) postures on the straight way from each pregrasp (first) to its grasp (last).
+
+    Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation).
+    """
+    t = np.linspace(0.0, 1.0, postures)[None, :, None]
+    start, end = pregrasp.hand_pose[:, None], grasp.hand_pose[:, None]
+    sign = np.where((start[..., 3:] * end[..., 3:]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    target = np.concatenate([end[..., :3], sign * end[..., 3:]], axis=-1)
+    pose = (1 - t) * start + t * target
+    pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+    joints = (1 - t) * pregrasp.joint_positions[:, None] + t * grasp.joint_positions[:, None]
+    return Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
+
+
+def _rows(posture: Posture, rows: NDArray[np.intp]) -> Posture:
+    return Posture(np.asarray(posture.hand_pose, float)[rows], np.asarray(posture.joint_positions, float)[rows])
+
+
+def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
+    """(S, N) lowest point of the hand on its way, in the table frame [m]."""
+    path = approach(grasp, pregrasp)
+    bodies = body_poses(hand, path.hand_pose, path.joint_positions)
+    balls, cylinders = _solids(hand.pieces)
+    centres = quat_rotate(bodies[:, balls.body, 3:], balls.centre) + bodies[:, balls.body, :3]
+    middles = quat_rotate(bodies[:, cylinders.body, 3:], cylinders.centre) + bodies[:, cylinders.body, :3]
+    axes = quat_rotate(bodies[:, cylinders.body, 3:], cylinders.axis)
+    lowest = np.full((len(object_pose), len(path)), np.inf)
+    for s, pose in enumerate(object_pose):
+        up = quat_to_matrix(pose[3:])[2]
+        if len(balls.body):
+            lowest[s] = np.minimum(lowest[s], (centres @ up - balls.radius).min(axis=1) + pose[2])
+        if len(cylinders.body):
+            slope = axes @ up
+            reach = cylinders.half_length * np.abs(slope) + cylinders.radius * np.sqrt(np.maximum(0.0, 1 - slope**2))
+            lowest[s] = np.minimum(lowest[s], (middles @ up - reach).min(axis=1) + pose[2])
+    return lowest.reshape(len(object_pose), len(grasp), -1).min(axis=2)
+
+
+def _solids(pieces: tuple[ConvexPiece, ...]) -> tuple[_Balls, _Cylinders]:
+    """Convex pieces as balls and cylinders in their body frames."""
+    balls: list[tuple[int, Floats, float]] = []
+    rods: list[tuple[int, Floats, Floats, float, float]] = []
+    for piece in pieces:
+        middle, axis = piece.pose[:3], quat_rotate(piece.pose[3:], np.array([0.0, 0.0, 1.0]))
+        if piece.kind == "sphere":
+            balls.append((piece.body, middle, piece.size[0]))
+        elif piece.kind == "capsule":
+            radius, length = piece.size
+            balls += [(piece.body, middle + end * 0.5 * length * axis, radius) for end in (-1, 1)]
+        elif piece.kind == "cylinder":
+            rods.append((piece.body, middle, axis, 0.5 * piece.size[1], piece.size[0]))
+        else:
+            balls += [(piece.body, corner, 0.0) for corner in piece.vertices]
+    return (
+        _Balls(
+            np.array([b[0] for b in balls], np.intp),
+            np.array([b[1] for b in balls]).reshape(-1, 3),
+            np.array([b[2] for b in balls]),
+        ),
+        _Cylinders(
+            np.array([r[0] for r in rods], np.intp),
+            np.array([r[1] for r in rods]).reshape(-1, 3),
+            np.array([r[2] for r in rods]).reshape(-1, 3),
+            np.array([r[3] for r in rods]),
+            np.array([r[4] for r in rods]),
+        ),
+    )

@@ -1,0 +1,127 @@
+"""Static rest of a convex hull on a plane: which faces it can stand on and which one it tips to.
+
+A rigid body on a plane touches it with its convex hull only, so a resting face of the object is a face of the hull
+whose polygon contains the projection of the centre of mass (Goldberg et al., "Part pose statistics", 1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from service.errors import MeshError
+from worker.objects.model import Floats, Ints, ObjectModel
+from worker.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
+
+#: Hull triangles within this angle of each other are one flat face [rad].
+COPLANAR_ANGLE = np.radians(0.05)
+#: A face holds the object if the centre of mass projects at least this share of the hull's size inside its polygon.
+STABILITY_MARGIN = 1e-4
+#: Resting faces whose normals differ by less than this count as one: scanned flat bottoms fall into many facets [rad].
+SAME_FACE_ANGLE = np.radians(2.0)
+
+
+@dataclass(frozen=True)
+class RestingFaces:
+    """Flat faces of the convex hull, C of them, in the object frame."""
+
+    normal: Floats
+    """(C, 3) unit, outward."""
+    offset: Floats
+    """(C,) normal . x of the face's plane [m]."""
+    successor: Ints
+    """(C,) the face the object tips to when put down on this one; the face itself where it is stable."""
+
+    @property
+    def stable(self) -> Ints:
+        """Indices of the faces the object can stand on."""
+        return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
+
+
+def resting_faces(obj: ObjectModel) -> RestingFaces:
+    """Faces of the object's convex hull with the way it tips over them.
+
+    Raises:
+        MeshError: the hull is flat.
+    """
+    mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)
+    label = _merge_coplanar(mesh)
+    count = int(label.max()) + 1
+    weighted = np.zeros((count, 3))
+    np.add.at(weighted, label, mesh.face_normals * mesh.area_faces[:, None])
+    length = np.linalg.norm(weighted, axis=1, keepdims=True)
+    if not np.all(length > 0):
+        raise MeshError(f"the convex hull of {obj.name!r} is flat; an object needs some thickness to be put on a table")
+    normal = weighted / length
+    offset = np.full(count, -np.inf)
+    np.maximum.at(offset, np.repeat(label, 3), _support(normal[np.repeat(label, 3)], mesh.vertices[mesh.faces.ravel()]))
+    return RestingFaces(normal, offset, _successors(mesh, label, normal, obj.centre_of_mass))
+
+
+def _support(normals: Floats, points: Floats) -> Floats:
+    return np.einsum("ij,ij->i", normals, points)
+
+
+def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
+    """(F,) index of the flat face that each hull triangle belongs to."""
+    pairs = mesh.face_adjacency[mesh.face_adjacency_angles < COPLANAR_ANGLE]
+    label = trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.faces))
+    return np.asarray(label, np.int32)
+
+
+def _successors(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -> Ints:
+    """The neighbour across the edge over which the centre of mass lies farthest outside; itself where inside."""
+    tolerance = STABILITY_MARGIN * float(np.linalg.norm(mesh.extents))
+    successor = np.arange(len(normal))
+    farthest = np.full(len(normal), tolerance)
+    edges, pairs = mesh.face_adjacency_edges, mesh.face_adjacency
+    for side in (0, 1):
+        here, there = label[pairs[:, side]], label[pairs[:, 1 - side]]
+        start, end = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
+        outward = np.cross(end - start, normal[here])
+        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-30)
+        opposite = mesh.triangles_center[pairs[:, side]]
+        outward *= -np.sign(np.einsum("ij,ij->i", outward, opposite - start))[:, None]
+        overhang = np.einsum("ij,ij->i", outward, centre - start)
+        for k in np.flatnonzero(here != there):
+            if overhang[k] > farthest[here[k]]:
+                farthest[here[k]], successor[here[k]] = overhang[k], there[k]
+    return successor.astype(np.int32)
+
+
+def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
+    """The stable face under an object of this orientation, and the angle by which it must turn to lie flat [rad].
+
+    Starts at the face that looks down most and tips over edges until the face holds.
+    """
+    down = quat_rotate(np.asarray(quaternion) * np.array([1.0, -1, -1, -1]), np.array([0.0, 0.0, -1.0]))
+    face = int(np.argmax(faces.normal @ down))
+    # Tipping lowers the centre of mass, so it ends; the bound guards against rounding on spheres.
+    for _ in range(len(faces.normal)):
+        following = int(faces.successor[face])
+        if following == face:
+            break
+        face = following
+    cosine = float(np.clip(faces.normal[face] @ down, -1.0, 1.0))
+    return face, float(np.arccos(cosine))
+
+
+def lay_flat(faces: RestingFaces, face: int, pose: Floats) -> Floats:
+    """The pose (7,) turned by the smallest rotation that puts the face onto z = 0; x and y stay."""
+    normal = quat_rotate(pose[3:], faces.normal[face])
+    axis = np.cross(normal, [0.0, 0.0, -1.0])
+    sine = float(np.linalg.norm(axis))
+    if sine > 1e-12:
+        turn = quat_from_axis_angle(axis / sine, np.asarray(np.arctan2(sine, -normal[2])))
+    else:
+        turn = np.array([1.0, 0, 0, 0]) if normal[2] < 0 else np.array([0.0, 1, 0, 0])
+    quaternion = quat_multiply(turn, pose[3:])
+    quaternion /= np.linalg.norm(quaternion)
+    return np.concatenate([pose[:2], [faces.offset[face]], quaternion])
+
+
+def same_face(faces: RestingFaces, face: int, others: Ints) -> Ints:
+    """Which of the `others` are the same resting face, up to `SAME_FACE_ANGLE`: booleans."""
+    return faces.normal[np.asarray(others, int)] @ faces.normal[face] > np.cos(SAME_FACE_ANGLE)
