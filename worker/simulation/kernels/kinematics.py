@@ -32,11 +32,19 @@ def forward(
     axis_out: wp.array2d(dtype=wp.vec3),
     force_out: wp.array2d(dtype=wp.vec3),
     torque_out: wp.array2d(dtype=wp.vec3),
+    count_out: wp.array(dtype=wp.int32),
+    point_depth_out: wp.array(dtype=wp.float32),
+    object_depth_out: wp.array(dtype=wp.float32),
+    self_depth_out: wp.array(dtype=wp.float32),
 ):
-    """Poses of all bodies (B, L); world axes of their joints; wrench accumulators set to zero. Launch over B."""
+    """Poses of all bodies (B, L), world axes of their joints; what the iteration accumulates is set to zero. Over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
+    count_out[b] = 0
+    point_depth_out[b] = 0.0
+    object_depth_out[b] = 0.0
+    self_depth_out[b] = 0.0
     body_q_out[b, 0] = rotation_in[b]
     body_p_out[b, 0] = pivot_in[b] - wp.quat_rotate(rotation_in[b], tree_in.pivot)
     force_out[b, 0] = wp.vec3(0.0)

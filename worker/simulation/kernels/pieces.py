@@ -56,27 +56,27 @@ def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
         if length > 1.0e-9:
             n = x / length
     elif kind == CAPSULE:
-        y = wp.vec3(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1]))
-        length = wp.length(y)
-        d = length - size[0]
-        if length > 1.0e-9:
-            n = y / length
+        radial_part = wp.vec3(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1]))
+        from_axis = wp.length(radial_part)
+        d = from_axis - size[0]
+        if from_axis > 1.0e-9:
+            n = radial_part / from_axis
     elif kind == CYLINDER:
         radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
         side = wp.vec3(1.0, 0.0, 0.0)
         if radial > 1.0e-9:
             side = wp.vec3(x[0] / radial, x[1] / radial, 0.0)
         cap = wp.vec3(0.0, 0.0, wp.sign(x[2]))
-        a = radial - size[0]
-        c = wp.abs(x[2]) - size[1]
-        if a > 0.0 and c > 0.0:
-            d = wp.sqrt(a * a + c * c)
-            n = (a * side + c * cap) / d
-        elif a > c:
-            d = a
+        beside = radial - size[0]
+        beyond = wp.abs(x[2]) - size[1]
+        if beside > 0.0 and beyond > 0.0:
+            d = wp.sqrt(beside * beside + beyond * beyond)
+            n = (beside * side + beyond * cap) / d
+        elif beside > beyond:
+            d = beside
             n = side
         else:
-            d = c
+            d = beyond
             n = cap
     else:
         d = float(-1.0e9)

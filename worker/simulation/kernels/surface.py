@@ -175,7 +175,7 @@ def gather(
     contact_weight_out: wp.array2d(dtype=wp.float32),
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
-    """Candidate contacts: hand points nearer to the object than dilation + band, packed per grasp. Launch over (B, N)."""
+    """Candidate contacts: hand points nearer than dilation + band, packed per grasp. Launch over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0:
         return
@@ -183,7 +183,7 @@ def gather(
     point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
     dilation = dilation_in[iteration_in[0]]
     reach = dilation + band_in
-    sample = distance(surface_in, point, reach, dilation + exact_in)
+    sample = distance(surface_in, point, reach, exact_in)
     if sample.distance < reach:
         k = wp.atomic_add(count_inout, b, 1)
         contact_body_out[b, k] = body

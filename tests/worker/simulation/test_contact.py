@@ -1,0 +1,180 @@
+"""The contact kernels against the float64 reference, and the physics they must keep."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.worker.simulation import reference
+from tests.worker.simulation.reference import Contacts, World
+from worker.simulation.kernels import contact
+from worker.simulation.simulation import initial_motions
+
+#: float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m.
+END_TOLERANCE = 2e-6
+#: Cosine between the kernel's adjoint and central differences: contacts that switch on or off within the difference,
+#: and the fixed slip direction, are what differs.
+COSINE = 0.97
+#: Passes of the direct and Jacobi solvers: the direct solve converges in 4.
+PASSES = 12
+INERTIA = np.diag([8e-4, 6e-4, 4e-4])
+WORLD = World(inertia=INERTIA, gyration=float(np.sqrt(np.trace(INERTIA) / 3)))
+
+
+def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: float = 2e-4) -> Contacts:
+    """Contacts all around a ball of 4 cm."""
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Contacts(0.04 * normals, normals, gap + spread * rng.normal(size=count), rng.uniform(0.5, 1.5, count))
+
+
+def physics(world: World, *, leak: float = 0.0, one_sided: bool = True) -> Any:
+    out = contact.Physics()
+    out.mass = contact.mat66(*world.mass.ravel().tolist())
+    out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
+    out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
+    out.leak, out.leak_length, out.one_sided, out.step = leak, 0.02, int(one_sided), world.step
+    return out
+
+
+def run(
+    kernel: Any, contacts: Contacts, world: World, *, passes: int = PASSES, leak: float = 0.0, one_sided: bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motions at the end (M, 6), losses (M,), dL/drho (N,)."""
+    motions = initial_motions(7, world.step, world.gyration)
+    n, m = len(contacts.points), len(motions)
+    with wp.ScopedDevice("cpu"):
+        loss, end = wp.zeros((1, m), dtype=wp.float32), wp.zeros((1, m), dtype=contact.vec6)
+        gradient = wp.zeros((1, n), dtype=wp.float32)
+        inputs = [
+            physics(world, leak=leak, one_sided=one_sided), wp.array(motions, dtype=contact.vec6), passes,
+            wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32),
+            wp.array([n], dtype=wp.int32),
+            wp.array(contacts.points[None], dtype=wp.vec3), wp.array(contacts.normals[None], dtype=wp.vec3),
+            wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
+        ]  # fmt: skip
+        if kernel is not contact.direct:
+            inputs.append(wp.zeros((1, m, max(n, passes)), dtype=contact.vec6))
+        wp.launch(kernel, dim=(1, m), inputs=[*inputs, loss, end, gradient])
+        return end.numpy()[0].astype(float), loss.numpy()[0].astype(float), gradient.numpy()[0].astype(float)
+
+
+def mean_loss(solver: Any, contacts: Contacts, distances: np.ndarray, world: World) -> float:
+    moved = Contacts(contacts.points, contacts.normals, distances, contacts.weights)
+    motions = initial_motions(7, world.step, world.gyration)
+    return float(np.mean([reference.loss(solver(moved, s0, world), world) for s0 in motions]))
+
+
+SOLVERS = {
+    "direct": (contact.direct, lambda c, s0, w: reference.direct(c, s0, w, PASSES)),
+    "gauss_seidel": (contact.gauss_seidel, lambda c, s0, w: reference.gauss_seidel(c, s0, w)[0]),
+    "jacobi": (contact.jacobi, lambda c, s0, w: reference.jacobi(c, s0, w, PASSES)),
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_step_ends_where_the_float64_reference_ends(name: str) -> None:
+    kernel, solver = SOLVERS[name]
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        contacts = ring(rng)
+        end, _, _ = run(kernel, contacts, WORLD)
+        motions = initial_motions(7, WORLD.step, WORLD.gyration)
+        expected = np.array([solver(contacts, s0, WORLD) for s0 in motions])
+        scale = np.array([1, 1, 1, WORLD.gyration, WORLD.gyration, WORLD.gyration])
+        np.testing.assert_allclose(end * scale, expected * scale, atol=END_TOLERANCE)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_gradient_agrees_with_central_differences_of_the_reference(name: str) -> None:
+    kernel, solver = SOLVERS[name]
+    rng = np.random.default_rng(2)
+    cosines = []
+    for _ in range(5):
+        contacts = ring(rng, count=8, gap=-3e-4, spread=1e-4)
+        _, _, gradient = run(kernel, contacts, WORLD)
+        numeric = np.empty(len(gradient))
+        for i in range(len(gradient)):
+            step = np.zeros(len(gradient))
+            step[i] = 1e-9
+            above = mean_loss(solver, contacts, contacts.distances + step, WORLD)
+            below = mean_loss(solver, contacts, contacts.distances - step, WORLD)
+            numeric[i] = (above - below) / 2e-9
+        cosines.append(gradient @ numeric / np.linalg.norm(gradient) / np.linalg.norm(numeric))
+    assert np.median(cosines) > COSINE, cosines
+
+
+def test_a_free_object_keeps_its_motion() -> None:
+    far = Contacts(np.array([[0, 0, 0.04]]), np.array([[0, 0, 1.0]]), np.array([0.01]), np.ones(1))
+    for kernel, _ in SOLVERS.values():
+        end, loss, gradient = run(kernel, far, WORLD)
+        np.testing.assert_allclose(end, initial_motions(7, WORLD.step, WORLD.gyration), atol=1e-9)
+        assert np.all(gradient == 0)
+        assert loss[0] < 0.05, "an object at rest that nothing touches stays at rest, up to the smoothing"
+
+
+@pytest.mark.parametrize("name", ["gauss_seidel"])
+def test_friction_never_leaves_the_cone_and_both_stick_and_slip_occur(name: str) -> None:
+    rng = np.random.default_rng(3)
+    stuck = slid = 0
+    for friction in (0.1, 0.8, 3.0):
+        world = World(inertia=INERTIA, gyration=WORLD.gyration, friction=friction)
+        contacts = ring(rng)
+        for s0 in initial_motions(7, world.step, world.gyration):
+            for normal, slip in reference.gauss_seidel(contacts, s0, world)[1]:
+                assert slip <= friction * normal * (1 + 1e-12)
+                stuck += 0 < slip < friction * normal * (1 - 1e-9)
+                slid += 0 < normal and slip >= friction * normal * (1 - 1e-9)
+    assert stuck > 0 and slid > 0
+
+
+def test_an_object_between_two_fingers_sticks_with_friction_and_slides_without() -> None:
+    points = np.array([[0.03, 0, 0], [-0.03, 0, 0]])
+    squeeze = Contacts(points, points / 0.03, np.full(2, -1e-3), np.full(2, 50.0))
+    for kernel, _ in SOLVERS.values():
+        rough = World(inertia=INERTIA, gyration=WORLD.gyration, friction=2.0)
+        smooth = World(inertia=INERTIA, gyration=WORLD.gyration, friction=1e-6)
+        along_y = 3  # motions: rest, +x, -x, +y, ...
+        assert abs(run(kernel, squeeze, rough)[0][along_y, 1]) < 0.1 * WORLD.step
+        assert abs(run(kernel, squeeze, smooth)[0][along_y, 1]) > 0.9 * WORLD.step
+
+
+def test_a_balanced_grasp_leaves_the_object_at_rest() -> None:
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    balanced = Contacts(0.04 * axes, axes, np.full(6, -5e-4), np.ones(6))
+    for kernel in (contact.direct, contact.jacobi):
+        end, _, _ = run(kernel, balanced, WORLD)
+        np.testing.assert_allclose(end[0], 0, atol=1e-8)
+
+
+def test_the_direct_solve_does_not_depend_on_the_order_of_contacts() -> None:
+    rng = np.random.default_rng(4)
+    contacts = ring(rng)
+    order = rng.permutation(len(contacts.points))
+    shuffled = Contacts(*(a[order] for a in (contacts.points, contacts.normals, contacts.distances, contacts.weights)))
+    end, _, gradient = run(contact.direct, contacts, WORLD)
+    end2, _, gradient2 = run(contact.direct, shuffled, WORLD)
+    np.testing.assert_allclose(end, end2, atol=1e-7)
+    np.testing.assert_allclose(gradient[order], gradient2, atol=1e-3 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_one_sided_leak_only_draws_free_points_nearer(name: str) -> None:
+    kernel, _ = SOLVERS[name]
+    rng = np.random.default_rng(5)
+    free = ring(rng, gap=5e-3, spread=1e-4)
+    one = run(kernel, free, WORLD, leak=0.1)[2]
+    two = run(kernel, free, WORLD, leak=0.1, one_sided=False)[2]
+    # Descending a positive dL/drho shortens the distance.
+    assert np.all(one >= 0) and one.max() > 0
+    assert np.abs(two).max() < 0.1 * one.max(), "two-sided: opposite velocities cancel where nothing touches"
+
+
+def test_contact_at_zero_distance_and_zero_motion_gives_no_nan() -> None:
+    touching = Contacts(np.zeros((3, 3)), np.eye(3), np.zeros(3), np.ones(3))
+    for kernel, _ in SOLVERS.values():
+        for part in run(kernel, touching, WORLD, leak=0.1):
+            assert np.all(np.isfinite(part))

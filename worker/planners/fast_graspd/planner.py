@@ -1,0 +1,158 @@
+"""The planner: starts, coarse phase, fine phase, projection. A batch is cut into one part per CPU thread.
+
+Warp releases the interpreter lock while a kernel runs, so threads use all cores; a grasp's result does not depend on
+the part it is in.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from service.domain import Fidelity
+from service.errors import TaskCancelled
+from worker.grasps import GraspSet, Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners import Cancelled, Progress
+from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.quality.postures import pregrasp, squeeze
+from worker.simulation.projection import Projection, ProjectionOptions
+from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.transforms import quat_rotate
+
+Floats = NDArray[np.float64]
+
+#: Iterations between two looks at cancellation.
+CHUNK: Final = 10
+#: Fewest grasps worth a thread of their own.
+PART: Final = 4
+
+
+@dataclass
+class _Part:
+    """Grasps `indices` of a batch, worked on by one thread."""
+
+    indices: range
+    state: HandState | None = None
+    loss: Floats | None = None
+    curve: list[float] | None = None
+
+
+class _Steps:
+    """Counts work done by all threads; looks at cancellation."""
+
+    def __init__(self, total: int, progress: Progress, cancelled: Cancelled) -> None:
+        self._total, self._progress, self._cancelled = total, progress, cancelled
+        self._done = 0
+        self._lock = threading.Lock()
+
+    def __call__(self, work: int, message: str) -> None:
+        if self._cancelled():
+            raise TaskCancelled("the synthesis was cancelled")
+        with self._lock:
+            self._done += work
+            self._progress(self._done, self._total, message)
+
+
+def plan(
+    hand: HandModel,
+    obj: ObjectModel,
+    *,
+    count: int,
+    fidelity: Fidelity,
+    seed: int,
+    batch: int,
+    threads: int,
+    device: str,
+    progress: Progress,
+    cancelled: Cancelled,
+) -> GraspSet:
+    """See `worker.planners.Planner`."""
+    began = time.perf_counter()
+    pair = pair_of(hand, obj, fidelity, device)
+    parts = [_Part(indices) for indices in _cut(count, threads, device)]
+    iterations = fidelity.coarse_iterations + fidelity.fine_iterations
+    steps = _Steps(count * (iterations + 1), progress, cancelled)
+    if len(parts) == 1:
+        _work(pair, parts[0], fidelity, seed, batch, steps)
+    else:
+        with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
+            for future in [pool.submit(_work, pair, part, fidelity, seed, batch, steps) for part in parts]:
+                future.result()
+    return _grasps(hand, obj, parts, time.perf_counter() - began)
+
+
+def _cut(count: int, threads: int, device: str) -> list[range]:
+    """Contiguous, nearly equal parts of a batch: one on a GPU, at most one per thread on a CPU."""
+    if wp.get_device(device).is_cuda:
+        return [range(count)]
+    parts = max(1, min(threads or os.cpu_count() or 1, count // PART))
+    bounds = np.linspace(0, count, parts + 1).astype(int)
+    return [range(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+
+
+def _work(pair: Pair, part: _Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
+    n = len(part.indices)
+    hand, obj = pair.hand.model, pair.obj.model
+    probe = pair.simulation(pair.coarse, n * len(RETREATS))
+    state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices)
+    steps(n, "starts")
+    part.curve = []
+    for points, schedule, name in (
+        (pair.coarse, coarse_schedule(fidelity), "coarse"),
+        (pair.fine, fine_schedule(fidelity), "fine"),
+    ):
+        simulation = pair.simulation(points, n)
+        if len(schedule):
+            state = _optimize(simulation, state, schedule, fidelity.optimizer, steps, name, part.curve)
+    part.loss = simulation.loss.numpy()[:n].mean(axis=1).astype(float)
+    if fidelity.polish_iterations:
+        state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
+    part.state = state
+
+
+def _optimize(
+    simulation: Simulation, state: HandState, schedule: Schedule, optimizer: str, steps: _Steps, name: str,
+    curve: list[float],
+) -> HandState:  # fmt: skip
+    n = len(state.pivot)
+    simulation.set_schedule(schedule)
+    simulation.set_state(state)
+    simulation.record_iteration(optimizer)
+    done = 0
+    while done < len(schedule):
+        chunk = min(CHUNK, len(schedule) - done)
+        simulation.run(chunk)
+        done += chunk
+        steps(n * chunk, name)
+        if not wp.get_device(simulation.device).is_cuda:
+            curve.append(float(simulation.loss.numpy()[:n].mean()))
+    return simulation.state(n)
+
+
+def _grasps(hand: HandModel, obj: ObjectModel, parts: list[_Part], seconds: float) -> GraspSet:
+    states = [part.state for part in parts if part.state is not None]
+    pivot, rotation, q = (np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q"))
+    root = pivot + obj.centre_of_mass - quat_rotate(rotation, hand.palm.centre)
+    grasp = Posture(np.concatenate([root, rotation], axis=1), hand.expand(q))
+    curves = [part.curve for part in parts if part.curve]
+    curve = np.mean(curves, axis=0).round(5).tolist() if curves else []
+    return GraspSet(
+        grasp=grasp,
+        pregrasp=pregrasp(hand, obj, grasp),
+        squeeze=squeeze(hand, obj, grasp),
+        stability_loss=np.concatenate([part.loss for part in parts if part.loss is not None]),
+        seconds=seconds,
+        info={"loss_curve": curve, "chunk": CHUNK},
+    )

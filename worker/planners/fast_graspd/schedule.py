@@ -1,0 +1,55 @@
+"""What each iteration weighs: the coarse phase shrinks the dilation while penetration grows dear, the fine phase seats."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.domain import Fidelity
+from worker.simulation.simulation import LossOptions, Schedule
+
+Floats = NDArray[np.float64]
+
+#: Rates of Adam: translation [m], rotation [rad], joints [rad].
+COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
+FINE_RATES: Final = (5e-4, 5e-3, 1e-2)
+#: Largest dilation of the object [m].
+DILATION: Final = 0.01
+SELF_WEIGHT: Final = 2e4
+
+
+def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
+    """The simulation of a fidelity. Plain gradient descent needs the limits as a penalty, as the paper has them."""
+    paper = fidelity.optimizer == "gd"
+    return LossOptions(
+        contact_solver=fidelity.contact_solver,
+        velocities=fidelity.velocities,
+        friction=friction,
+        passes=4 if fidelity.contact_solver == "direct" else 8,
+        one_sided=fidelity.leak == "one_sided",
+        leak_length=0.02 if fidelity.leak == "one_sided" else 1e3,
+        limit_weight=100.0 if paper else 0.0,
+    )
+
+
+def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats:
+    return np.array(rates) * np.geomspace(1.0, to, max(count, 1))[:count, None]
+
+
+def coarse_schedule(fidelity: Fidelity) -> Schedule:
+    """Dilation to 0 over the first four fifths; penetration weight times 10."""
+    n = fidelity.coarse_iterations
+    dilation = DILATION * np.clip(1.0 - np.arange(n) / max(0.8 * n, 1.0), 0.0, 1.0)
+    penetration = np.geomspace(3e3, 3e4, max(n, 1))[:n]
+    return Schedule(dilation, penetration, penetration, np.full(n, SELF_WEIGHT), _decayed(COARSE_RATES, n, 0.25))
+
+
+def fine_schedule(fidelity: Fidelity) -> Schedule:
+    """No dilation; penetration dear."""
+    n = fidelity.fine_iterations
+    penetration = np.geomspace(1e5, 1e6, max(n, 1))[:n]
+    return Schedule(
+        np.zeros(n), penetration, 0.3 * penetration, np.full(n, 3 * SELF_WEIGHT), _decayed(FINE_RATES, n, 0.1)
+    )

@@ -1,0 +1,148 @@
+"""Approach sampling: where the hands start. The palm looks at a random point of the surface, from a little way off.
+
+A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+
+Floats = NDArray[np.float64]
+
+#: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
+GAP: Final = (0.004, 0.02)
+RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
+#: Tilt of the approach away from the surface normal, standard deviation [rad].
+TILT: Final = 0.25
+#: Noise of the pre-shape, standard deviation as a share of the joint's range.
+POSTURE_NOISE: Final = 0.08
+#: Deepest penetration of a start [m].
+CLEAR: Final = 0.001
+#: Draws per grasp before the least penetrating one is taken.
+DRAWS: Final = 48
+
+
+@dataclass
+class _Draw:
+    state: HandState
+    approach: Floats
+
+
+def grasp_generator(seed: int, batch: int, index: int) -> np.random.Generator:
+    """Random numbers of one grasp, independent of every other grasp."""
+    return np.random.default_rng(np.random.SeedSequence([seed, batch, index]))
+
+
+def _frame(z: Floats) -> Floats:
+    """Rotation matrix with third column z (3,) and an arbitrary but fixed first."""
+    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def draw(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> _Draw:
+    """One candidate start at its nearest distance; `approach` (3,) is the direction in which the palm looks."""
+    triangles = obj.vertices[obj.faces]
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    face = int(rng.choice(len(area), p=area / area.sum()))
+    u, v = rng.random(2)
+    if u + v > 1:
+        u, v = 1 - u, 1 - v
+    corner = triangles[face]
+    point = corner[0] + u * (corner[1] - corner[0]) + v * (corner[2] - corner[0])
+    normal = cross[face] / area[face]
+    tilt_axis = _frame(normal)[:, :2] @ rng.normal(size=2)
+    angle = float(np.linalg.norm(tilt_axis)) * TILT
+    if angle > 1e-9:
+        axis = tilt_axis / np.linalg.norm(tilt_axis)
+        normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
+    approach = -normal
+    align = _frame(approach) @ _frame(hand.palm.approach).T
+    roll = quat_from_axis_angle(approach, np.array(rng.uniform(0, 2 * np.pi)))
+    rotation = quat_multiply(roll, quat_from_matrix(align))
+    span = hand.upper - hand.lower
+    q = np.clip(hand.preshape + POSTURE_NOISE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
+    pivot = point - obj.centre_of_mass - approach * rng.uniform(*GAP)
+    return _Draw(HandState(pivot[None], rotation[None], q[None]), approach)
+
+
+def _retreated(draws: list[_Draw]) -> HandState:
+    """Each draw at each distance of retreat, (len(draws) * len(RETREATS)) hands."""
+    back = np.array(RETREATS)[None, :, None]
+    pivot = np.stack([d.state.pivot[0] for d in draws])[:, None] - back * np.stack([d.approach for d in draws])[:, None]
+    repeat = len(RETREATS)
+    return HandState(
+        pivot.reshape(-1, 3),
+        np.repeat(np.stack([d.state.rotation[0] for d in draws]), repeat, axis=0),
+        np.repeat(np.stack([d.state.q[0] for d in draws]), repeat, axis=0),
+    )
+
+
+def placement_schedule() -> Schedule:
+    """Tables for telling penetration only: no dilation, no weights."""
+    zero = np.zeros(1)
+    return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))
+
+
+def sample_starts(
+    hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range
+) -> HandState:
+    """Collision-free starts of the grasps `indices` of a batch.
+
+    `probe` is a simulation whose capacity is at least len(indices) * len(RETREATS).
+
+    Raises:
+        InputError: not one draw of some grasp came within 10 mm of being clear.
+    """
+    probe.set_schedule(placement_schedule())
+    probe.record_placement()
+    generators = [grasp_generator(seed, batch, i) for i in indices]
+    best: list[tuple[float, HandState] | None] = [None] * len(generators)
+    open_ = list(range(len(generators)))
+    for _ in range(DRAWS):
+        draws = [draw(hand, obj, generators[i]) for i in open_]
+        states = _retreated(draws)
+        depth = probe_depths(probe, states).reshape(len(draws), len(RETREATS))
+        for row, i in enumerate(open_):
+            # The nearest clear distance, or else the least deep.
+            clear = np.flatnonzero(depth[row] <= CLEAR)
+            pick = int(clear[0]) if len(clear) else int(np.argmin(depth[row]))
+            found = best[i]
+            if found is None or depth[row, pick] < found[0]:
+                k = row * len(RETREATS) + pick
+                best[i] = (float(depth[row, pick]), states[k : k + 1])
+        open_ = [i for i in open_ if (b := best[i]) is None or b[0] > CLEAR]
+        if not open_:
+            break
+    chosen = [b for b in best if b is not None]
+    if max(b[0] for b in chosen) > 0.01:
+        raise InputError(
+            f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
+            "check the object's units"
+        )
+    return HandState(
+        np.concatenate([b[1].pivot for b in chosen]),
+        np.concatenate([b[1].rotation for b in chosen]),
+        np.concatenate([b[1].q for b in chosen]),
+    )
+
+
+def probe_depths(probe: Simulation, states: HandState) -> Floats:
+    """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links."""
+    n = len(states.pivot)
+    probe.set_state(states)
+    probe.run()
+    parts = (probe.point_depth, probe.object_depth, probe.self_depth)
+    return np.max([part.numpy()[:n] for part in parts], axis=0).astype(float)

@@ -1,0 +1,172 @@
+"""A hand and an object as arrays on a Warp device. Made once, shared by every simulation of the pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.hands.model import ConvexPiece, HandModel
+from worker.objects.model import ObjectModel
+from worker.simulation.kernels import kinematics, pieces, surface
+
+Floats = NDArray[np.float64]
+
+#: Kernels' numbers for `ConvexPiece.kind`.
+_KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
+#: Distances farther than this from the surface are never asked for [m].
+FIELD_REACH: Final = 0.06
+
+
+def to_xyzw(quaternion: Floats) -> Floats:
+    """Warp's order x y z w from graspd's w x y z, (..., 4)."""
+    return np.roll(quaternion, -1, axis=-1)
+
+
+def to_wxyz(quaternion: Floats) -> Floats:
+    """graspd's order w x y z from Warp's x y z w, (..., 4)."""
+    return np.roll(quaternion, 1, axis=-1)
+
+
+@dataclass(frozen=True)
+class DeviceHand:
+    """A hand on the device: joint tree, convex pieces, limits."""
+
+    model: HandModel
+    device: str
+    tree: Any
+    pieces: Any
+    lower: Any
+    upper: Any
+
+    @classmethod
+    def create(cls, hand: HandModel, device: str) -> DeviceHand:
+        tree = kinematics.Tree()
+        with wp.ScopedDevice(device):
+            tree.parent = wp.array(hand.parent, dtype=wp.int32)
+            tree.joint_type = wp.array(hand.joint_type, dtype=wp.int32)
+            tree.origin_p = wp.array(hand.origin[:, :3], dtype=wp.vec3)
+            tree.origin_q = wp.array(to_xyzw(hand.origin[:, 3:]), dtype=wp.quat)
+            tree.axis = wp.array(hand.axis, dtype=wp.vec3)
+            tree.dof = wp.array(hand.dof, dtype=wp.int32)
+            tree.multiplier = wp.array(hand.multiplier, dtype=wp.float32)
+            tree.offset = wp.array(hand.offset, dtype=wp.float32)
+            tree.pivot = wp.vec3(*hand.palm.centre)
+            return cls(
+                model=hand,
+                device=device,
+                tree=tree,
+                pieces=_device_pieces(hand),
+                lower=wp.array(hand.lower, dtype=wp.float32),
+                upper=wp.array(hand.upper, dtype=wp.float32),
+            )
+
+
+def _device_pieces(hand: HandModel) -> Any:
+    out = pieces.Pieces()
+    rows = [_piece_row(piece) for piece in hand.pieces]
+    planes = [row[4] for row in rows]
+    starts = np.concatenate([[0], np.cumsum([len(p) for p in planes])])
+    apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
+    for a, b in hand.neighbours:
+        apart[a, b] = apart[b, a] = 0
+    out.body = wp.array([p.body for p in hand.pieces], dtype=wp.int32)
+    out.kind = wp.array([_KINDS[p.kind] for p in hand.pieces], dtype=wp.int32)
+    out.size = wp.array(np.array([row[0] for row in rows]), dtype=wp.vec3)
+    out.pose_p = wp.array(np.array([row[1] for row in rows]), dtype=wp.vec3)
+    out.pose_q = wp.array(to_xyzw(np.array([row[2] for row in rows])), dtype=wp.quat)
+    out.half = wp.array(np.array([row[3] for row in rows]), dtype=wp.vec3)
+    out.first_plane = wp.array(starts, dtype=wp.int32)
+    out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
+    out.apart = wp.array(apart, dtype=wp.int32)
+    return out
+
+
+def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Size, position, quaternion (w x y z), half extents and planes of a piece for the kernels."""
+    none = np.zeros((0, 4))
+    position, rotation = piece.pose[:3], piece.pose[3:]
+    if piece.kind == "box":
+        half = np.array(piece.size) / 2
+        return half, position, rotation, half, none
+    if piece.kind == "sphere":
+        r = piece.size[0]
+        return np.array([r, 0, 0]), position, rotation, np.full(3, r), none
+    if piece.kind in ("cylinder", "capsule"):
+        r, length = piece.size
+        caps = r if piece.kind == "capsule" else 0.0
+        return np.array([r, length / 2, 0]), position, rotation, np.array([r, r, length / 2 + caps]), none
+    low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
+    centre = (low + high) / 2
+    planes = face_planes(piece.vertices - centre, piece.faces)
+    return np.zeros(3), centre, np.array([1.0, 0, 0, 0]), (high - low) / 2, planes
+
+
+def face_planes(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
+    """Distinct face planes (K, 4) of a convex solid: outward unit normal and offset; coplanar faces merged."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    keep = length > 1e-14
+    normal = normal[keep] / length[keep, None]
+    planes = np.column_stack([normal, np.einsum("ij,ij->i", normal, a[keep])])
+    # Planes closer than 1e-4 rad and 1 um are one plane: hulls of boxes have two triangles a side.
+    _, first = np.unique(np.round(planes / np.array([1e-4, 1e-4, 1e-4, 1e-6])), axis=0, return_index=True)
+    return planes[np.sort(first)]
+
+
+@dataclass(frozen=True)
+class DeviceObject:
+    """An object on the device, origin at its centre of mass: surface, distance grid, surface samples."""
+
+    model: ObjectModel
+    device: str
+    surface: Any
+    mesh: Any
+    samples: Any
+    bvh: Any
+
+    @classmethod
+    def create(
+        cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float
+    ) -> DeviceObject:
+        """Upload an object.
+
+        Args:
+            obj: the object.
+            device: Warp device.
+            samples: (S, 3) points on its surface, object frame [m].
+            phong_alpha: 0: flat faces, 1: full Phong projection.
+            cell: cell size of the distance grid [m]; 0: none, every distance is exact.
+        """
+        with wp.ScopedDevice(device):
+            points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)
+            mesh = wp.Mesh(points=points, indices=wp.array(obj.faces.ravel(), dtype=wp.int32))
+            skin = surface.Surface()
+            skin.mesh = mesh.id
+            skin.corner_normals = wp.array(obj.corner_normals.reshape(-1, 3), dtype=wp.vec3)
+            skin.alpha = phong_alpha
+            skin.field = wp.zeros((0, 0, 0), dtype=wp.float32)
+            if cell > 0:
+                _add_field(skin, obj, cell)
+            centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
+            bvh = wp.Bvh(centred, centred)
+        return cls(model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh)
+
+
+def _add_field(skin: Any, obj: ObjectModel, cell: float) -> None:
+    low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
+    high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
+    # At most 96 cells a side: a large object is asked of a coarser grid, whose error grows with it and is accounted for.
+    cell = max(cell, float((high - low).max()) / 96)
+    shape = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
+    field = wp.empty(shape, dtype=wp.float32)
+    wp.launch(surface.sample_field, dim=shape, inputs=[skin, wp.vec3(*low), cell, 4 * FIELD_REACH], outputs=[field])
+    skin.field = field
+    skin.field_origin = wp.vec3(*low)
+    skin.field_cell = cell
+    # A distance has slope at most 1: trilinear interpolation between corners is off by less than half a diagonal.
+    skin.field_error = 0.5 * cell

@@ -1,0 +1,390 @@
+"""One step of the object against the static hand, M times per grasp, and how its end depends on every distance.
+
+A simulation starts the object with velocity v_m; s0 = dt (v, omega) is its free motion. A hand point p at distance rho
+with outward object normal n sees, after the object's motion s = (x, theta) about its centre of mass, the gap
+rho - j.s with j = (n, p x n); it is violated by C = r - rho + j.s, where r is the dilation. Hand and object meet in
+frictional contact while C > 0 (paper, eq. 1 and section III-C). The loss of one simulation is
+(|x| + g |theta|) / |s0| with g the gyration radius; L_stable is the mean over m.
+
+Each kernel writes dL/drho: the exact adjoint of its solve on active points; on free points the leak, `leak` times what
+the point would feel if it touched, fading with its distance. `one_sided` keeps of the leak only what draws the point
+to the object: with the paper's two-sided leak, opposite velocities cancel wherever nothing touches.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+
+#: Norms are smoothed below this length [m]: |x| has no gradient at 0.
+SMOOTH = wp.constant(1.0e-5)
+
+
+@wp.struct
+class Physics:
+    """Constants of the step."""
+
+    inverse_mass: mat66  # of the object per unit of mass, about its centre of mass
+    mass: mat66
+    gyration: wp.float32  # [m]
+    friction: wp.float32
+    stiffness: wp.float32  # direct solver: contact stiffness over mass, for a point of weight 1
+    leak: wp.float32
+    leak_length: wp.float32  # [m]
+    one_sided: wp.int32
+    step: wp.float32  # |s0| of a moving simulation [m]
+
+
+@wp.func
+def row(n: wp.vec3, p: wp.vec3):
+    """(n, p x n): derivative of the gap's closing along n by the object's motion."""
+    t = wp.cross(p, n)
+    return vec6(n[0], n[1], n[2], t[0], t[1], t[2])
+
+
+@wp.func
+def point_motion(s: vec6, p: wp.vec3):
+    """Motion of the object's material at p."""
+    return wp.vec3(s[0], s[1], s[2]) + wp.cross(wp.vec3(s[3], s[4], s[5]), p)
+
+
+@wp.func
+def add_isotropic(a: mat66, c0: wp.float32, c1: wp.vec3, c2: wp.mat33):
+    """Add sum c (x + theta x p)^2 given the moments sum c, sum c p, sum c p p'."""
+    trace = c2[0, 0] + c2[1, 1] + c2[2, 2]
+    cross = wp.skew(c1)
+    for i in range(3):
+        a[i, i] = a[i, i] + c0
+        a[3 + i, 3 + i] = a[3 + i, 3 + i] + trace
+        for j in range(3):
+            a[3 + i, 3 + j] = a[3 + i, 3 + j] - c2[i, j]
+            a[i, 3 + j] = a[i, 3 + j] - cross[i, j]
+            a[3 + i, j] = a[3 + i, j] + cross[i, j]
+    return a
+
+
+@wp.func
+def solve_spd(a: mat66, b: vec6):
+    """x with a x = b for symmetric positive definite a: Cholesky."""
+    low = mat66(0.0)
+    for i in range(6):
+        for j in range(6):
+            if j <= i:
+                total = a[i, j]
+                for k in range(6):
+                    if k < j:
+                        total = total - low[i, k] * low[j, k]
+                if i == j:
+                    low[i, j] = wp.sqrt(wp.max(total, 1.0e-12))
+                else:
+                    low[i, j] = total / low[j, j]
+    y = vec6(0.0)
+    for i in range(6):
+        total = b[i]
+        for k in range(6):
+            if k < i:
+                total = total - low[i, k] * y[k]
+        y[i] = total / low[i, i]
+    x = vec6(0.0)
+    for m in range(6):
+        i = 5 - m
+        total = y[i]
+        for k in range(6):
+            if k > i:
+                total = total - low[k, i] * x[k]
+        x[i] = total / low[i, i]
+    return x
+
+
+@wp.func
+def displacement_loss(s: vec6, physics: Physics):
+    x = wp.vec3(s[0], s[1], s[2])
+    r = physics.gyration * wp.vec3(s[3], s[4], s[5])
+    return (wp.sqrt(wp.dot(x, x) + SMOOTH * SMOOTH) + wp.sqrt(wp.dot(r, r) + SMOOTH * SMOOTH)) / physics.step
+
+
+@wp.func
+def displacement_gradient(s: vec6, physics: Physics):
+    x = wp.vec3(s[0], s[1], s[2])
+    r = physics.gyration * wp.vec3(s[3], s[4], s[5])
+    gx = x / (wp.sqrt(wp.dot(x, x) + SMOOTH * SMOOTH) * physics.step)
+    gr = (physics.gyration / (wp.sqrt(wp.dot(r, r) + SMOOTH * SMOOTH) * physics.step)) * r
+    return vec6(gx[0], gx[1], gx[2], gr[0], gr[1], gr[2])
+
+
+@wp.func
+def leaked(pull: wp.float32, gap: wp.float32, physics: Physics):
+    """dL/drho of a free point at distance `gap` from the dilated surface, given what it would be on contact."""
+    if physics.one_sided == 1 and pull < 0.0:
+        return float(0.0)
+    return physics.leak * pull * wp.exp(-gap / physics.leak_length)
+
+
+@wp.kernel
+def direct(
+    physics_in: Physics,
+    motion_in: wp.array(dtype=vec6),
+    passes_in: wp.int32,
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    normal_in: wp.array2d(dtype=wp.vec3),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    loss_out: wp.array2d(dtype=wp.float32),
+    end_out: wp.array2d(dtype=vec6),
+    gradient_inout: wp.array2d(dtype=wp.float32),
+):
+    """Order-independent compliant contact: all contacts at once in one 6 x 6 system. Launch over (B, M).
+
+    Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of magnitude at most mu k w_i C_i, by
+    iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking one
+    a spring of stiffness k w_i.
+    """
+    b, m = wp.tid()
+    if active_in[b] == 0:
+        return
+    r = dilation_in[iteration_in[0]]
+    s0 = motion_in[m]
+    s = s0
+    k = physics_in.stiffness
+    count = count_in[b]
+    a = physics_in.mass
+    for _pass in range(passes_in):
+        a = physics_in.mass
+        rhs = physics_in.mass * s0
+        # Isotropic springs c at p act as c (I, -[p]; [p], |p|^2 I - p p'): summed as three small moments.
+        c0 = float(0.0)
+        c1 = wp.vec3(0.0)
+        c2 = wp.mat33(0.0)
+        for i in range(count):
+            rho = distance_in[b, i]
+            n = normal_in[b, i]
+            p = point_in[b, i]
+            u = point_motion(s, p)
+            c = r - rho + wp.dot(n, u)
+            if c > 0.0:
+                kw = k * weight_in[b, i]
+                tangent = u - wp.dot(n, u) * n
+                slide = wp.min(kw, kw * physics_in.friction * c / wp.max(wp.length(tangent), 1.0e-9))
+                j = row(n, p)
+                a += wp.outer((kw - slide) * j, j)
+                rhs -= (kw * (r - rho)) * j
+                c0 += slide
+                c1 += slide * p
+                c2 += wp.outer(slide * p, p)
+        a = add_isotropic(a, c0, c1, c2)
+        s = solve_spd(a, rhs)
+    loss_out[b, m] = displacement_loss(s, physics_in)
+    end_out[b, m] = s
+    y = solve_spd(a, displacement_gradient(s, physics_in))
+    share = 1.0 / float(motion_in.shape[0])
+    for i in range(count):
+        rho = distance_in[b, i]
+        n = normal_in[b, i]
+        p = point_in[b, i]
+        u = point_motion(s, p)
+        c = r - rho + wp.dot(n, u)
+        kw = k * weight_in[b, i]
+        g = kw * wp.dot(row(n, p), y)
+        if c > 0.0:
+            tangent = u - wp.dot(n, u) * n
+            length = wp.length(tangent)
+            if physics_in.friction * c < length:
+                g += kw * physics_in.friction * wp.dot(row(tangent / length, p), y)
+        else:
+            g = leaked(g, rho - r, physics_in)
+        if g != 0.0:
+            wp.atomic_add(gradient_inout, b, i, share * g)
+
+
+@wp.func
+def inverse_mass_along(physics: Physics, j: vec6):
+    """w = j M^-1 j': generalised inverse mass of the object along a row."""
+    return wp.dot(j, physics.inverse_mass * j)
+
+
+@wp.kernel
+def gauss_seidel(
+    physics_in: Physics,
+    motion_in: wp.array(dtype=vec6),
+    passes_in: wp.int32,
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    normal_in: wp.array2d(dtype=wp.vec3),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    states_out: wp.array3d(dtype=vec6),
+    loss_out: wp.array2d(dtype=wp.float32),
+    end_out: wp.array2d(dtype=vec6),
+    gradient_inout: wp.array2d(dtype=wp.float32),
+):
+    """The paper's step: one sweep of position-based dynamics over the contacts, in their order (Deul 2016).
+
+    Contact i moves the object by -M^-1 j C / w along the normal, then against the slip of its point by at most mu times
+    that impulse. `states` (B, M, N) keeps the object's motion before each contact for the reverse sweep. `passes` is
+    ignored: a second sweep would need its states too. Launch over (B, M).
+    """
+    b, m = wp.tid()
+    if active_in[b] == 0:
+        return
+    r = dilation_in[iteration_in[0]]
+    s = motion_in[m]
+    count = count_in[b]
+    for i in range(count):
+        states_out[b, m, i] = s
+        n = normal_in[b, i]
+        p = point_in[b, i]
+        j = row(n, p)
+        c = r - distance_in[b, i] + wp.dot(j, s)
+        if c > 0.0:
+            impulse = c / inverse_mass_along(physics_in, j)
+            s = s - impulse * (physics_in.inverse_mass * j)
+            u = point_motion(s, p)
+            tangent = u - wp.dot(n, u) * n
+            length = wp.length(tangent)
+            if length > 1.0e-9:
+                jt = row(tangent / length, p)
+                stop = length / inverse_mass_along(physics_in, jt)
+                s = s - wp.min(stop, physics_in.friction * impulse) * (physics_in.inverse_mass * jt)
+    loss_out[b, m] = displacement_loss(s, physics_in)
+    end_out[b, m] = s
+    y = displacement_gradient(s, physics_in)
+    share = 1.0 / float(motion_in.shape[0])
+    for back in range(count):
+        i = count - 1 - back
+        before = states_out[b, m, i]
+        n = normal_in[b, i]
+        p = point_in[b, i]
+        j = row(n, p)
+        mj = physics_in.inverse_mass * j
+        w = wp.dot(j, mj)
+        c = r - distance_in[b, i] + wp.dot(j, before)
+        if c > 0.0:
+            impulse = c / w
+            middle = before - impulse * mj
+            u = point_motion(middle, p)
+            tangent = u - wp.dot(n, u) * n
+            length = wp.length(tangent)
+            slip = float(0.0)
+            if length > 1.0e-9:
+                # The slip direction is taken as constant.
+                jt = row(tangent / length, p)
+                mjt = physics_in.inverse_mass * jt
+                wt = wp.dot(jt, mjt)
+                along = wp.dot(mjt, y)
+                if length / wt <= physics_in.friction * impulse:
+                    y = y - (along / wt) * jt
+                else:
+                    # lambda_t = mu C / w: it grows with C, hence falls with the distance.
+                    slip = physics_in.friction * along / w
+            g = wp.dot(mj, y) / w + slip
+            y = y - g * j
+            wp.atomic_add(gradient_inout, b, i, share * g)
+        else:
+            g = leaked(wp.dot(mj, y) / w, -c, physics_in)
+            if g != 0.0:
+                wp.atomic_add(gradient_inout, b, i, share * g)
+
+
+@wp.kernel
+def jacobi(
+    physics_in: Physics,
+    motion_in: wp.array(dtype=vec6),
+    passes_in: wp.int32,
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    normal_in: wp.array2d(dtype=wp.vec3),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    states_out: wp.array3d(dtype=vec6),
+    loss_out: wp.array2d(dtype=wp.float32),
+    end_out: wp.array2d(dtype=vec6),
+    gradient_inout: wp.array2d(dtype=wp.float32),
+):
+    """Averaged Jacobi: every pass applies the mean of all active contacts' corrections, so their order does not matter.
+
+    `states` (B, M, >= passes) keeps the motion before each pass. The summed (not averaged) form diverges with the
+    number of contacts. The count of active contacts is taken as constant by the adjoint. Launch over (B, M).
+    """
+    b, m = wp.tid()
+    if active_in[b] == 0:
+        return
+    r = dilation_in[iteration_in[0]]
+    s = motion_in[m]
+    count = count_in[b]
+    for step in range(passes_in):
+        states_out[b, m, step] = s
+        total = vec6(0.0)
+        touching = float(0.0)
+        for i in range(count):
+            n = normal_in[b, i]
+            p = point_in[b, i]
+            j = row(n, p)
+            c = r - distance_in[b, i] + wp.dot(j, s)
+            if c > 0.0:
+                touching += 1.0
+                mj = physics_in.inverse_mass * j
+                impulse = c / wp.dot(j, mj)
+                total -= impulse * mj
+                u = point_motion(s, p)
+                tangent = u - wp.dot(n, u) * n
+                length = wp.length(tangent)
+                if length > 1.0e-9:
+                    jt = row(tangent / length, p)
+                    mjt = physics_in.inverse_mass * jt
+                    total -= wp.min(length / wp.dot(jt, mjt), physics_in.friction * impulse) * mjt
+        if touching > 0.0:
+            s = s + total / touching
+    loss_out[b, m] = displacement_loss(s, physics_in)
+    end_out[b, m] = s
+    y = displacement_gradient(s, physics_in)
+    share = 1.0 / float(motion_in.shape[0])
+    for back in range(passes_in):
+        before = states_out[b, m, passes_in - 1 - back]
+        touching = float(0.0)
+        for i in range(count):
+            c = r - distance_in[b, i] + wp.dot(row(normal_in[b, i], point_in[b, i]), before)
+            if c > 0.0:
+                touching += 1.0
+        part = share / wp.max(touching, 1.0)
+        carried = vec6(0.0)
+        for i in range(count):
+            n = normal_in[b, i]
+            p = point_in[b, i]
+            j = row(n, p)
+            mj = physics_in.inverse_mass * j
+            w = wp.dot(j, mj)
+            c = r - distance_in[b, i] + wp.dot(j, before)
+            g = wp.dot(mj, y) / w
+            if c > 0.0:
+                carried -= g * j
+                u = point_motion(before, p)
+                tangent = u - wp.dot(n, u) * n
+                length = wp.length(tangent)
+                if length > 1.0e-9:
+                    jt = row(tangent / length, p)
+                    mjt = physics_in.inverse_mass * jt
+                    along = wp.dot(mjt, y)
+                    wt = wp.dot(jt, mjt)
+                    if length / wt <= physics_in.friction * c / w:
+                        carried -= (along / wt) * jt
+                    else:
+                        g += physics_in.friction * along / w
+                        carried -= (physics_in.friction * along / w) * j
+            else:
+                g = leaked(g, -c, physics_in)
+            if g != 0.0:
+                wp.atomic_add(gradient_inout, b, i, part * g)
+        if touching > 0.0:
+            y = y + carried / touching

@@ -1,0 +1,87 @@
+"""Penalties on single points and joints, and the gradient's way from points to bodies."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def points_to_bodies(
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    penetration_weight_in: wp.array(dtype=wp.float32),
+    clearance_in: wp.float32,
+    count_in: wp.array(dtype=wp.int32),
+    body_in: wp.array2d(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    normal_in: wp.array2d(dtype=wp.vec3),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    gradient_in: wp.array2d(dtype=wp.float32),
+    force_inout: wp.array2d(dtype=wp.vec3),
+    torque_inout: wp.array2d(dtype=wp.vec3),
+    depth_inout: wp.array(dtype=wp.float32),
+):
+    """Wrench gradient on bodies from dL/drho, with the penetration term w sum w_i min(rho - clearance, 0)^2 added.
+
+    The distance grows along the object's outward normal (normals are taken as constant). Launch over (B, N).
+    """
+    b, i = wp.tid()
+    if active_in[b] == 0 or i >= count_in[b]:
+        return
+    rho = distance_in[b, i]
+    g = gradient_in[b, i]
+    if rho < clearance_in:
+        g += 2.0 * penetration_weight_in[iteration_in[0]] * weight_in[b, i] * (rho - clearance_in)
+        wp.atomic_max(depth_inout, b, -rho)
+    if g != 0.0:
+        body = body_in[b, i]
+        f = g * normal_in[b, i]
+        wp.atomic_add(force_inout, b, body, f)
+        wp.atomic_add(torque_inout, b, body, wp.cross(point_in[b, i], f))
+
+
+@wp.kernel
+def joints(
+    active_in: wp.array(dtype=wp.int32),
+    q_in: wp.array2d(dtype=wp.float32),
+    lower_in: wp.array(dtype=wp.float32),
+    upper_in: wp.array(dtype=wp.float32),
+    range_weight_in: wp.float32,
+    limit_weight_in: wp.float32,
+    gradient_inout: wp.array2d(dtype=wp.float32),
+):
+    """Gradient of L_range + L_limit (paper, section III-D). Launch over (B, D).
+
+    L_range = w sum ((q - mid) / half)^2; L_limit = w sum max(lower - q, 0, q - upper)^2.
+    """
+    b, d = wp.tid()
+    if active_in[b] == 0:
+        return
+    q = q_in[b, d]
+    lower = lower_in[d]
+    upper = upper_in[d]
+    half = wp.max(0.5 * (upper - lower), 1.0e-6)
+    g = 2.0 * range_weight_in * (q - 0.5 * (lower + upper)) / (half * half)
+    g += 2.0 * limit_weight_in * (wp.max(q - upper, 0.0) - wp.max(lower - q, 0.0))
+    gradient_inout[b, 6 + d] = gradient_inout[b, 6 + d] + g
+
+
+@wp.kernel
+def attract(
+    active_in: wp.array(dtype=wp.int32),
+    pull_in: wp.float32,
+    length_in: wp.float32,
+    count_in: wp.array(dtype=wp.int32),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    gradient_out: wp.array2d(dtype=wp.float32),
+):
+    """The control without a simulation: free points are drawn to the object, fading with distance. Launch over (B, N)."""
+    b, i = wp.tid()
+    if active_in[b] == 0 or i >= count_in[b]:
+        return
+    rho = distance_in[b, i]
+    gradient_out[b, i] = 0.0
+    if rho > 0.0:
+        gradient_out[b, i] = pull_in * weight_in[b, i] * wp.exp(-rho / length_in)

@@ -1,0 +1,209 @@
+"""Gauss-Newton projection out of penetration: residuals of violated clearances, their rows, the normal equations.
+
+A residual is w (d - target) where d is a signed distance; its row is the derivative of d by (root translation, root
+rotation about the pivot, dofs). d is the distance of a hand point to the object (normal n of the object), of an object
+sample to a link, or of a point of one link to another link.
+"""
+
+import warp as wp
+
+from worker.simulation.kernels.kinematics import Tree
+from worker.simulation.kernels.pieces import Pieces, piece_distance
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Residuals:
+    """Packed residuals per grasp, capacity R; what does not fit is left to the next iteration."""
+
+    count: wp.array(dtype=wp.int32)
+    body: wp.array2d(dtype=wp.int32)
+    other: wp.array2d(dtype=wp.int32)  # body moved against, or -1: the object
+    point: wp.array2d(dtype=wp.vec3)
+    direction: wp.array2d(dtype=wp.vec3)  # moving the body by it increases d
+    value: wp.array2d(dtype=wp.float32)  # d - target [m]
+    weight: wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def emit(
+    out: Residuals, b: wp.int32, body: wp.int32, other: wp.int32, point: wp.vec3, direction: wp.vec3,
+    value: wp.float32, weight: wp.float32,
+):  # fmt: skip
+    k = wp.atomic_add(out.count, b, 1)
+    if k < out.body.shape[1]:
+        out.body[b, k] = body
+        out.other[b, k] = other
+        out.point[b, k] = point
+        out.direction[b, k] = direction
+        out.value[b, k] = value
+        out.weight[b, k] = weight
+
+
+@wp.kernel
+def point_residuals(
+    active_in: wp.array(dtype=wp.int32),
+    near_in: wp.float32,
+    target_in: wp.float32,
+    hold_in: wp.float32,
+    hold_target_in: wp.float32,
+    hold_weight_in: wp.float32,
+    count_in: wp.array(dtype=wp.int32),
+    body_in: wp.array2d(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    normal_in: wp.array2d(dtype=wp.vec3),
+    distance_in: wp.array2d(dtype=wp.float32),
+    residuals_out: Residuals,
+):
+    """Hand points nearer than `near` go to `target`; those nearer than `hold` are held near it, weakly. Over (B, N)."""
+    b, i = wp.tid()
+    if active_in[b] == 0 or i >= count_in[b]:
+        return
+    rho = distance_in[b, i]
+    if rho < near_in:
+        emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
+    elif rho < hold_in:
+        emit(
+            residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - hold_target_in, hold_weight_in
+        )
+
+
+@wp.kernel
+def sample_residuals(
+    active_in: wp.array(dtype=wp.int32),
+    near_in: wp.float32,
+    target_in: wp.float32,
+    pieces_in: Pieces,
+    bvh_in: wp.uint64,
+    sample_in: wp.array(dtype=wp.vec3),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    residuals_out: Residuals,
+):
+    """Object samples nearer to a link than `near` go to `target`. Launch over (B, P)."""
+    b, piece = wp.tid()
+    if active_in[b] == 0:
+        return
+    body = pieces_in.body[piece]
+    q = body_q_in[b, body] * pieces_in.pose_q[piece]
+    p = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], pieces_in.pose_p[piece])
+    half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
+    ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
+    ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
+    ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
+    extent = wp.vec3(
+        wp.abs(ex[0]) + wp.abs(ey[0]) + wp.abs(ez[0]),
+        wp.abs(ex[1]) + wp.abs(ey[1]) + wp.abs(ez[1]),
+        wp.abs(ex[2]) + wp.abs(ey[2]) + wp.abs(ez[2]),
+    )
+    query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
+    index = wp.int32(0)
+    while wp.bvh_query_next(query, index):
+        x = sample_in[index]
+        local = wp.quat_rotate_inv(q, x - p)
+        if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+            nd = piece_distance(pieces_in, piece, local)
+            if nd[3] < near_in:
+                n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                # The link moving along its own outward normal comes nearer: d falls.
+                emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
+
+
+@wp.kernel
+def self_residuals(
+    active_in: wp.array(dtype=wp.int32),
+    near_in: wp.float32,
+    target_in: wp.float32,
+    pieces_in: Pieces,
+    point_body_in: wp.array(dtype=wp.int32),
+    point_in: wp.array(dtype=wp.vec3),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    residuals_out: Residuals,
+):
+    """Points of one link nearer than `near` to another link go to `target`. Launch over (B, points)."""
+    b, i = wp.tid()
+    if active_in[b] == 0:
+        return
+    own = point_body_in[i]
+    x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], point_in[i])
+    for piece in range(pieces_in.body.shape[0]):
+        other = pieces_in.body[piece]
+        if pieces_in.apart[own, other] == 1:
+            bq = body_q_in[b, other]
+            offset = x - body_p_in[b, other] - wp.quat_rotate(bq, pieces_in.pose_p[piece])
+            reach = wp.length(pieces_in.half[piece]) + near_in
+            if wp.dot(offset, offset) < reach * reach:
+                q = bq * pieces_in.pose_q[piece]
+                nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, offset))
+                if nd[3] < near_in:
+                    n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                    emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
+
+
+@wp.func
+def add_chain(
+    tree: Tree, b: wp.int32, body: wp.int32, point: wp.vec3, direction: wp.vec3, sign: wp.float32,
+    body_p: wp.array2d(dtype=wp.vec3), axis: wp.array2d(dtype=wp.vec3), row: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """Add the joints' part of a row: motion along `direction` of a point of `body`."""
+    k = body
+    while k > 0:
+        a = axis[b, k]
+        g = wp.dot(a, direction)
+        if tree.joint_type[k] == 1:
+            g = wp.dot(wp.cross(a, point - body_p[b, k]), direction)
+        column = 6 + tree.dof[k]
+        row[b, column] = row[b, column] + sign * tree.multiplier[k] * g
+        k = tree.parent[k]
+
+
+@wp.kernel
+def normal_equations(
+    tree_in: Tree,
+    active_in: wp.array(dtype=wp.int32),
+    pivot_in: wp.array(dtype=wp.vec3),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    axis_in: wp.array2d(dtype=wp.vec3),
+    residuals_in: Residuals,
+    row_out: wp.array2d(dtype=wp.float32),
+    matrix_out: wp.array3d(dtype=wp.float32),
+    vector_out: wp.array2d(dtype=wp.float32),
+):
+    """J'WJ (B, n, n) and J'We (B, n), n = 6 + D; `row` (B, n) is scratch. Launch over B."""
+    b = wp.tid()
+    if active_in[b] == 0:
+        return
+    n = row_out.shape[1]
+    for i in range(n):
+        vector_out[b, i] = 0.0
+        for j in range(n):
+            matrix_out[b, i, j] = 0.0
+    count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
+    for k in range(count):
+        for i in range(n):
+            row_out[b, i] = 0.0
+        body = residuals_in.body[b, k]
+        other = residuals_in.other[b, k]
+        point = residuals_in.point[b, k]
+        direction = residuals_in.direction[b, k]
+        add_chain(tree_in, b, body, point, direction, 1.0, body_p_in, axis_in, row_out)
+        if other >= 0:
+            # Both links move with the root: only the joints between them tell.
+            add_chain(tree_in, b, other, point, direction, -1.0, body_p_in, axis_in, row_out)
+        else:
+            turn = wp.cross(point - pivot_in[b], direction)
+            for i in range(3):
+                row_out[b, i] = direction[i]
+                row_out[b, 3 + i] = turn[i]
+        w = residuals_in.weight[b, k]
+        e = residuals_in.value[b, k]
+        for i in range(n):
+            ri = row_out[b, i]
+            if ri != 0.0:
+                vector_out[b, i] = vector_out[b, i] + w * ri * e
+                for j in range(i + 1):
+                    rj = row_out[b, j]
+                    if rj != 0.0:
+                        matrix_out[b, i, j] = matrix_out[b, i, j] + w * ri * rj

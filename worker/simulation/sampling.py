@@ -1,0 +1,60 @@
+"""Even samples of a mesh's surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.objects.model import ObjectModel
+
+Floats = NDArray[np.float64]
+
+#: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
+SHARP_EDGE_COS = np.cos(np.radians(35.0))
+
+
+def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
+    """Indices of `count` of the points (n, 3), each the farthest from those before it; the first is point 0."""
+    chosen = np.empty(min(count, len(points)), dtype=np.intp)
+    distance = np.full(len(points), np.inf)
+    pick = 0
+    for k in range(len(chosen)):
+        chosen[k] = pick
+        np.minimum(distance, ((points - points[pick]) ** 2).sum(axis=1), out=distance)
+        pick = int(np.argmax(distance))
+    return chosen
+
+
+def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
+    """(count, 3) evenly spread points of the surface, its sharp edges included [m]."""
+    rng = np.random.default_rng(seed)
+    corners = obj.vertices[obj.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    faces = rng.choice(len(area), size=6 * count, p=area / area.sum())
+    u, v = rng.random((2, 6 * count))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    a, b, c = (corners[faces, k] for k in range(3))
+    inner = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    edges = _edge_samples(obj, cross / area[:, None].clip(1e-18), count, rng)
+    # Edge points first: farthest-point thinning keeps early points where it has a choice.
+    points = np.concatenate([edges, inner])
+    return points[farthest_points(points, count)]
+
+
+def _edge_samples(obj: ObjectModel, normals: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """Up to count / 2 random points on sharp edges, by length."""
+    edges = np.sort(np.concatenate([obj.faces[:, [0, 1]], obj.faces[:, [1, 2]], obj.faces[:, [2, 0]]]), axis=1)
+    face = np.tile(np.arange(len(obj.faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, face = edges[order], face[order]
+    twin = np.flatnonzero((edges[:-1] == edges[1:]).all(axis=1))
+    sharp = np.einsum("ij,ij->i", normals[face[twin]], normals[face[twin + 1]]) < SHARP_EDGE_COS
+    ends = obj.vertices[edges[twin[sharp]]]
+    if len(ends) == 0:
+        return np.zeros((0, 3))
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    pick = rng.choice(len(ends), size=count // 2, p=length / length.sum())
+    t = rng.random((len(pick), 1))
+    return ends[pick, 0] * (1 - t) + ends[pick, 1] * t

@@ -1,0 +1,321 @@
+"""B grasps of one hand on one object: one iteration is gradient of the loss, then a step; nothing leaves the device.
+
+All per-iteration values (dilation, weights, rates) lie in tables on the device, read at a counter on the device, so an
+iteration is the same list of launches each time: recorded once, and replayed as a graph on CUDA.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.hands.model import SurfacePoints
+from worker.simulation.device import DeviceHand, DeviceObject, to_wxyz, to_xyzw
+from worker.simulation.kernels import contact, kinematics, optimizers, penalties, pieces, surface
+
+Floats = NDArray[np.float64]
+
+#: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on how many points.
+REFERENCE_POINTS: Final = 800
+#: Weight of one object sample is 1 at this many samples.
+REFERENCE_SAMPLES: Final = 2000
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """What is simulated and penalised; see `worker.simulation.kernels.contact` for the symbols."""
+
+    contact_solver: str = "direct"
+    velocities: int = 7
+    friction: float = 0.8
+    stiffness: float = 1.0
+    passes: int = 4
+    step: float = 1e-3
+    """Free motion of the object in one step, v dt [m]."""
+    leak: float = 0.1
+    leak_length: float = 0.02
+    one_sided: bool = True
+    band: float = 0.03
+    """Points farther than dilation + band from the surface take no part [m]."""
+    exact_below: float = 0.004
+    """Nearer than this distances are asked of the mesh, farther of the grid [m]."""
+    range_weight: float = 0.005
+    limit_weight: float = 0.0
+    self_margin: float = 1e-3
+    simulate: bool = True
+    """False: no simulation; every point near the object is drawn to it. A control for benchmarks."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Per-iteration values, arrays of length I; rates (I, 3) for translation [m], rotation [rad], joints."""
+
+    dilation: Floats
+    penetration: Floats
+    object_penetration: Floats
+    self_penetration: Floats
+    rates: Floats
+
+    def __len__(self) -> int:
+        return len(self.dilation)
+
+
+@dataclass
+class HandState:
+    """State of B hands: pivot (B, 3) = palm centre relative to the object's centre of mass, rotation (B, 4) w x y z,
+    q (B, D)."""
+
+    pivot: Floats
+    rotation: Floats
+    q: Floats
+
+    def __getitem__(self, index: Any) -> HandState:
+        return HandState(self.pivot[index], self.rotation[index], self.q[index])
+
+
+def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
+    """(M, 6) free motions of the object: at rest, then +-x, +-y, +-z, then (13) the same for rotations."""
+    rows = [np.zeros(6)]
+    for axis in range(3 if velocities == 7 else 6):
+        for sign in (1.0, -1.0):
+            motion = np.zeros(6)
+            motion[axis] = sign * (step if axis < 3 else step / gyration)
+            rows.append(motion)
+    return np.array(rows)
+
+
+class Simulation:
+    """Arrays and launches for up to `capacity` grasps with one set of hand points."""
+
+    def __init__(
+        self, hand: DeviceHand, obj: DeviceObject, points: SurfacePoints, self_points: SurfacePoints,
+        *, capacity: int, options: LossOptions,
+    ) -> None:  # fmt: skip
+        self.hand, self.obj, self.options, self.capacity = hand, obj, options, capacity
+        self.device = hand.device
+        self.dofs, self.bodies, self.count = hand.model.dofs, hand.model.bodies, len(points)
+        self._graph: Any = None
+        self._commands: list[Any] = []
+        with wp.ScopedDevice(self.device):
+            self._upload_points(points, self_points)
+            self._allocate()
+            self.physics = self._physics()
+
+    def _upload_points(self, points: SurfacePoints, self_points: SurfacePoints) -> None:
+        weight = points.area * (REFERENCE_POINTS / points.area.sum())
+        self.point_body = wp.array(points.body, dtype=wp.int32)
+        self.point_position = wp.array(points.position, dtype=wp.vec3)
+        self.point_weight = wp.array(weight, dtype=wp.float32)
+        self.self_body = wp.array(self_points.body, dtype=wp.int32)
+        self.self_position = wp.array(self_points.position, dtype=wp.vec3)
+
+    def _allocate(self) -> None:
+        B, N, L, D = self.capacity, self.count, self.bodies, self.dofs
+        M = self.options.velocities
+        self.active = wp.ones(B, dtype=wp.int32)
+        self.iteration = wp.zeros(1, dtype=wp.int32)
+        self.pivot = wp.zeros(B, dtype=wp.vec3)
+        self.rotation = wp.zeros(B, dtype=wp.quat)
+        self.q = wp.zeros((B, D), dtype=wp.float32)
+        self.body_p = wp.zeros((B, L), dtype=wp.vec3)
+        self.body_q = wp.zeros((B, L), dtype=wp.quat)
+        self.axis = wp.zeros((B, L), dtype=wp.vec3)
+        self.force = wp.zeros((B, L), dtype=wp.vec3)
+        self.torque = wp.zeros((B, L), dtype=wp.vec3)
+        self.contacts = wp.zeros(B, dtype=wp.int32)
+        self.contact_body = wp.zeros((B, N), dtype=wp.int32)
+        self.contact_point = wp.zeros((B, N), dtype=wp.vec3)
+        self.contact_normal = wp.zeros((B, N), dtype=wp.vec3)
+        self.contact_distance = wp.zeros((B, N), dtype=wp.float32)
+        self.contact_weight = wp.zeros((B, N), dtype=wp.float32)
+        self.contact_gradient = wp.zeros((B, N), dtype=wp.float32)
+        self.loss = wp.zeros((B, M), dtype=wp.float32)
+        self.end = wp.zeros((B, M), dtype=contact.vec6)
+        self.gradient = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.first = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.second = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.point_depth = wp.zeros(B, dtype=wp.float32)
+        self.object_depth = wp.zeros(B, dtype=wp.float32)
+        self.self_depth = wp.zeros(B, dtype=wp.float32)
+        motions = initial_motions(M, self.options.step, self.obj.model.gyration_radius)
+        self.motions = wp.array(motions, dtype=contact.vec6)
+        self.states = None
+        if self.options.contact_solver != "direct":
+            kept = N if self.options.contact_solver == "gauss_seidel" else self.options.passes
+            self.states = wp.zeros((B, M, kept), dtype=contact.vec6)
+
+    def _physics(self) -> Any:
+        mass = np.zeros((6, 6))
+        mass[:3, :3] = np.eye(3)
+        mass[3:, 3:] = self.obj.model.inertia
+        physics = contact.Physics()
+        physics.mass = contact.mat66(*mass.ravel().tolist())
+        physics.inverse_mass = contact.mat66(*np.linalg.inv(mass).ravel().tolist())
+        physics.gyration = self.obj.model.gyration_radius
+        physics.friction = self.options.friction
+        physics.stiffness = self.options.stiffness
+        physics.leak = self.options.leak
+        physics.leak_length = self.options.leak_length
+        physics.one_sided = int(self.options.one_sided)
+        physics.step = self.options.step
+        return physics
+
+    def set_state(self, state: HandState, active: NDArray[np.bool_] | None = None) -> None:
+        """Load up to `capacity` hands; the rest of the capacity is switched off. Optimiser moments are cleared."""
+        n = len(state.pivot)
+        mask = np.zeros(self.capacity, dtype=np.int32)
+        mask[:n] = 1 if active is None else active
+        self._assign(self.pivot, state.pivot)
+        self._assign(self.rotation, to_xyzw(state.rotation))
+        self._assign(self.q, state.q)
+        self.active.assign(mask)
+        self.iteration.zero_()
+        self.first.zero_()
+        self.second.zero_()
+
+    def _assign(self, array: Any, values: Floats) -> None:
+        padded = np.zeros((self.capacity, values.shape[1]), dtype=np.float32)
+        padded[: len(values)] = values
+        array.assign(padded)
+
+    def state(self, n: int) -> HandState:
+        """The first n hands, in float64."""
+        return HandState(
+            self.pivot.numpy()[:n].astype(float),
+            to_wxyz(self.rotation.numpy()[:n].astype(float)),
+            self.q.numpy()[:n].astype(float),
+        )
+
+    def set_schedule(self, schedule: Schedule) -> None:
+        """Upload the per-iteration tables and start counting at 0."""
+        with wp.ScopedDevice(self.device):
+            self.dilation = wp.array(schedule.dilation, dtype=wp.float32)
+            self.penetration_weight = wp.array(schedule.penetration, dtype=wp.float32)
+            self.object_weight = wp.array(schedule.object_penetration, dtype=wp.float32)
+            self.self_weight = wp.array(schedule.self_penetration, dtype=wp.float32)
+            self.rates = wp.array(schedule.rates, dtype=wp.float32)
+        self._commands = []
+        self._graph = None
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        self._commands.append(wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True))
+
+    def _record_kinematics(self) -> None:
+        B = self.capacity
+        self._launch(
+            kinematics.forward, B,
+            [self.hand.tree, self.active, self.pivot, self.rotation, self.q, self.body_p, self.body_q, self.axis,
+             self.force, self.torque, self.contacts, self.point_depth, self.object_depth, self.self_depth],
+        )  # fmt: skip
+        self._launch(
+            surface.gather, (B, self.count),
+            [self.obj.surface, self.active, self.iteration, self.dilation, self.options.band, self.options.exact_below,
+             self.point_body, self.point_position, self.point_weight, self.body_p, self.body_q, self.contacts,
+             self.contact_body, self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
+             self.contact_gradient],
+        )  # fmt: skip
+
+    def _record_contact(self) -> None:
+        o = self.options
+        inputs = [
+            self.physics, self.motions, o.passes, self.active, self.iteration, self.dilation, self.contacts,
+            self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
+        ]  # fmt: skip
+        if self.states is not None:
+            inputs.append(self.states)
+        kernel = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
+        if o.simulate:
+            self._launch(
+                kernel[o.contact_solver], (self.capacity, o.velocities),
+                [*inputs, self.loss, self.end, self.contact_gradient],
+            )  # fmt: skip
+        else:
+            self._launch(
+                penalties.attract, (self.capacity, self.count),
+                [self.active, o.leak, o.leak_length, self.contacts, self.contact_distance, self.contact_weight,
+                 self.contact_gradient],
+            )  # fmt: skip
+
+    def _record_penalties(self) -> None:
+        B, o = self.capacity, self.options
+        self._launch(
+            pieces.object_in_pieces, (B, len(self.hand.model.pieces)),
+            [self.hand.pieces, self.obj.bvh.id, self.obj.samples, REFERENCE_SAMPLES / len(self.obj.samples),
+             self.active, self.iteration, self.object_weight, self.body_p, self.body_q, self.force, self.torque,
+             self.object_depth],
+        )  # fmt: skip
+        self._launch(
+            pieces.pieces_in_pieces, (B, len(self.self_body)),
+            [self.hand.pieces, o.self_margin, self.active, self.iteration, self.self_weight, self.self_body,
+             self.self_position, self.body_p, self.body_q, self.force, self.torque, self.self_depth],
+        )  # fmt: skip
+        self._launch(
+            penalties.points_to_bodies, (B, self.count),
+            [self.active, self.iteration, self.penetration_weight, 0.0, self.contacts, self.contact_body,
+             self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
+             self.contact_gradient, self.force, self.torque, self.point_depth],
+        )  # fmt: skip
+
+    def _record_gradient(self) -> None:
+        B, o = self.capacity, self.options
+        self._launch(
+            kinematics.backward, B,
+            [self.hand.tree, self.active, self.pivot, self.body_p, self.axis, self.force, self.torque, self.gradient],
+        )  # fmt: skip
+        self._launch(
+            penalties.joints, (B, self.dofs),
+            [self.active, self.q, self.hand.lower, self.hand.upper, o.range_weight, o.limit_weight, self.gradient],
+        )  # fmt: skip
+
+    def record_iteration(self, optimizer: str, *, betas: tuple[float, float] = (0.9, 0.99)) -> None:
+        """Fix the launches of one iteration for the present schedule."""
+        self._commands, self._graph = [], None
+        self._record_kinematics()
+        self._record_contact()
+        self._record_penalties()
+        self._record_gradient()
+        limits = [self.hand.lower, self.hand.upper]
+        state = [self.pivot, self.rotation, self.q]
+        if optimizer == "adam":
+            inputs = [self.active, self.iteration, self.rates, *betas, *limits, self.gradient]
+            self._launch(optimizers.adam, self.capacity, [*inputs, self.first, self.second, *state])
+        else:
+            clamp = int(self.options.limit_weight == 0.0)
+            inputs = [self.active, self.iteration, self.rates, clamp, *limits, self.gradient]
+            self._launch(optimizers.gradient_descent, self.capacity, [*inputs, *state])
+        self._launch(optimizers.advance, 1, [self.iteration])
+
+    def record_evaluation(self) -> None:
+        """Fix the launches of loss and gradient without a step."""
+        self._commands, self._graph = [], None
+        self._record_kinematics()
+        self._record_contact()
+        self._record_penalties()
+        self._record_gradient()
+
+    def record_placement(self) -> None:
+        """Fix the launches that tell contacts and penetration depths only."""
+        self._commands, self._graph = [], None
+        self._record_kinematics()
+        self._record_penalties()
+
+    def run(self, iterations: int = 1) -> None:
+        """Launch what was recorded, `iterations` times, without waiting for the device."""
+        if wp.get_device(self.device).is_cuda and iterations > 2:
+            if self._graph is None:
+                with wp.ScopedCapture(device=self.device) as capture:
+                    self._launch_all()
+                self._graph = capture.graph
+            for _ in range(iterations):
+                wp.capture_launch(self._graph)
+            return
+        for _ in range(iterations):
+            self._launch_all()
+
+    def _launch_all(self) -> None:
+        for command in self._commands:
+            command.launch()
