@@ -1,0 +1,54 @@
+"""What an object's `asset.json` may say beside the mesh."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from service.errors import MeshError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+#: Metres per unit.
+UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+
+
+class ObjectOptions(BaseModel):
+    """The keys of an object's `asset.json`; units are SI."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: str = ""
+    description: str = ""
+    licence: str = ""
+    source: str = ""
+    facts: dict[str, Any] = Field(default_factory=dict)
+    units: Literal["m", "mm", "cm", "in"] = "m"
+    scale_to: Positive | None = Field(None, description="longest extent after scaling [m]")
+    keep_largest: bool = Field(False, description="of several components keep the largest")
+    allow_open: bool = Field(False, description="take a mesh that encloses no volume")
+    density: Positive | None = Field(None, description="[kg/m^3]")
+    mass: Positive | None = Field(None, description="[kg]")
+
+
+def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> ObjectOptions:
+    """Options of the object in `files`, with `extra` (None values left out) over what its `asset.json` says.
+
+    Raises:
+        MeshError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it.
+    """
+    try:
+        stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
+    except (ValueError, RecursionError):
+        stated = None
+    if not isinstance(stated, dict):
+        raise MeshError('asset.json is no JSON object; write one such as {"file": "mug.stl", "units": "mm"}')
+    given = {key: value for key, value in (extra or {}).items() if value is not None}
+    try:
+        return ObjectOptions.model_validate({**stated, **given})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise MeshError(f"asset.json: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -1,0 +1,152 @@
+"""An object from its files: read, repaired, simplified, with normals, hull and mass properties."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from service.assets import builtin_files, builtin_names, unpack
+from service.digests import digest_files
+from service.domain import AssetKind
+from service.errors import GraspdError, MeshError, NotFoundError
+from service.settings import Settings
+from worker.objects.formats import READERS, read_mesh
+from worker.objects.mass import mass_properties
+from worker.objects.model import Floats, Ints, ObjectModel
+from worker.objects.normals import corner_normals
+from worker.objects.options import ObjectOptions, parse_options
+from worker.objects.repair import Repaired, repair
+from worker.objects.simplify import simplify
+
+
+def load_object(
+    files: Mapping[str, bytes], *, name: str, digest: str, face_error_m: float, options: Mapping[str, Any] | None = None
+) -> ObjectModel:
+    """The object that `files` describe.
+
+    Args:
+        files: the mesh (STL, OBJ, PLY, OFF or GLB) and, if there is more to say, `asset.json` (see `ObjectOptions`).
+        name: name of the object.
+        digest: digest of its files.
+        face_error_m: the prepared surface lies within this distance of the uploaded one [m]; 0: no simplification.
+        options: keys that go over those of `asset.json`.
+
+    Raises:
+        MeshError: the mesh cannot be used; the message names what is wrong and the mend.
+    """
+    settings = parse_options(files, options)
+    main = main_file(files, settings)
+    model = _prepared(main, files[main], settings.model_dump_json(), float(face_error_m))
+    return replace(model, name=name, digest=digest)
+
+
+def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
+    """Name of the mesh: as `asset.json` says, else the only one."""
+    if options.file:
+        if options.file not in files:
+            raise MeshError(f"asset.json names the file {options.file!r}, which is not there")
+        return options.file
+    found = sorted(name for name in files if Path(name).suffix.lower() in READERS)
+    if len(found) == 1:
+        return found[0]
+    others = sorted(name for name in files if name != "asset.json")
+    if not found and len(others) == 1:
+        return others[0]
+    raise MeshError(f'{len(found)} meshes among the object\'s files; name one in asset.json under "file"')
+
+
+@lru_cache(maxsize=8)
+def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
+    """Cached by content: every batch of a job asks for the same object."""
+    return build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m)
+
+
+def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> Repaired:
+    """The mesh of a file as a solid in metres; errors name the file."""
+    soup = read_mesh(main, data)
+    try:
+        return repair(soup, options)
+    except GraspdError as error:
+        raise type(error)(f"{main}: {error}") from None
+
+
+def build(mesh: Repaired, face_error_m: float) -> ObjectModel:
+    """The model of a repaired mesh."""
+    vertices, faces, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
+    hull_vertices, hull_faces = convex_hull(vertices)
+    solid = (vertices, faces.astype(np.int32)) if mesh.watertight else (hull_vertices, hull_faces)
+    mass = mass_properties(*solid)
+    return ObjectModel(
+        name="",
+        digest="",
+        vertices=vertices,
+        faces=faces.astype(np.int32),
+        corner_normals=corner_normals(vertices, faces.astype(np.int32)),
+        volume=mass.volume,
+        centre_of_mass=mass.centre_of_mass,
+        inertia=mass.inertia,
+        radius=float(np.linalg.norm(vertices - mass.centre_of_mass, axis=1).max()),
+        hull_vertices=hull_vertices,
+        hull_faces=hull_faces,
+        watertight=mesh.watertight,
+        deviation_m=error,
+        repairs=mesh.repairs,
+    )
+
+
+def convex_hull(points: Floats) -> tuple[Floats, Ints]:
+    """Corners (H, 3) and outward triangles (G, 3)."""
+    try:
+        qhull = ConvexHull(points)
+    except QhullError:
+        raise MeshError("the mesh is flat; give it a thickness") from None
+    keep, inverse = np.unique(qhull.simplices, return_inverse=True)
+    faces: Ints = inverse.reshape(-1, 3).astype(np.int32)
+    vertices = points[keep]
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), qhull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces
+
+
+def object_from_path(
+    path: str | Path, face_error_m: float = 3e-4, options: Mapping[str, Any] | None = None
+) -> ObjectModel:
+    """An object for the command line: name of a built-in, a mesh file, or a ZIP.
+
+    Raises:
+        NotFoundError: neither a file nor a built-in object.
+        MeshError: see `load_object`.
+    """
+    name, files, stated = files_from_path(path)
+    return load_object(
+        files,
+        name=name,
+        digest=digest_files(AssetKind.OBJECT, files),
+        face_error_m=face_error_m,
+        options={**stated, **(options or {})},
+    )
+
+
+def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
+    """Name, files and further options of the object at `path`."""
+    path = Path(path)
+    if not path.is_file():
+        if str(path) in builtin_names(AssetKind.OBJECT):
+            return str(path), builtin_files(AssetKind.OBJECT, str(path)), {}
+        known = ", ".join(builtin_names(AssetKind.OBJECT))
+        raise NotFoundError(f"{path} is neither a file nor a built-in object ({known})")
+    if path.suffix.lower() == ".zip":
+        return path.stem, unpack(path.read_bytes(), limit_bytes=8 * Settings().max_upload_bytes), {}
+    files = {path.name: path.read_bytes()}
+    beside = path.parent / "asset.json"
+    if beside.is_file():
+        files["asset.json"] = beside.read_bytes()
+        return path.stem, files, {"file": path.name}
+    return path.stem, files, {}

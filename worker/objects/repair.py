@@ -1,0 +1,279 @@
+"""From the triangles of a file to one closed, outward solid, or an error that says why not and what to do.
+
+Every change is named: what is repaired silently today is a mystery in a dataset tomorrow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from service.errors import MeshError
+from worker.objects import solid, topology
+from worker.objects.formats import Soup
+from worker.objects.mass import signed_volume
+from worker.objects.options import UNITS, ObjectOptions
+from worker.objects.topology import Floats, Indices
+
+MAX_EXTENT_M: Final = 3.0
+MIN_EXTENT_M: Final = 1e-3
+#: Vertices closer than this share of the longest extent are one vertex.
+MERGE: Final = 1e-8
+#: A seam that did not close is welded at this share of the longest extent.
+WELD: Final = 1e-5
+#: Holes with a rim no wider than this share of the longest extent are filled.
+HOLE: Final = 0.03
+#: Components with less than this share of the largest one's volume are dropped as scan debris.
+DEBRIS: Final = 1e-6
+#: A mean wall below this [m] is worth a warning: it can pass between hand points.
+THIN_M: Final = 2.5e-3
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """A mesh in metres with the names of what was changed and of what is odd but right."""
+
+    vertices: Floats
+    faces: Indices
+    watertight: bool = True
+    repairs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    components: int = field(default=1)
+
+    def but(self, vertices: Floats, faces: Indices, repair: str) -> Repaired:
+        return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
+
+
+def repair(soup: Soup, options: ObjectOptions) -> Repaired:
+    """The soup as a solid in metres.
+
+    Raises:
+        MeshError: wrong units, no volume, holes, several components; the message says the mend.
+    """
+    mesh = _to_metres(soup, options)
+    mesh = _clean(mesh)
+    mesh = _close(mesh)
+    if not topology.is_closed(mesh.faces):
+        return _open(mesh, options)
+    mesh = _resolve_components(mesh, options)
+    volume = signed_volume(mesh.vertices, mesh.faces)
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    if volume < 1e-9 * extent**3:
+        raise MeshError("the mesh encloses no volume; give the surface a thickness")
+    wall = 2 * volume / float(_areas(mesh.vertices, mesh.faces).sum())
+    if wall < THIN_M:
+        note = f"thin: walls of {wall * 1e3:.1f} mm on average; use a fine fidelity"
+        mesh = replace(mesh, notes=(*mesh.notes, note))
+    return mesh
+
+
+def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
+    used, inverse = np.unique(soup.faces, return_inverse=True)
+    vertices, faces = soup.vertices[used] * UNITS[options.units], inverse.reshape(-1, 3)
+    extent = float(np.ptp(vertices, axis=0).max())
+    if extent <= 0:
+        raise MeshError("the mesh encloses no volume: all its vertices are one point")
+    if options.scale_to is not None:
+        vertices, extent = vertices * (options.scale_to / extent), options.scale_to
+    if extent > MAX_EXTENT_M:
+        raise MeshError(
+            f"the mesh is {extent:.4g} m long, too large to grasp; if it is in millimetres say so: --units mm "
+            "(or give a size: --scale-to 0.1)"
+        )
+    if extent < MIN_EXTENT_M:
+        raise MeshError(
+            f"the mesh is {extent * 1e3:.3g} mm long, too small to grasp; check its units or give a size: "
+            "--scale-to 0.1"
+        )
+    return Repaired(vertices, faces)
+
+
+def _clean(mesh: Repaired) -> Repaired:
+    """Vertices merged; faces without area and duplicates dropped."""
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    vertices, faces = topology.merge_vertices(mesh.vertices, mesh.faces, MERGE * extent)
+    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    faces = faces[~collapsed]
+    doubled = topology.repeated(faces) if len(faces) else np.zeros(0, dtype=bool)
+    faces = faces[~doubled]
+    slivers = topology.degenerate(vertices, faces) if len(faces) else np.zeros(0, dtype=bool)
+    # A face without area may still be the seam between a long edge and two short ones: it goes only if none opens.
+    if slivers.any() and topology.open_edges(faces[~slivers]) <= topology.open_edges(faces):
+        faces = faces[~slivers]
+    else:
+        slivers[:] = False
+    if not len(faces):
+        raise MeshError("the mesh encloses no volume: its faces have no area or cover each other; give it a thickness")
+    mesh = replace(mesh, vertices=vertices, faces=faces)
+    if dropped := int(collapsed.sum() + doubled.sum() + slivers.sum()):
+        mesh = mesh.but(*topology.compact(vertices, faces), f"dropped {dropped} degenerate or duplicate faces")
+    return mesh
+
+
+def _close(mesh: Repaired) -> Repaired:
+    """Winding made consistent, crowded edges taken apart, seams welded, pinholes filled."""
+    if topology.open_edges(mesh.faces):
+        mesh = _weld(mesh)
+    faces, orientable = topology.unify_winding(mesh.faces)
+    if not orientable:
+        return mesh
+    if turned := int((faces != mesh.faces).any(axis=1).sum()):
+        mesh = mesh.but(mesh.vertices, faces, f"winding of {turned} faces made consistent with their neighbours")
+    crowded = int((topology.edge_faces(mesh.faces)[1] > 2).sum())
+    if crowded:
+        split = topology.split_edges(mesh.vertices, mesh.faces)
+        if not topology.open_edges(split[1]) > topology.open_edges(mesh.faces):
+            mesh = mesh.but(*split, f"took {crowded} non-manifold edges apart")
+    if topology.open_edges(mesh.faces):
+        mesh = _fill_pinholes(mesh)
+    return mesh
+
+
+def _weld(mesh: Repaired) -> Repaired:
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    pairs = cKDTree(mesh.vertices).query_pairs(WELD * extent, output_type="ndarray")
+    if not len(pairs) or len(pairs) > 10 * len(mesh.vertices):
+        return mesh
+    n = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    _, first = np.unique(label, return_index=True)
+    faces = label[mesh.faces].astype(np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    if not len(faces) or topology.open_edges(faces) >= topology.open_edges(mesh.faces):
+        return mesh
+    return mesh.but(*topology.compact(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam")
+
+
+def _fill_pinholes(mesh: Repaired) -> Repaired:
+    """A fan over each small hole; the whole mesh stays open if one is large."""
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    loops = _rims(mesh.faces)
+    if loops is None:
+        return mesh
+    if any(np.ptp(mesh.vertices[loop], axis=0).max() > HOLE * extent for loop in loops):
+        return mesh
+    fans = [[loop[0], loop[i + 1], loop[i]] for loop in loops for i in range(1, len(loop) - 1)]
+    faces = np.concatenate([mesh.faces, np.array(fans, dtype=np.int64)])
+    return mesh.but(mesh.vertices, faces, f"filled {len(loops)} small holes")
+
+
+def _rims(faces: Indices) -> list[list[int]] | None:
+    """Closed loops of open edges in the direction of their faces; None if they cross."""
+    index, counts = topology.edge_faces(faces)
+    rim = topology.directed_edges(faces)[counts[index] == 1]
+    after = {int(a): int(b) for a, b in rim}
+    if len(after) != len(rim):
+        return None
+    loops: list[list[int]] = []
+    while after:
+        start, at = after.popitem()
+        loop = [start]
+        while at != start:
+            if at not in after:
+                return None
+            loop.append(at)
+            at = after.pop(at)
+        loops.append(loop)
+    return loops
+
+
+def _open(mesh: Repaired, options: ObjectOptions) -> Repaired:
+    holes = topology.open_edges(mesh.faces)
+    if options.allow_open:
+        note = f"not watertight: {holes} open edges; the mass is that of the convex hull"
+        return replace(mesh, watertight=False, notes=(*mesh.notes, note))
+    what = f"{holes} open edges" if holes else "faces that no winding makes consistent"
+    raise MeshError(
+        f"the mesh is not watertight ({what}); close it in your modelling tool, or take it as it is: --allow-open"
+    )
+
+
+def _areas(vertices: Floats, faces: Indices) -> Floats:
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def _resolve_components(mesh: Repaired, options: ObjectOptions) -> Repaired:
+    """Debris dropped, every component outward, overlapping ones united; more than one left is the user's choice."""
+    shells = topology.components(mesh.faces)
+    parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
+    volumes = np.array([signed_volume(*part) for part in parts])
+    largest = int(np.argmax(np.abs(volumes)))
+    solid_parts = np.abs(volumes) > DEBRIS * abs(volumes[largest])
+    if abs(volumes[largest]) <= 0:
+        raise MeshError("the mesh encloses no volume; give the surface a thickness")
+    if not solid_parts.all():
+        parts = [part for part, keep in zip(parts, solid_parts, strict=True) if keep]
+        volumes = volumes[solid_parts]
+        largest = int(np.argmax(np.abs(volumes)))
+        dropped = int((~solid_parts).sum())
+        mesh = mesh.but(*_join(parts), f"dropped {dropped} components without volume")
+    sign = np.sign(volumes[largest])
+    outward = [part if v > 0 else (part[0], part[1][:, ::-1]) for part, v in zip(parts, volumes, strict=True)]
+    if len(parts) == 1:
+        if sign < 0:
+            mesh = mesh.but(*outward[0], "winding turned outward")
+        return mesh
+    return _unite(mesh, outward, np.sign(volumes) != sign, turned=bool(sign < 0), options=options)
+
+
+def _unite(
+    mesh: Repaired, parts: list[tuple[Floats, Indices]], against: np.ndarray, *, turned: bool, options: ObjectOptions
+) -> Repaired:
+    """One solid of several shells: those wound against the largest are cavities if they lie inside it."""
+    if turned:
+        mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
+    touching = _touching(parts)
+    boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
+    main = int(np.argmax([signed_volume(*part) for part in parts]))
+    cavity = [
+        bool(flip and (low > boxes[main][0]).all() and (high < boxes[main][1]).all())
+        for flip, (low, high) in zip(against, boxes, strict=True)
+    ]
+    turned_parts = sum(bool(a) and not c for a, c in zip(against, cavity, strict=True))
+    positives = [p for p, hole in zip(parts, cavity, strict=True) if not hole]
+    holes = [p for p, hole in zip(parts, cavity, strict=True) if hole]
+    united = solid.unite(positives, holes)
+    if united is None:
+        raise MeshError("the mesh has components that are no solids; repair it where it was made, or --keep-largest")
+    if turned_parts:
+        mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
+    pieces = united.decompose()
+    groups = len(pieces) if not touching else max(1, len(pieces) - touching)
+    if groups > 1:
+        if not options.keep_largest:
+            raise MeshError(
+                f"the mesh has {groups} separate components; keep the largest with --keep-largest, or upload each alone"
+            )
+        best = max(pieces, key=lambda piece: piece.volume())
+        return mesh.but(*solid.from_manifold(best), f"kept the largest of {groups} components")
+    before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
+    if abs(united.volume() - before) > 1e-6 * before:
+        return mesh.but(*solid.from_manifold(united), f"united {len(parts)} intersecting components")
+    return replace(mesh, vertices=_join_oriented(positives, holes)[0], faces=_join_oriented(positives, holes)[1])
+
+
+def _touching(parts: list[tuple[Floats, Indices]]) -> int:
+    """How many joints of shared vertices hold the parts together (0: none): parts less groups."""
+    vertices, faces = _join(parts)
+    extent = float(np.ptp(vertices, axis=0).max())
+    _, merged = topology.merge_vertices(vertices, faces, MERGE * extent)
+    return len(parts) - int(topology.components(merged).max() + 1)
+
+
+def _join(parts: list[tuple[Floats, Indices]]) -> tuple[Floats, Indices]:
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
+    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
+
+
+def _join_oriented(
+    positives: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]
+) -> tuple[Floats, Indices]:
+    return _join(positives + [(vertices, faces[:, ::-1]) for vertices, faces in holes])

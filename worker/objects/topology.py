@@ -1,0 +1,201 @@
+"""Topology of a triangle mesh: merging, degenerate and duplicate faces, winding, manifold edges, components.
+
+All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[Floats, Indices]:
+    """Vertices that round to the same point of a grid of `tolerance` become one; unused ones go."""
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    cells = np.round((vertices - vertices.min(axis=0)) / tolerance).astype(np.int64)
+    _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    # Keep the file's order: sorted cells would shuffle vertices for no reason.
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[order] = np.arange(len(first))
+    return vertices[first[order]], rank[inverse.reshape(-1)][faces]
+
+
+def compact(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
+    """Without the vertices that no face uses."""
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], inverse.reshape(-1, 3)
+
+
+def degenerate(vertices: Floats, faces: Indices) -> Mask:
+    """(F,) faces that repeat a vertex or are thinner than a millionth of their longest side."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    sides = np.stack([b - a, c - b, a - c])
+    longest = np.linalg.norm(sides, axis=2).max(axis=0)
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-300)
+    repeats = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    return repeats | (height <= 1e-6 * longest)
+
+
+def repeated(faces: Indices) -> Mask:
+    """(F,) faces to drop so that each set of three vertices is used at most once.
+
+    Two coincident faces of opposite winding enclose nothing: both go where the surface stays closed without them.
+    """
+    key = np.sort(faces, axis=1)
+    _, group, size = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    drop = np.zeros(len(faces), dtype=bool)
+    if (size == 1).all():
+        return drop
+    # Sign of the permutation that sorts a face: +1 for one winding, -1 for the other.
+    x, y, z = faces.T
+    parity = np.where((x < y).astype(int) + (y < z) + (z < x) == 2, 1, -1)
+    order = np.argsort(group, kind="stable")
+    single = size[group] == 1
+    edges_left = _edge_counts(faces[single])
+    for members in np.split(order, np.cumsum(size)[:-1]):
+        if len(members) == 1:
+            continue
+        drop[members] = True
+        corners = key[members[0]]
+        others = [edges_left.get((int(corners[i]), int(corners[j])), 0) for i, j in ((0, 1), (1, 2), (0, 2))]
+        balanced = parity[members].sum() == 0
+        if not (balanced and all(n % 2 == 0 for n in others)):
+            majority = 1 if parity[members].sum() >= 0 else -1
+            drop[members[np.argmax(parity[members] == majority)]] = False
+    return drop
+
+
+def _edge_counts(faces: Indices) -> dict[tuple[int, int], int]:
+    edges, counts = np.unique(np.sort(directed_edges(faces), axis=1), axis=0, return_counts=True)
+    return {(int(a), int(b)): int(n) for (a, b), n in zip(edges, counts, strict=True)}
+
+
+def directed_edges(faces: Indices) -> Indices:
+    """(3F, 2) edges in the direction of each face: first all 0-1 edges, then all 1-2, then all 2-0."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def edge_faces(faces: Indices) -> tuple[Indices, Indices]:
+    """(3F,) number of each directed edge's undirected edge, and (E,) how many faces meet there."""
+    _, index, counts = np.unique(
+        np.sort(directed_edges(faces), axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return index.reshape(-1), counts
+
+
+def is_closed(faces: Indices) -> bool:
+    """Whether every edge has exactly two faces that run along it in opposite directions."""
+    edges = directed_edges(faces)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    _, both = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    return bool(len(faces) and (counts == 1).all() and (both == 2).all())
+
+
+def open_edges(faces: Indices) -> int:
+    """Number of edges with an odd number of faces: the rims of holes."""
+    return int((edge_faces(faces)[1] % 2 == 1).sum())
+
+
+def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
+    """Faces on the two sides of each manifold edge: (M,) and (M,), and (M,) whether their windings agree."""
+    index, counts = edge_faces(faces)
+    order = np.argsort(index, kind="stable")
+    starts = np.cumsum(counts) - counts
+    pairs = starts[counts == 2]
+    one, two = order[pairs], order[pairs + 1]
+    edges = directed_edges(faces)
+    agree = edges[one, 0] == edges[two, 1]
+    return one % len(faces), two % len(faces), agree
+
+
+def components(faces: Indices) -> Indices:
+    """(F,) number of the connected component (by shared vertices) of each face."""
+    n = int(faces.max()) + 1
+    rows = np.concatenate([faces[:, 0], faces[:, 1]])
+    columns = np.concatenate([faces[:, 1], faces[:, 2]])
+    _, label = connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
+    _, numbers = np.unique(label[faces[:, 0]], return_inverse=True)
+    return numbers.reshape(-1).astype(np.int64)
+
+
+def unify_winding(faces: Indices) -> tuple[Indices, bool]:
+    """Faces turned so that neighbours agree, and whether that was possible (not on a Moebius strip).
+
+    Each face is two nodes, as it is and turned; an edge joins the nodes that agree. A component of this graph is one
+    consistent choice, and a face that meets its own turned copy shows a surface without sides.
+    """
+    count = len(faces)
+    one, two, agree = pair_faces(faces)
+    cross = np.where(agree, 0, count)
+    rows = np.concatenate([one, one + count])
+    columns = np.concatenate([two + cross, two + count - cross])
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count))
+    _, label = connected_components(graph, directed=False)
+    orientable = bool((label[:count] != label[count:]).all())
+    # Of a patch's two choices take the one that turns fewer faces: the majority of the file is usually right.
+    low = np.minimum(label[:count], label[count:])
+    as_is = label[:count] == low
+    share = np.bincount(low, as_is, minlength=2 * count) * 2 >= np.bincount(low, minlength=2 * count)
+    turn = as_is != share[low]
+    return np.where(turn[:, None], faces[:, ::-1], faces), orientable
+
+
+def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
+    """Edges with more than two faces taken apart: vertices there are doubled, one for each fan of faces.
+
+    Faces at a crowded edge are paired as neighbours around the edge that enclose material between them.
+    """
+    index, counts = edge_faces(faces)
+    count = len(faces)
+    order = np.argsort(index, kind="stable")
+    starts = np.cumsum(counts) - counts
+    edges = directed_edges(faces)
+    simple = starts[counts == 2]
+    one, two = [order[simple]], [order[simple + 1]]
+    for edge in np.flatnonzero(counts > 2):
+        half = order[starts[edge] : starts[edge] + counts[edge]]
+        pairs = np.array(_pairs_around(vertices, faces, edges, half), dtype=np.int64).reshape(-1, 2)
+        one.append(pairs[:, 0])
+        two.append(pairs[:, 1])
+    a, b = np.concatenate(one), np.concatenate(two)
+    # Half-edge k F + f runs from corner k of face f to corner k + 1; its partner runs the other way.
+    start, end = _corner(a, count), _corner(b, count)
+    after, before = _corner(a, count, 1), _corner(b, count, 1)
+    rows, columns = np.concatenate([start, after]), np.concatenate([before, end])
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * count, 3 * count))
+    _, label = connected_components(graph, directed=False)
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    return vertices[faces.reshape(-1)[first]], inverse.reshape(-1, 3).astype(np.int64)
+
+
+def _corner(half: Indices, count: int, step: int = 0) -> Indices:
+    """Number 3 f + k of the corner at which a half-edge starts, or ends with step 1."""
+    return 3 * (half % count) + (half // count + step) % 3
+
+
+def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
+    """Pairs of half-edges at one edge: sorted by angle, each face joined to the next one behind its back."""
+    a, b = np.sort(edges[half[0]])
+    axis = vertices[b] - vertices[a]
+    axis /= max(float(np.linalg.norm(axis)), 1e-300)
+    count = len(faces)
+    apex = np.array([vertices[next(v for v in faces[h % count] if v not in (a, b))] for h in half]) - vertices[a]
+    flat = apex - (apex @ axis)[:, None] * axis
+    x = flat[0] / max(float(np.linalg.norm(flat[0])), 1e-300)
+    angle = np.arctan2(flat @ np.cross(axis, x), flat @ x)
+    order = np.argsort(angle, kind="stable")
+    forward = edges[half[order], 0] == a
+    # A face that runs a -> b has its material on the side of smaller angle: it closes with the face before it.
+    closing = [k for k in range(len(order)) if forward[k] and not forward[k - 1]]
+    if 2 * len(closing) != len(order):
+        return []
+    return [(int(half[order[k]]), int(half[order[k - 1]])) for k in closing]
