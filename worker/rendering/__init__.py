@@ -1,0 +1,7 @@
+"""What a camera sees of a scene, and pictures of grasps for people."""
+
+from __future__ import annotations
+
+from worker.rendering.views import render
+
+__all__ = ["render"]

@@ -1,0 +1,123 @@
+"""Pinhole cameras: where they stand, what they map to which pixel.
+
+Camera frame: x right, y down, z forward (OpenCV). Extrinsics E = [R | t] map table to camera: x_camera = R x + t.
+Pixel (column i, row j) covers [i, i + 1) x [j, j + 1): its centre is (i + 0.5, j + 0.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+FIELD_OF_VIEW: Final = np.radians(40.0)
+BASELINE_M: Final = 0.06
+#: Elevation of a sampled camera above the table [rad].
+ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
+#: Share of the smaller field of view that the object's bounding ball fills.
+FILL: Final = (0.7, 1.0)
+#: Nearer than this a stereo pair no longer has the whole object in both pictures [m].
+NEAREST_M: Final = 0.25
+#: How far the optical axis passes from the object's middle, in bounding radii.
+AIM_JITTER: Final = 0.15
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V cameras that share one picture size and one K."""
+
+    width: int
+    height: int
+    intrinsics: Floats
+    """(3, 3) [px]"""
+    extrinsics: Floats
+    """(V, 4, 4) table to camera."""
+
+    def __len__(self) -> int:
+        return len(self.extrinsics)
+
+    @property
+    def centre(self) -> Floats:
+        """(V, 3) optical centres in the table frame [m]."""
+        rotation, translation = self.extrinsics[:, :3, :3], self.extrinsics[:, :3, 3]
+        return -np.einsum("vji,vj->vi", rotation, translation)
+
+    def project(self, points: Floats) -> tuple[Floats, Floats]:
+        """Pixel coordinates (V, P, 2) and depths (V, P) of table-frame points (P, 3) or (V, P, 3)."""
+        points = np.broadcast_to(points, (len(self), *np.shape(points)[-2:]))
+        camera = np.einsum("vij,vpj->vpi", self.extrinsics[:, :3, :3], points) + self.extrinsics[:, None, :3, 3]
+        image = camera @ self.intrinsics.T
+        return image[..., :2] / image[..., 2:], camera[..., 2]
+
+    def unproject(self, depth: Floats) -> Floats:
+        """Table-frame points (V, H, W, 3) of forward depths (V, H, W) at pixel centres."""
+        camera = pixel_rays(self.intrinsics, self.width, self.height) * np.asarray(depth, float)[..., None]
+        offset = camera - self.extrinsics[:, None, None, :3, 3]
+        return np.einsum("vji,vhwj->vhwi", self.extrinsics[:, :3, :3], offset)
+
+
+def intrinsics(width: int, height: int, field_of_view: float = FIELD_OF_VIEW) -> Floats:
+    """K (3, 3) with square pixels and a centred principal point; `field_of_view` [rad] spans the picture's height."""
+    focal = 0.5 * height / np.tan(0.5 * field_of_view)
+    return np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+
+
+def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
+    """Directions (H, W, 3) with z = 1 in the camera frame through points `shift` [px] off the pixel centres."""
+    columns = (np.arange(width) + 0.5 + shift[0] - k[0, 2]) / k[0, 0]
+    rows = (np.arange(height) + 0.5 + shift[1] - k[1, 2]) / k[1, 1]
+    x, y = np.meshgrid(columns, rows)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def look_at(eye: Floats, target: Floats) -> Floats:
+    """Extrinsics (4, 4) of a camera at `eye` that looks at `target` with the table's z axis up in the picture."""
+    forward = np.asarray(target, float) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-9:
+        right = np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    return matrix
+
+
+def distance_to_fill(radius: float, field_of_view: float, fill: float) -> float:
+    """Distance at which a ball of this radius fills the share `fill` of the field of view [m]."""
+    return radius / float(np.sin(0.5 * fill * field_of_view))
+
+
+def sample_hemisphere(
+    centre: Floats, radius: float, *, views: int, aspect: float, rng: np.random.Generator
+) -> list[Floats]:
+    """Extrinsics of cameras on a hemisphere around a ball (centre [m], radius [m]).
+
+    Azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in area within `ELEVATION`.
+    """
+    narrow = 2 * np.arctan(np.tan(0.5 * FIELD_OF_VIEW) * min(1.0, aspect))
+    turn = rng.uniform(0, 2 * np.pi)
+    extrinsics = []
+    for view in range(views):
+        azimuth = turn + 2 * np.pi * (view + rng.uniform(0.1, 0.9)) / views
+        elevation = np.arcsin(rng.uniform(np.sin(ELEVATION[0]), np.sin(ELEVATION[1])))
+        distance = max(NEAREST_M + radius, distance_to_fill(radius, narrow, rng.uniform(*FILL)))
+        direction = np.array(
+            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+        )
+        aim = centre + radius * AIM_JITTER * rng.uniform(-1, 1, 3)
+        extrinsics.append(look_at(centre + distance * direction, aim))
+    return extrinsics
+
+
+def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
+    """Left and right eye of a rectified pair around a camera: the right one stands `baseline` [m] along camera +x."""
+    left, right = extrinsics.copy(), extrinsics.copy()
+    left[0, 3] += 0.5 * baseline
+    right[0, 3] -= 0.5 * baseline
+    return left, right
