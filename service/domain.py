@@ -60,7 +60,7 @@ class Fidelity(Model):
     name: str = "custom"
     coarse_points: int = Field(400, ge=16, le=8192, description="hand surface points in the first phase")
     fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
-    object_points: int = Field(2000, ge=16, le=65536, description="object surface points tested against the links")
+    object_points: int = Field(4000, ge=16, le=65536, description="object surface points tested against the links")
     face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
     coarse_iterations: int = Field(100, ge=0, le=100_000)
     fine_iterations: int = Field(40, ge=0, le=100_000)
@@ -74,12 +74,12 @@ class Fidelity(Model):
 
 FIDELITIES: Final[dict[str, Fidelity]] = {
     "draft": Fidelity(
-        name="draft", coarse_points=256, fine_points=800, object_points=1000, face_error_m=1e-3,
+        name="draft", coarse_points=256, fine_points=800, object_points=2000, face_error_m=1e-3,
         coarse_iterations=60, fine_iterations=20, polish_iterations=6,
     ),
     "standard": Fidelity(name="standard"),
     "fine": Fidelity(
-        name="fine", coarse_points=600, fine_points=4000, object_points=4000, face_error_m=1e-4,
+        name="fine", coarse_points=600, fine_points=4000, object_points=8000, face_error_m=1e-4,
         coarse_iterations=120, fine_iterations=60, polish_iterations=15,
     ),
 }  # fmt: skip

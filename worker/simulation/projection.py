@@ -23,22 +23,22 @@ CAPACITY: Final = 1024
 class ProjectionOptions:
     """Clearances in metres."""
 
-    near: float = 1.5e-4
+    near: float = 3e-4
     """Hand points nearer to the object than this are moved ..."""
-    target: float = 3e-4
+    target: float = 5e-4
     """... to this distance."""
     hold: float = 2e-3
     """Points nearer than this are contacts, drawn to `hold_target` with weight `hold_weight`."""
     hold_target: float = 5e-4
-    hold_weight: float = 0.02
-    sample_near: float = 0.0
+    hold_weight: float = 0.01
+    sample_near: float = 4e-4
     """Object samples nearer to a link than this are moved to `target`."""
     self_near: float = 2e-4
     self_target: float = 5e-4
     damping: float = 1e-3
     """Times the number of residuals."""
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
-    """One over the natural size of a step of translation [m], rotation and joints [rad], up to a common factor."""
+    """Translation [m], rotation and joints [rad] that move a hand's surface alike: levers of 8 and 4 cm."""
     step: float = 3e-3
     """Largest step in units of the scaled variables [m]."""
 
@@ -105,7 +105,7 @@ class Projection:
         H = lower + np.tril(lower, -1).transpose(0, 2, 1)
         g = self.vector.numpy()[:n].astype(float)
         rows = np.minimum(self.residuals.count.numpy()[:n], CAPACITY)
-        scale = 1.0 / np.repeat(o.scale, [3, 3, sim.dofs])
+        scale = np.repeat(o.scale, [3, 3, sim.dofs])
         H = H * scale[:, None] * scale[None, :]
         damping = o.damping * np.maximum(rows, 1)
         H[:, np.arange(len(scale)), np.arange(len(scale))] += damping[:, None]
@@ -131,9 +131,8 @@ class Projection:
             device=sim.device,
         )  # fmt: skip
         wp.launch(
-            kernels.self_residuals, (B, len(sim.self_body)),
-            [sim.active, o.self_near, o.self_target, sim.hand.pieces, sim.self_body, sim.self_position, sim.body_p,
-             sim.body_q, r],
+            kernels.self_residuals, (B, len(sim.hand.model.pieces)),
+            [sim.active, o.self_near, o.self_target, sim.hand.pieces, sim.body_points, sim.body_p, sim.body_q, r],
             device=sim.device,
         )  # fmt: skip
         wp.launch(

@@ -88,6 +88,25 @@ def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
     return np.array(rows)
 
 
+def _body_points(points: SurfacePoints, bodies: int) -> Any:
+    """The points sorted by body, with bounding spheres."""
+    order = np.argsort(points.body, kind="stable")
+    body, position = points.body[order], points.position[order]
+    first = np.searchsorted(body, np.arange(bodies + 1))
+    centre, radius = np.zeros((bodies, 3)), np.zeros(bodies)
+    for k in range(bodies):
+        own = position[first[k] : first[k + 1]]
+        if len(own):
+            centre[k] = (own.min(axis=0) + own.max(axis=0)) / 2
+            radius[k] = np.linalg.norm(own - centre[k], axis=1).max()
+    out = pieces.BodyPoints()
+    out.first = wp.array(first, dtype=wp.int32)
+    out.position = wp.array(position, dtype=wp.vec3)
+    out.centre = wp.array(centre, dtype=wp.vec3)
+    out.radius = wp.array(radius, dtype=wp.float32)
+    return out
+
+
 class Simulation:
     """Arrays and launches for up to `capacity` grasps with one set of hand points."""
 
@@ -110,8 +129,7 @@ class Simulation:
         self.point_body = wp.array(points.body, dtype=wp.int32)
         self.point_position = wp.array(points.position, dtype=wp.vec3)
         self.point_weight = wp.array(weight, dtype=wp.float32)
-        self.self_body = wp.array(self_points.body, dtype=wp.int32)
-        self.self_position = wp.array(self_points.position, dtype=wp.vec3)
+        self.body_points = _body_points(self_points, self.bodies)
 
     def _allocate(self) -> None:
         B, N, L, D = self.capacity, self.count, self.bodies, self.dofs
@@ -249,9 +267,9 @@ class Simulation:
              self.object_depth],
         )  # fmt: skip
         self._launch(
-            pieces.pieces_in_pieces, (B, len(self.self_body)),
-            [self.hand.pieces, o.self_margin, self.active, self.iteration, self.self_weight, self.self_body,
-             self.self_position, self.body_p, self.body_q, self.force, self.torque, self.self_depth],
+            pieces.pieces_in_pieces, (B, len(self.hand.model.pieces)),
+            [self.hand.pieces, self.body_points, o.self_margin, self.active, self.iteration, self.self_weight,
+             self.body_p, self.body_q, self.force, self.torque, self.self_depth],
         )  # fmt: skip
         self._launch(
             penalties.points_to_bodies, (B, self.count),

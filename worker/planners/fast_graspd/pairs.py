@@ -19,7 +19,7 @@ from worker.simulation.simulation import LossOptions, Simulation
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005
 #: Hand points tested against other links.
-SELF_POINTS: Final = 256
+SELF_POINTS: Final = 1000
 #: Pairs kept on the device.
 KEPT: Final = 4
 

@@ -149,15 +149,39 @@ def object_in_pieces(
         wp.atomic_max(depth_inout, b, deepest)
 
 
+@wp.struct
+class BodyPoints:
+    """Dense surface points sorted by body, with a bounding sphere for each body's set."""
+
+    first: wp.array(dtype=wp.int32)  # (L + 1,)
+    position: wp.array(dtype=wp.vec3)  # body frame
+    centre: wp.array(dtype=wp.vec3)  # (L,)
+    radius: wp.array(dtype=wp.float32)  # (L,)
+
+
+@wp.func
+def may_touch(
+    pieces: Pieces, points: BodyPoints, piece: wp.int32, own: wp.int32, b: wp.int32, margin: wp.float32,
+    body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
+):  # fmt: skip
+    """Whether the points of body `own` count against a piece and their bounding spheres meet."""
+    other = pieces.body[piece]
+    if pieces.apart[own, other] == 0 or points.first[own] == points.first[own + 1]:
+        return False
+    centre = body_p[b, other] + wp.quat_rotate(body_q[b, other], pieces.pose_p[piece])
+    offset = body_p[b, own] + wp.quat_rotate(body_q[b, own], points.centre[own]) - centre
+    reach = wp.length(pieces.half[piece]) + points.radius[own] + margin
+    return wp.dot(offset, offset) < reach * reach
+
+
 @wp.kernel
 def pieces_in_pieces(
     pieces_in: Pieces,
+    points_in: BodyPoints,
     margin_in: wp.float32,
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
-    point_body_in: wp.array(dtype=wp.int32),
-    point_in: wp.array(dtype=wp.vec3),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
     force_inout: wp.array2d(dtype=wp.vec3),
@@ -166,31 +190,29 @@ def pieces_in_pieces(
 ):
     """Gradient of w sum (depth + margin)^2 over hand points inside pieces of bodies they must stay clear of.
 
-    Launch over (B, points).
+    Launch over (B, P).
     """
-    b, i = wp.tid()
+    b, piece = wp.tid()
     if active_in[b] == 0:
         return
-    own = point_body_in[i]
-    x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], point_in[i])
+    other = pieces_in.body[piece]
+    q = body_q_in[b, other] * pieces_in.pose_q[piece]
+    p = body_p_in[b, other] + wp.quat_rotate(body_q_in[b, other], pieces_in.pose_p[piece])
     weight = 2.0 * weight_in[iteration_in[0]]
-    for piece in range(pieces_in.body.shape[0]):
-        other = pieces_in.body[piece]
-        if pieces_in.apart[own, other] == 1:
-            bq = body_q_in[b, other]
-            centre = body_p_in[b, other] + wp.quat_rotate(bq, pieces_in.pose_p[piece])
-            half = pieces_in.half[piece]
-            offset = x - centre
-            reach = wp.length(half) + margin_in
-            if wp.dot(offset, offset) < reach * reach:
-                q = bq * pieces_in.pose_q[piece]
-                nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, offset))
-                depth = margin_in - nd[3]
-                if depth > 0.0:
-                    f = (weight * depth) * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                    t = wp.cross(x, f)
-                    wp.atomic_add(force_inout, b, other, f)
-                    wp.atomic_add(torque_inout, b, other, t)
-                    wp.atomic_add(force_inout, b, own, -f)
-                    wp.atomic_add(torque_inout, b, own, -t)
-                    wp.atomic_max(depth_inout, b, -nd[3])
+    half = pieces_in.half[piece] + wp.vec3(margin_in, margin_in, margin_in)
+    for own in range(body_p_in.shape[1]):
+        if may_touch(pieces_in, points_in, piece, own, b, margin_in, body_p_in, body_q_in):
+            for i in range(points_in.first[own], points_in.first[own + 1]):
+                x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
+                local = wp.quat_rotate_inv(q, x - p)
+                if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+                    nd = piece_distance(pieces_in, piece, local)
+                    depth = margin_in - nd[3]
+                    if depth > 0.0:
+                        f = (weight * depth) * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                        t = wp.cross(x, f)
+                        wp.atomic_add(force_inout, b, other, f)
+                        wp.atomic_add(torque_inout, b, other, t)
+                        wp.atomic_add(force_inout, b, own, -f)
+                        wp.atomic_add(torque_inout, b, own, -t)
+                        wp.atomic_max(depth_inout, b, -nd[3])

@@ -8,7 +8,7 @@ sample to a link, or of a point of one link to another link.
 import warp as wp
 
 from worker.simulation.kernels.kinematics import Tree
-from worker.simulation.kernels.pieces import Pieces, piece_distance
+from worker.simulation.kernels.pieces import BodyPoints, Pieces, may_touch, piece_distance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -116,30 +116,29 @@ def self_residuals(
     near_in: wp.float32,
     target_in: wp.float32,
     pieces_in: Pieces,
-    point_body_in: wp.array(dtype=wp.int32),
-    point_in: wp.array(dtype=wp.vec3),
+    points_in: BodyPoints,
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
     residuals_out: Residuals,
 ):
-    """Points of one link nearer than `near` to another link go to `target`. Launch over (B, points)."""
-    b, i = wp.tid()
+    """Points of one link nearer than `near` to another link go to `target`. Launch over (B, P)."""
+    b, piece = wp.tid()
     if active_in[b] == 0:
         return
-    own = point_body_in[i]
-    x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], point_in[i])
-    for piece in range(pieces_in.body.shape[0]):
-        other = pieces_in.body[piece]
-        if pieces_in.apart[own, other] == 1:
-            bq = body_q_in[b, other]
-            offset = x - body_p_in[b, other] - wp.quat_rotate(bq, pieces_in.pose_p[piece])
-            reach = wp.length(pieces_in.half[piece]) + near_in
-            if wp.dot(offset, offset) < reach * reach:
-                q = bq * pieces_in.pose_q[piece]
-                nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, offset))
-                if nd[3] < near_in:
-                    n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                    emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
+    other = pieces_in.body[piece]
+    q = body_q_in[b, other] * pieces_in.pose_q[piece]
+    p = body_p_in[b, other] + wp.quat_rotate(body_q_in[b, other], pieces_in.pose_p[piece])
+    half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
+    for own in range(body_p_in.shape[1]):
+        if may_touch(pieces_in, points_in, piece, own, b, near_in, body_p_in, body_q_in):
+            for i in range(points_in.first[own], points_in.first[own + 1]):
+                x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
+                local = wp.quat_rotate_inv(q, x - p)
+                if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+                    nd = piece_distance(pieces_in, piece, local)
+                    if nd[3] < near_in:
+                        n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                        emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
 
 
 @wp.func

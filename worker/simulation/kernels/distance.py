@@ -1,0 +1,112 @@
+"""Distances as metrics need them: exact in sign and value, no smoothing, no gradient.
+
+`worker.simulation.kernels.surface` answers the optimiser's question (smoothed, cheap); this module answers the
+referee's: how far is a point from the mesh itself, and how deep is it in the hand's convex pieces.
+"""
+
+import warp as wp
+
+from worker.simulation.kernels.pieces import Pieces, piece_distance
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def mesh_distance(
+    mesh_in: wp.uint64,
+    winding_in: wp.int32,
+    corner_normal_in: wp.array(dtype=wp.vec3),
+    low_in: wp.vec3,
+    high_in: wp.vec3,
+    reach_in: wp.float32,
+    point_in: wp.array(dtype=wp.vec3),
+    distance_out: wp.array(dtype=wp.float32),
+    closest_out: wp.array(dtype=wp.vec3),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    """Signed distance, closest point and outward normal there (corner normals interpolated). Launch over points.
+
+    Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
+    The sign is ray parity, or the winding number where `winding` is 1 (open meshes): both are right near creases.
+    """
+    i = wp.tid()
+    p = point_in[i]
+    distance_out[i] = reach_in
+    closest_out[i] = p
+    normal_out[i] = wp.vec3(0.0)
+    # The box encloses the object, so inside it the diagonal bounds the distance: no deep point is ever missed.
+    inside = (
+        p[0] > low_in[0]
+        and p[1] > low_in[1]
+        and p[2] > low_in[2]
+        and p[0] < high_in[0]
+        and p[1] < high_in[1]
+        and p[2] < high_in[2]
+    )
+    if inside:
+        if winding_in == 1:
+            query = wp.mesh_query_point_sign_winding_number(mesh_in, p, wp.length(high_in - low_in))
+        else:
+            query = wp.mesh_query_point(mesh_in, p, wp.length(high_in - low_in))
+    else:
+        query = wp.mesh_query_point_no_sign(mesh_in, p, reach_in)
+    if query.result:
+        closest = wp.mesh_eval_position(mesh_in, query.face, query.u, query.v)
+        sign = float(1.0)
+        if inside:
+            sign = query.sign
+        gap = wp.length(p - closest)
+        u = query.u
+        v = query.v
+        face = query.face
+        distance_out[i] = sign * gap
+        closest_out[i] = closest
+        normal_out[i] = wp.normalize(
+            u * corner_normal_in[3 * face]
+            + v * corner_normal_in[3 * face + 1]
+            + (1.0 - u - v) * corner_normal_in[3 * face + 2]
+        )
+
+
+@wp.kernel
+def pieces_distance(
+    pieces_in: Pieces,
+    piece_p_in: wp.array2d(dtype=wp.vec3),
+    piece_q_in: wp.array2d(dtype=wp.quat),
+    reach_in: wp.float32,
+    point_in: wp.array(dtype=wp.vec3),
+    distance_inout: wp.array2d(dtype=wp.float32),
+):
+    """Least distance of S points to each of P pieces for B grasps; what is farther than `reach` is left out.
+
+    Launch over (B, S); `distance_inout` (B, P) holds `reach` before.
+    """
+    b, s = wp.tid()
+    for piece in range(pieces_in.body.shape[0]):
+        offset = point_in[s] - piece_p_in[b, piece]
+        bound = wp.length(pieces_in.half[piece]) + reach_in
+        if wp.dot(offset, offset) < bound * bound:
+            nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(piece_q_in[b, piece], offset))
+            wp.atomic_min(distance_inout, b, piece, nd[3])
+
+
+@wp.kernel
+def self_distance(
+    pieces_in: Pieces,
+    piece_p_in: wp.array2d(dtype=wp.vec3),
+    piece_q_in: wp.array2d(dtype=wp.quat),
+    body_in: wp.array(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    depth_inout: wp.array(dtype=wp.float32),
+):
+    """Greatest depth of the hand's own points in pieces of bodies whose contact counts. Launch over (B, N)."""
+    b, i = wp.tid()
+    x = point_in[b, i]
+    for piece in range(pieces_in.body.shape[0]):
+        if pieces_in.apart[body_in[i], pieces_in.body[piece]] == 1:
+            offset = x - piece_p_in[b, piece]
+            bound = wp.length(pieces_in.half[piece])
+            if wp.dot(offset, offset) < bound * bound:
+                nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(piece_q_in[b, piece], offset))
+                if nd[3] < 0.0:
+                    wp.atomic_max(depth_inout, b, -nd[3])
