@@ -8,26 +8,60 @@ from scipy.spatial import cKDTree
 
 from worker.objects.topology import Floats, Indices
 
-#: Candidate triangles per point: those of the nearest surface samples.
+#: Pieces into which a mesh is cut at least, so that a piece is small against the mesh.
+_PIECES = 10_000
+#: Pieces looked at first; twice as many again where that does not prove the answer.
 _CANDIDATES = 12
 
 
 class MeshDistance:
-    """Distances to one mesh. Answers are exact up to the choice of candidates, and never too small."""
+    """Exact distances to one mesh.
 
-    def __init__(self, vertices: Floats, faces: Indices, samples: int = 20_000) -> None:
+    Its triangles are cut into pieces no longer than a fixed length. A point's distance to the best triangle of its
+    nearest pieces is proven when the next piece's centre is farther than that distance plus a piece's radius.
+    """
+
+    def __init__(self, vertices: Floats, faces: Indices) -> None:
         self._corners = vertices[faces]
-        points, face = sample_faces(vertices, faces, samples)
-        centres = self._corners.mean(axis=1)
-        self._face = np.concatenate([np.arange(len(faces)), face])
-        self._tree = cKDTree(np.concatenate([centres, points]))
+        a, b, c = np.moveaxis(self._corners, 1, 0)
+        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+        pieces, self._face = cut(self._corners, 2 * np.sqrt(area / _PIECES))
+        centres = pieces.mean(axis=1)
+        self._radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
+        self._tree = cKDTree(centres)
 
     def __call__(self, points: Floats) -> Floats:
         """(N,) distance of points (N, 3) to the surface [m]."""
-        k = min(_CANDIDATES, len(self._face))
-        _, nearest = self._tree.query(points, k=k)
-        triangles = self._corners[self._face[nearest.reshape(len(points), k)]]
-        return point_triangle_distance(points[:, None], triangles).min(axis=1)
+        found = np.full(len(points), np.inf)
+        todo, k = np.arange(len(points)), min(_CANDIDATES, len(self._face))
+        while len(todo):
+            reach, nearest = (np.asarray(part) for part in self._tree.query(points[todo], k=np.arange(1, k + 1)))
+            triangles = self._corners[self._face[nearest]]
+            found[todo] = point_triangle_distance(points[todo][:, None], triangles).min(axis=1)
+            open_ = reach[:, -1] < found[todo] + self._radius
+            if k == len(self._face):
+                break
+            todo, k = todo[open_], min(4 * k, len(self._face))
+        return found
+
+
+def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
+    """Triangles (F, 3, 3) halved across their longest side until none is longer than `length`; and whose each is."""
+    done: list[Floats] = []
+    owners: list[NDArray[np.int64]] = []
+    face = np.arange(len(corners), dtype=np.int64)
+    while len(corners):
+        sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        longest = sides.argmax(axis=1)
+        small = sides.max(axis=1) <= length
+        done.append(corners[small])
+        owners.append(face[small])
+        turned = np.take_along_axis(corners, ((longest[:, None] + np.arange(3)) % 3)[:, :, None], axis=1)[~small]
+        a, b, c = np.moveaxis(turned, 1, 0)
+        middle = (a + b) / 2
+        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        face = np.tile(face[~small], 2)
+    return np.concatenate(done), np.concatenate(owners)
 
 
 def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples: int = 8000) -> float:

@@ -9,7 +9,7 @@ import fast_simplification
 import numpy as np
 
 from worker.objects import solid, topology
-from worker.objects.distance import deviation
+from worker.objects.distance import MeshDistance, sample_faces
 from worker.objects.mass import signed_volume
 from worker.objects.topology import Floats, Indices
 
@@ -19,83 +19,115 @@ Mesh = tuple[Floats, Indices]
 FEW_FACES: Final = 64
 #: The search stops when two targets differ by less than this factor.
 STEP: Final = 1.12
+#: Surface samples, besides the vertices, at which two surfaces are compared.
+SAMPLES: Final = 6000
+#: Aggressiveness of the collapse: the slowest that still reaches its target; it errs least and breaks least.
+PATIENCE: Final = 3
 
 
 def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool = True) -> tuple[Floats, Indices, float]:
     """The coarsest mesh found whose surface lies within `error_m` of the given one, both ways.
 
     Quadric edge collapse (Garland & Heckbert 1997) to a bisected number of faces; each trial is measured and, for
-    closed meshes, must be an oriented 2-manifold of the same genus and components. Where no trial passes, the mesh is
-    thinned by manifold3d's edge collapse, and where that gains nothing it stays as it is.
+    closed meshes, must be an oriented 2-manifold with as many shells as the original. Where no trial passes, the mesh
+    is thinned by manifold3d's edge collapse, and where that gains nothing it stays as it is.
 
     Returns:
         vertices, faces and the measured deviation [m].
     """
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
+    original = Original(vertices, faces, closed)
     best: tuple[Floats, Indices, float] | None = None
-    low, high = float(min(FEW_FACES, len(faces))), float(len(faces))
+    low, high = float(FEW_FACES), float(len(faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
-        trial = _trial(vertices, faces, target, error_m, closed)
+        trial = _trial(original, target, error_m)
         if trial is None:
             low = target
         else:
             high, best = target, trial
     if best is None and closed:
-        best = _thinned(vertices, faces, error_m)
+        best = _thinned(original, error_m)
     return best if best is not None else (vertices, faces, 0.0)
 
 
-def _trial(
-    vertices: Floats, faces: Indices, target: int, error_m: float, closed: bool
-) -> tuple[Floats, Indices, float] | None:
-    """A mesh of about `target` faces if it keeps the topology and the bound. A broken one gets a second chance."""
-    for count in (target, int(target * 1.03) + 2):
-        mesh = _collapse(vertices, faces, count)
-        if mesh is None or (closed and not same_topology(mesh, (vertices, faces))):
+class Original:
+    """The mesh that trials are held against; what is asked of it many times is computed once."""
+
+    def __init__(self, vertices: Floats, faces: Indices, closed: bool) -> None:
+        self.vertices, self.faces, self.closed = vertices, faces, closed
+        self.shells = int(topology.components(faces).max())
+        self._distance = MeshDistance(vertices, faces)
+        self._points = np.concatenate([vertices, sample_faces(vertices, faces, SAMPLES)[0]])
+
+    def accepts(self, mesh: Mesh) -> bool:
+        """Whether a mesh is closed, outward and in as many shells as the original, if that is closed."""
+        if not self.closed:
+            return True
+        return (
+            topology.is_closed(mesh[1])
+            and signed_volume(*mesh) > 0
+            and int(topology.components(mesh[1]).max()) == self.shells
+            and solid.to_manifold(*mesh) is not None
+        )
+
+    def deviation(self, mesh: Mesh, limit: float) -> float | None:
+        """Largest distance between the surfaces, both ways [m]; None as soon as it is known to exceed the limit."""
+        back = MeshDistance(*mesh)
+        own = np.concatenate([mesh[0], sample_faces(*mesh, SAMPLES)[0]])
+        furthest = 0.0
+        # A few points tell of most meshes that are too coarse; all of them are only asked when it may be accepted.
+        for step in (16, 1):
+            for distance, points in ((back, self._points), (self._distance, own)):
+                furthest = max(furthest, float(distance(points[::step]).max()))
+                if furthest > limit:
+                    return None
+        return furthest
+
+
+def _trial(original: Original, target: int, error_m: float) -> tuple[Floats, Indices, float] | None:
+    """A mesh of about `target` faces if it is sound and within the bound.
+
+    A collapse that broke the surface at one count often does not at the next, so a few are tried.
+    """
+    for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
+        mesh = _collapse(original.vertices, original.faces, count)
+        if mesh is None or not original.accepts(mesh):
             continue
-        error = deviation(mesh, (vertices, faces))
-        return (*mesh, error) if error <= error_m else None
+        error = original.deviation(mesh, error_m)
+        return None if error is None else (*mesh, error)
     return None
 
 
 def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
+    if target >= len(faces):
+        return None
     # Single precision inside: centred and scaled, so that it costs the least.
     middle, scale = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
     points, triangles = fast_simplification.simplify(
-        ((vertices - middle) / scale).astype(np.float32), faces.astype(np.int32), target_count=target
-    )
+        ((vertices - middle) / scale).astype(np.float32), faces.astype(np.int32), target_count=target, agg=PATIENCE
+    )[:2]
     triangles = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
+    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    triangles = triangles[~topology.repeated(triangles)] if len(triangles) else triangles
     if len(triangles) < 4:
         return None
-    points, triangles = topology.compact(np.asarray(points, dtype=float) * scale + middle, triangles)
-    keep = ~((triangles == np.roll(triangles, 1, axis=1)).any(axis=1) | topology.repeated(triangles))
-    return topology.compact(points, triangles[keep]) if keep.sum() >= 4 else None
+    mesh = topology.compact(np.asarray(points, dtype=float) * scale + middle, triangles)
+    if (topology.edge_faces(mesh[1])[1] > 2).any():
+        # A tunnel that collapsed to an edge: taking the edge apart closes the tunnel.
+        mesh = topology.split_edges(*mesh)
+    return mesh
 
 
-def same_topology(mesh: Mesh, original: Mesh) -> bool:
-    """Whether a mesh is closed and outward with the original's Euler characteristic and number of shells."""
-    if not topology.is_closed(mesh[1]) or signed_volume(*mesh) <= 0:
-        return False
-    if _euler(mesh) != _euler(original) or topology.components(mesh[1]).max() != topology.components(original[1]).max():
-        return False
-    return solid.to_manifold(*mesh) is not None
-
-
-def _euler(mesh: Mesh) -> int:
-    """V - E + F, with E = 3/2 F on closed meshes."""
-    return len(np.unique(mesh[1])) - len(mesh[1]) // 2
-
-
-def _thinned(vertices: Floats, faces: Indices, error_m: float) -> tuple[Floats, Indices, float] | None:
-    original = solid.to_manifold(vertices, faces)
-    if original is None:
+def _thinned(original: Original, error_m: float) -> tuple[Floats, Indices, float] | None:
+    whole = solid.to_manifold(original.vertices, original.faces)
+    if whole is None:
         return None
     for share in (0.9, 0.5, 0.2):
-        mesh = solid.from_manifold(original.simplify(share * error_m))
-        if len(mesh[1]) < len(faces) and same_topology(mesh, (vertices, faces)):
-            error = deviation(mesh, (vertices, faces))
-            if error <= error_m:
+        mesh = solid.from_manifold(whole.simplify(share * error_m))
+        if len(mesh[1]) < len(original.faces) and original.accepts(mesh):
+            error = original.deviation(mesh, error_m)
+            if error is not None:
                 return (*mesh, error)
     return None
