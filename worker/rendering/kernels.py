@@ -82,7 +82,7 @@ def backdrop(light: Light, direction: wp.vec3f):
 def surroundings(light: Light, direction: wp.vec3f, roughness: wp.float32):
     # A room in one line: bright ceiling panel, dim floor, edge softened by the surface's roughness.
     soft = 0.12 + 0.6 * roughness
-    room = mix(light.ground, light.sky * 1.4, wp.smoothstep(-soft, soft, direction[2] - 0.05))
+    room = mix(light.ground * 1.8, light.sky * 1.4, wp.smoothstep(-soft, soft, direction[2] - 0.05))
     panel = wp.smoothstep(0.82 - 0.5 * soft, 0.82 + 0.5 * soft, direction[2])
     return room + light.key * (0.5 * panel)
 
@@ -159,7 +159,7 @@ def accumulate(
 def encode(c: wp.float32):
     # Extended Reinhard curve with white at 4, then the sRGB transfer function (IEC 61966-2-1).
     x = wp.max(c, 0.0)
-    x = wp.min(x * (1.0 + x / 16.0) / (1.0 + 0.35 * x), 1.0)
+    x = wp.min(x * (1.0 + x / 16.0) / (1.0 + 0.55 * x), 1.0)
     if x <= 0.0031308:
         return 12.92 * x
     return 1.055 * wp.pow(x, 1.0 / 2.4) - 0.055

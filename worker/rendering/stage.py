@@ -214,7 +214,7 @@ class Stage:
         turns[:, 3:] = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), shot.turn)
         self._model.shape_transform.assign(_xyzw(compose(turns[:, None], self._poses)).reshape(-1, 7))
         self._model.bvh_refit_shapes(self._state)
-        inverse: Floats = np.linalg.inv(shot.extrinsics) @ _FLIP
+        inverse = np.asarray(np.linalg.inv(shot.extrinsics) @ _FLIP, np.float64)
         poses = compose(turns[shot.world], pose_from_matrix(inverse))
         return wp.array(_xyzw(poses), dtype=wp.transformf, device=self.device)
 
