@@ -30,6 +30,8 @@ class Settings(BaseSettings):
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
     max_upload_bytes: int = Field(64 * 2**20, gt=0, description="largest hand or object taken over HTTP [bytes]")
+    queue_window: int = Field(1000, ge=1, description="tasks kept waiting in the queue; the rest waits in the index")
+    stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
 
     @cached_property

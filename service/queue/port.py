@@ -92,8 +92,11 @@ class TaskQueue(Protocol):
     def ping(self) -> float:
         """Seconds a round trip takes."""
 
-    def enqueue(self, messages: Sequence[Message], lane: Lane) -> int:
-        """Append tasks to a lane. A task (by id and attempt) that already waits is not queued twice.
+    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
+        """Append tasks to a lane. A task (by id and attempt) that already waits or runs is not queued twice.
+
+        Args:
+            again: the caller has seen that the queue lost these tasks; what it still remembers of them is replaced.
 
         Returns:
             number of tasks added.

@@ -1,0 +1,152 @@
+"""Connection to the index database: SQLite in WAL mode or PostgreSQL, migrated to the present schema when opened."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import Connection, Engine, Table, create_engine, event, make_url, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+
+from service.errors import IndexUnavailable, InputError
+
+_MIGRATIONS: Final = Path(__file__).parent / "migrations"
+_BUSY_TIMEOUT_S: Final = 5.0
+#: SQLite takes at most 32,766 values in a statement.
+_MAX_VALUES: Final = 30_000
+#: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
+_MIGRATION_LOCK: Final = 0x67727370
+
+
+class Database:
+    """An engine, with reads and writes as context managers."""
+
+    def __init__(self, url: str) -> None:
+        """Connect and migrate.
+
+        Raises:
+            InputError: the URL names no known database.
+            IndexUnavailable: the database does not answer or cannot be written.
+        """
+        self._engine = _engine(url)
+        self._write_lock = threading.Lock()
+        with _mapped():
+            _migrate(self._engine)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection for queries, which all see the same moment."""
+        with _mapped(), self._engine.connect() as connection:
+            if connection.dialect.name == "sqlite":
+                connection.exec_driver_sql("BEGIN")
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """A transaction: all of it is kept or nothing. Threads of one process take turns."""
+        with _mapped(), self._write_lock, self._engine.connect() as connection:
+            if connection.dialect.name == "sqlite":
+                # A transaction that reads first and writes later fails at once when another one wrote in between.
+                connection.exec_driver_sql("BEGIN IMMEDIATE")
+            yield connection
+            connection.commit()
+
+    def ping(self) -> float:
+        """Seconds a query takes."""
+        start = time.perf_counter()
+        with self.reading() as connection:
+            connection.execute(text("SELECT 1"))
+        return time.perf_counter() - start
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self._engine.dispose()
+
+
+def upsert(
+    connection: Connection, table: Table, rows: Sequence[Mapping[str, Any]], *, keep: Sequence[str] = ()
+) -> None:
+    """Insert rows; where the primary key is there, update all columns given but those in `keep`."""
+    if not rows:
+        return
+    keys = [column.name for column in table.primary_key]
+    changed = [name for name in rows[0] if name not in keys and name not in keep]
+    size = max(1, _MAX_VALUES // len(rows[0]))
+    for start in range(0, len(rows), size):
+        chunk = [dict(row) for row in rows[start : start + size]]
+        insert: Any = (postgresql if connection.dialect.name == "postgresql" else sqlite).insert(table).values(chunk)
+        if changed:
+            update = {name: insert.excluded[name] for name in changed}
+            statement = insert.on_conflict_do_update(index_elements=keys, set_=update)
+        else:
+            statement = insert.on_conflict_do_nothing(index_elements=keys)
+        connection.execute(statement)
+
+
+def _engine(url: str) -> Engine:
+    try:
+        parsed = make_url(url)
+        if parsed.get_backend_name() == "sqlite":
+            return _sqlite_engine(url, parsed.database)
+        return create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
+    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
+        raise InputError(
+            f"the index URL cannot be used ({_line(error)}); give sqlite:///PATH or postgresql+psycopg://..."
+        ) from None
+
+
+def _sqlite_engine(url: str, database: str | None) -> Engine:
+    if database and database != ":memory:":
+        try:
+            Path(database).parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise IndexUnavailable(
+                f"the index folder {Path(database).parent} cannot be made: {error.strerror}"
+            ) from None
+    engine = create_engine(url, connect_args={"timeout": _BUSY_TIMEOUT_S})
+
+    @event.listens_for(engine, "connect")
+    def _pragmas(connection: Any, _record: Any) -> None:
+        connection.isolation_level = None  # transactions begin where `writing` says
+        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
+            connection.execute(f"PRAGMA {pragma}")
+
+    return engine
+
+
+def _migrate(engine: Engine) -> None:
+    with engine.connect() as connection:
+        if connection.dialect.name == "postgresql":
+            connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _MIGRATION_LOCK})
+        else:
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        try:
+            config = Config()
+            config.set_main_option("script_location", str(_MIGRATIONS))
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+            connection.commit()
+        finally:
+            if connection.dialect.name == "postgresql":
+                connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _MIGRATION_LOCK})
+                connection.commit()
+
+
+@contextmanager
+def _mapped() -> Iterator[None]:
+    try:
+        yield
+    except SQLAlchemyError as error:
+        raise IndexUnavailable(f"the index does not answer or cannot be written: {_line(error)}") from error
+
+
+def _line(error: Exception) -> str:
+    original = getattr(error, "orig", None) or error
+    return (str(original).strip().splitlines() or [type(original).__name__])[0]

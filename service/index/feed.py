@@ -1,0 +1,124 @@
+"""What the keeper asks the index: which tasks should be queued, and which it believes are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select
+
+from service.domain import AssetKind, Lane, Stage, State
+from service.index.database import Database
+from service.index.tables import assets, jobs, tasks
+from service.planning import PlannedTask
+from service.records import JobRecord
+
+
+@dataclass(frozen=True)
+class ReadyTask:
+    """A task that may start now, with what a message needs."""
+
+    job: JobRecord
+    task: PlannedTask
+    lane: Lane
+    last_attempt: int
+    retried_upto: int
+
+
+@dataclass(frozen=True)
+class ReadyCheck:
+    """An uploaded hand or object that waits for its check."""
+
+    kind: AssetKind
+    name: str
+    digest: str
+    last_attempt: int
+
+
+class Feed(Database):
+    """Reads of the keeper."""
+
+    def ready_tasks(self, lane: Lane, *, now: float, limit: int) -> list[ReadyTask]:
+        """Tasks to be queued: batch by batch over all jobs, so that no job waits behind all of another."""
+        query = (
+            select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest, jobs.c.created)
+            .join(jobs, jobs.c.id == tasks.c.job_id)
+            .where(tasks.c.ready.is_(True), tasks.c.queued.is_(False), tasks.c.lane == lane.value)
+            .where(tasks.c.not_before <= now)
+            .order_by(tasks.c.batch, jobs.c.created, tasks.c.job_id)
+            .limit(limit)
+        )
+        with self.reading() as connection:
+            return [_ready(row) for row in connection.execute(query).mappings()]
+
+    def ready_of_job(self, job_id: str, *, limit: int) -> list[ReadyTask]:
+        """The first tasks of one job that may be queued."""
+        query = (
+            select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest, jobs.c.created)
+            .join(jobs, jobs.c.id == tasks.c.job_id)
+            .where(tasks.c.job_id == job_id, tasks.c.ready.is_(True), tasks.c.queued.is_(False))
+            .order_by(tasks.c.batch)
+            .limit(limit)
+        )
+        with self.reading() as connection:
+            return [_ready(row) for row in connection.execute(query).mappings()]
+
+    def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
+        """Uploads to be checked, oldest first."""
+        open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), assets.c.not_before <= now)
+        query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
+        with self.reading() as connection:
+            return [
+                ReadyCheck(AssetKind(row["kind"]), row["name"], row["digest"], row["last_attempt"])
+                for row in connection.execute(query).mappings()
+            ]
+
+    def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
+        """Unfinished tasks, and checks of assets, that were given to the queue."""
+        unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
+        of_tasks = select(tasks.c.id).where(tasks.c.queued.is_(True), unfinished)
+        of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
+        with self.reading() as connection:
+            checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
+            return set(connection.scalars(of_tasks)), checks
+
+    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Stage and shard id of tasks."""
+        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id).where(tasks.c.id.in_(list(task_ids)))
+        with self.reading() as connection:
+            return {task: (stage, shard) for task, stage, shard in connection.execute(query)}
+
+    def stopped(self, task_ids: Collection[str]) -> set[str]:
+        """Those of the tasks that should not be with a worker: cancelled, or unknown to the index."""
+        query = select(tasks.c.id).where(tasks.c.id.in_(list(task_ids)), tasks.c.state != State.CANCELLED.value)
+        with self.reading() as connection:
+            return set(task_ids) - set(connection.scalars(query))
+
+    def failed_tasks(self, job_id: str) -> dict[str, int]:
+        """Failed and cancelled tasks of a job with the number of their last attempt."""
+        final = tasks.c.state.in_((State.FAILED.value, State.CANCELLED.value))
+        query = select(tasks.c.id, tasks.c.last_attempt).where(tasks.c.job_id == job_id, final)
+        with self.reading() as connection:
+            return {row.id: row.last_attempt for row in connection.execute(query)}
+
+    def unfinished_tasks(self, job_id: str) -> list[str]:
+        """Tasks of a job that are in the queue or with a worker."""
+        query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
+        with self.reading() as connection:
+            return list(connection.scalars(query))
+
+
+def _ready(row: Any) -> ReadyTask:
+    record = JobRecord(
+        id=row["job_id"],
+        request=row["request"],
+        hand_digest=row["hand_digest"],
+        object_digest=row["object_digest"],
+        lane=row["lane"],
+        created=row["created"],
+    )
+    task = PlannedTask(
+        row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
+    )
+    return ReadyTask(record, task, Lane(row["lane"]), row["last_attempt"], row["retried_upto"])

@@ -1,0 +1,181 @@
+"""Tables of the index. `LIVE_COLUMNS` hold the present moment (progress, queue marks); the rest follows from the store.
+
+A change here needs a migration in `migrations/versions`; a test compares the two.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from sqlalchemy import JSON, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text
+
+metadata: Final = MetaData()
+
+jobs: Final = Table(
+    "jobs",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("state", String(10), nullable=False),
+    Column("lane", String(12), nullable=False),
+    Column("hand", String(64), nullable=False),
+    Column("object", String(64), nullable=False),
+    Column("hand_digest", String(32), nullable=False),
+    Column("object_digest", String(32), nullable=False),
+    Column("request", JSON, nullable=False),
+    Column("cancelled", Boolean, nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("finished", String(32)),
+    Column("reason", Text),
+    Index("jobs_newest", "created", "id"),
+    Index("jobs_by_state", "state", "created", "id"),
+    Index("jobs_by_pair", "hand", "object"),
+)
+
+tasks: Final = Table(
+    "tasks",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("job_id", String(32), nullable=False),
+    Column("stage", String(12), nullable=False),
+    Column("batch", Integer, nullable=False),
+    Column("position", Integer, nullable=False),
+    Column("count", Integer, nullable=False),
+    Column("lane", String(12), nullable=False),
+    Column("inputs", JSON, nullable=False),
+    Column("shard_id", String(32), nullable=False),
+    Column("state", String(10), nullable=False),
+    Column("ready", Boolean, nullable=False),
+    Column("done", Boolean, nullable=False),
+    Column("last_attempt", Integer, nullable=False),
+    Column("exhausted", Boolean, nullable=False),
+    Column("retried_upto", Integer, nullable=False),
+    Column("reason", Text),
+    Column("worker", String(128)),
+    Column("device", String(64)),
+    Column("seconds", Float),
+    Column("finished", String(32)),
+    Column("queued", Boolean, nullable=False, default=False),
+    Column("not_before", Float, nullable=False, default=0.0),
+    Column("progress_done", Float, nullable=False, default=0.0),
+    Column("progress_total", Float, nullable=False, default=0.0),
+    Column("progress_message", Text),
+    Index("tasks_of_job", "job_id", "batch", "position"),
+    Index("tasks_by_state", "job_id", "state"),
+    Index("tasks_by_shard", "shard_id"),
+    Index("tasks_to_queue", "ready", "queued", "lane", "batch"),
+    Index("tasks_finished", "finished"),
+)
+
+attempts: Final = Table(
+    "attempts",
+    metadata,
+    Column("task_id", String(32), primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("job_id", String(32), nullable=False),
+    Column("stage", String(12), nullable=False),
+    Column("kind", String(64), nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("trace", Text),
+    Column("worker", String(128), nullable=False),
+    Column("started", String(32)),
+    Column("ended", String(32), nullable=False),
+    Column("last", Boolean, nullable=False),
+    Index("attempts_of_job", "job_id", "ended"),
+    Index("attempts_by_kind", "stage", "kind"),
+)
+
+shards: Final = Table(
+    "shards",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("kind", String(8), nullable=False),
+    Column("stage", String(12), nullable=False),
+    Column("key", String(128), nullable=False),
+    Column("sha256", String(64), nullable=False),
+    Column("size_bytes", Integer, nullable=False),
+    Column("count", Integer, nullable=False),
+    Column("valid", Integer, nullable=False),
+    Column("hand", String(64), nullable=False),
+    Column("object", String(64), nullable=False),
+    Column("hand_digest", String(32), nullable=False),
+    Column("object_digest", String(32), nullable=False),
+    Column("batch", Integer, nullable=False),
+    Column("seed", Integer, nullable=False),
+    Column("inputs", JSON, nullable=False),
+    Column("device", String(64), nullable=False),
+    Column("worker", String(128), nullable=False),
+    Column("seconds", Float, nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("manifest", JSON, nullable=False),
+    Index("shards_newest", "created", "id"),
+    Index("shards_by_kind", "kind", "created", "id"),
+    Index("shards_by_pair", "hand", "object", "kind"),
+)
+
+METRICS: Final = (
+    "epsilon",
+    "wrench_volume",
+    "contact_area_cm2",
+    "intersection_volume_cm3",
+    "penetration_depth_mm",
+    "self_penetration_depth_mm",
+    "stability_loss",
+)
+
+grasps: Final = Table(
+    "grasps",
+    metadata,
+    Column("shard_id", String(32), primary_key=True),
+    Column("row", Integer, primary_key=True),
+    Column("hand", String(64), nullable=False),
+    Column("object", String(64), nullable=False),
+    *(Column(name, Float) for name in METRICS),
+    Column("contact_links", Integer),
+    Column("valid", Boolean, nullable=False),
+    Column("success", Boolean),
+    Column("created", String(32), nullable=False),
+    *(Index(f"grasps_{name}", name, "shard_id", "row") for name in (*METRICS, "created")),
+    Index("grasps_by_pair", "hand", "object", "epsilon"),
+    sqlite_with_rowid=False,
+)
+
+assets: Final = Table(
+    "assets",
+    metadata,
+    Column("kind", String(8), primary_key=True),
+    Column("digest", String(32), primary_key=True),
+    Column("name", String(64), nullable=False),
+    Column("filename", Text, nullable=False),
+    Column("files", JSON, nullable=False),
+    Column("size_bytes", Integer, nullable=False),
+    Column("created", String(32), nullable=False),
+    Column("builtin", Boolean, nullable=False),
+    Column("verdict", String(8)),
+    Column("message", Text),
+    Column("repairs", JSON, nullable=False),
+    Column("facts", JSON, nullable=False),
+    Column("last_attempt", Integer, nullable=False),
+    Column("queued", Boolean, nullable=False, default=False),
+    Column("not_before", Float, nullable=False, default=0.0),
+    Index("assets_by_name", "kind", "name", "created"),
+)
+
+workers: Final = Table(
+    "workers",
+    metadata,
+    Column("name", String(128), primary_key=True),
+    Column("host", String(128), nullable=False),
+    Column("pid", Integer, nullable=False),
+    Column("device", String(64), nullable=False),
+    Column("device_name", String(128), nullable=False),
+    Column("stages", JSON, nullable=False),
+    Column("version", String(32), nullable=False),
+    Column("state", String(10), nullable=False),
+    Column("task_id", String(32)),
+    Column("started", String(32), nullable=False),
+    Column("seen", String(32), nullable=False),
+)
+
+#: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
+LIVE_COLUMNS: Final = frozenset({"queued", "not_before", "progress_done", "progress_total", "progress_message"})
+LIVE_TABLES: Final = frozenset({"workers"})

@@ -1,0 +1,61 @@
+"""RQ job and queue classes that run nothing but graspd's own task, whatever a Redis writer puts there.
+
+RQ imports and calls any function that a job's hash names, JSON serializer or not; it does the same with callbacks, and
+it posts to any webhook URL. Here a job's function is what this process says it is, and the rest is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from rq import Queue
+from rq.job import Job
+from rq.serializers import JSONSerializer
+
+from service.errors import TaskRefused
+
+#: The one function name a job may carry.
+TASK_FUNCTION: Final = "graspd.task"
+#: How long Redis keeps what is left of a refused or broken job [s]. Results are not kept: events tell them.
+FAILURE_TTL_S: Final = 3600
+
+TaskFunction = Callable[[dict[str, Any]], None]
+
+
+class AllowedJob(Job):  # type: ignore[misc]
+    """A job whose function comes from a table of this process, not from Redis."""
+
+    function: TaskFunction | None = None
+    """What `TASK_FUNCTION` stands for; set in worker processes only."""
+
+    @property
+    def func(self) -> TaskFunction:
+        """The task function; TaskRefused for any other name, and where this process runs no tasks."""
+        if self.func_name != TASK_FUNCTION or self.instance is not None:
+            raise TaskRefused(f"the queue asks for {str(self.func_name)[:80]!r}, which is no task of graspd")
+        function = type(self).function
+        if function is None:
+            raise TaskRefused("this process runs no tasks; start `graspd worker`")
+        return function
+
+    def restore(self, raw_data: Any) -> None:
+        """Read a job from Redis without what could reach outside graspd or outlive its use."""
+        super().restore(raw_data)
+        self._success_callback_name = self._failure_callback_name = self._stopped_callback_name = None
+        self._success_callback = self._failure_callback = self._stopped_callback = None
+        self.webhooks: list[Any] = []
+        self._dependency_ids: list[str] = []
+        self.retries_left = self.repeats_left = None
+        self.result_ttl, self.failure_ttl = 0, FAILURE_TTL_S
+
+
+class AllowedQueue(Queue):  # type: ignore[misc]
+    """A queue of such jobs."""
+
+    job_class = AllowedJob
+
+    @classmethod
+    def open(cls, name: str, connection: Any) -> AllowedQueue:
+        """A queue by its name."""
+        return cls(name, connection=connection, job_class=AllowedJob, serializer=JSONSerializer)

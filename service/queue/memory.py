@@ -1,0 +1,124 @@
+"""The queue in one process: the twin that unit tests use, and what the contract test holds against Redis."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+
+from service.domain import Lane, Stage
+from service.queue.port import Event, Lease, Message, WorkerBeat
+
+
+@dataclass
+class Delivery:
+    """A task in a worker's hands."""
+
+    message: Message
+    worker: str
+    key: str
+    beat: int = 0
+
+
+@dataclass
+class MemoryQueue:
+    """`TaskQueue` without Redis. `take`, `beat` and `finish` are the worker's side."""
+
+    _lanes: dict[Lane, list[Message]] = field(default_factory=lambda: {lane: [] for lane in Lane})
+    _held: dict[str, Delivery] = field(default_factory=dict)
+    _cancelled: set[str] = field(default_factory=set)
+    _events: list[Event] = field(default_factory=list)
+    _workers: dict[str, WorkerBeat] = field(default_factory=dict)
+    _read: int = 0
+    _acknowledged: set[str] = field(default_factory=set)
+    _numbers: itertools.count[int] = field(default_factory=itertools.count)
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def ping(self) -> float:
+        return 0.0
+
+    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
+        known = {(m.task_id, m.attempt) for waiting in self._lanes.values() for m in waiting}
+        if not again:
+            known |= {(held.message.task_id, held.message.attempt) for held in self._held.values()}
+        fresh = [m for m in messages if (m.task_id, m.attempt) not in known]
+        self._cancelled -= {m.task_id for m in messages}
+        self._lanes[lane] += fresh
+        return len(fresh)
+
+    def discard(self, task_ids: Collection[str]) -> None:
+        self._cancelled |= set(task_ids)
+        for lane, waiting in self._lanes.items():
+            self._lanes[lane] = [m for m in waiting if m.task_id not in set(task_ids)]
+
+    def waiting(self) -> set[str]:
+        return {m.task_id for waiting in self._lanes.values() for m in waiting}
+
+    def depths(self) -> dict[tuple[Lane, Stage], int]:
+        return {(lane, s): sum(m.stage is s for m in waiting) for lane, waiting in self._lanes.items() for s in Stage}
+
+    def leases(self) -> list[Lease]:
+        return [
+            Lease(held.message.task_id, held.message.attempt, held.worker, held.key, str(held.beat), held.message)
+            for held in self._held.values()
+        ]
+
+    def release(self, lease: Lease) -> None:
+        self._held.pop(lease.key, None)
+
+    def workers(self) -> list[WorkerBeat]:
+        return list(self._workers.values())
+
+    def publish(self, event: Event) -> None:
+        with self._changed:
+            self._events.append(event)
+            self._changed.notify_all()
+
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._events) > self._read, timeout=wait_s)
+            found = [(str(i + 1), e) for i, e in enumerate(self._events) if i >= self._read][:limit]
+            self._read += len(found)
+            return found
+
+    def acknowledge(self, event_ids: Sequence[str]) -> None:
+        self._acknowledged |= set(event_ids)
+
+    def restart_consumer(self) -> None:
+        """What a new keeper sees: everything that was not acknowledged."""
+        done = {int(i) for i in self._acknowledged}
+        self._read = next((i for i in range(len(self._events)) if i + 1 not in done), len(self._events))
+
+    def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        with self._changed:
+            start = len(self._events) if after == "$" else int(after)
+            self._changed.wait_for(lambda: len(self._events) > start, timeout=wait_s)
+            return [(str(i + 1), e) for i, e in enumerate(self._events) if i >= start][:limit]
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+    def take(self, worker: str, *, wait_s: float = 0.0) -> Delivery | None:
+        """The next task, interactive ones first; it is leased to the worker."""
+        deadline = time.monotonic() + wait_s
+        while True:
+            for lane in Lane:
+                if self._lanes[lane]:
+                    message = self._lanes[lane].pop(0)
+                    delivery = Delivery(message, worker, f"{message.task_id}/{next(self._numbers)}")
+                    self._held[delivery.key] = delivery
+                    return delivery
+            if time.monotonic() >= deadline:
+                return None
+            time.sleep(0.01)
+
+    def beat(self, delivery: Delivery) -> tuple[bool, bool]:
+        """A sign of life. Returns whether the task was cancelled, and whether the lease is lost."""
+        delivery.beat += 1
+        return delivery.message.task_id in self._cancelled, delivery.key not in self._held
+
+    def finish(self, delivery: Delivery) -> None:
+        """The worker is done with the task, whatever came of it."""
+        self._held.pop(delivery.key, None)

@@ -1,0 +1,282 @@
+"""The queue on Redis: RQ for tasks and leases, a bounded stream for events.
+
+One RQ queue a lane and stage, so that a worker may serve some stages only. RQ's own retries, scheduler, maintenance and
+result storage are not used: each of them loses or repeats work in ways the keeper does not.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import product
+from typing import Any, Final
+
+from pydantic import ValidationError
+from redis import Redis
+from redis.backoff import ExponentialBackoff
+from redis.exceptions import RedisError, ResponseError
+from redis.retry import Retry
+from rq.exceptions import DuplicateJobError
+from rq.serializers import JSONSerializer
+
+from service.domain import IngestMessage, Lane, Stage, TaskMessage
+from service.embedded import redis_url
+from service.errors import QueueUnavailable
+from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
+from service.queue.port import Event, Lease, Message, WorkerBeat
+from service.settings import Settings
+
+EVENTS: Final = "graspd:events"
+#: Events kept: two minutes of a hundred workers' progress, 20 MB at most. Those lost are made good from the store.
+EVENTS_KEPT: Final = 50_000
+WORKERS: Final = "graspd:workers"
+_GROUP: Final = "keeper"
+_CANCEL_TTL_S: Final = 24 * 3600
+_SOCKET_TIMEOUT_S: Final = 10.0
+#: Later stages first: a batch that was begun is finished before the next begins.
+_STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
+
+
+class RqQueue:
+    """`TaskQueue` on Redis."""
+
+    def __init__(self, connection: Redis) -> None:
+        self.connection: Any = connection
+        self._unread = "0"
+
+    def ping(self) -> float:
+        start = time.perf_counter()
+        with _mapped():
+            self.connection.ping()
+        return time.perf_counter() - start
+
+    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
+        added = 0
+        with _mapped():
+            for message in messages:
+                queue = AllowedQueue.open(queue_name(lane, message.stage), self.connection)
+                self.connection.delete(cancel_key(message.task_id))
+                if again:
+                    self.connection.delete(AllowedJob.key_for(rq_id(message.task_id, message.attempt)))
+                added += self._enqueue(queue, message)
+        return added
+
+    def _enqueue(self, queue: AllowedQueue, message: Message) -> bool:
+        try:
+            queue.enqueue_call(
+                TASK_FUNCTION,
+                args=(message.model_dump(mode="json", by_alias=True),),
+                job_id=rq_id(message.task_id, message.attempt),
+                timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.main`
+                result_ttl=0,
+                failure_ttl=FAILURE_TTL_S,
+                description=f"{message.stage} {message.task_id}",
+                unique=True,
+            )
+        except DuplicateJobError:
+            return False
+        return True
+
+    def discard(self, task_ids: Collection[str]) -> None:
+        wanted = set(task_ids)
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for task in wanted:
+                pipe.set(cancel_key(task), "1", ex=_CANCEL_TTL_S)
+            pipe.execute()
+            for key in _queue_keys():
+                for job in self.connection.lrange(key, 0, -1):
+                    if task_of(job.decode())[0] in wanted:
+                        pipe.lrem(key, 0, job)
+                        pipe.delete(AllowedJob.key_for(job.decode()))
+            pipe.execute()
+
+    def waiting(self) -> set[str]:
+        with _mapped(), self.connection.pipeline(transaction=True) as pipe:
+            for key in _queue_keys():
+                pipe.lrange(key, 0, -1)
+            return {task_of(job.decode())[0] for jobs in pipe.execute() for job in jobs}
+
+    def depths(self) -> dict[tuple[Lane, Stage], int]:
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            places = list(product(Lane, Stage))
+            for lane, stage in places:
+                pipe.llen(f"rq:queue:{queue_name(lane, stage)}")
+            return dict(zip(places, pipe.execute(), strict=True))
+
+    def leases(self) -> list[Lease]:
+        # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
+        leases = []
+        with _mapped():
+            for lane, stage in product(Lane, Stage):
+                key = f"rq:wip:{queue_name(lane, stage)}"
+                for entry, score in self.connection.zrange(key, 0, -1, withscores=True):
+                    leases.append(self._lease(key, entry.decode(), score))
+        return leases
+
+    def _lease(self, key: str, entry: str, score: float) -> Lease:
+        job = entry.partition(":")[0]
+        task, attempt = task_of(job)
+        beat = self.connection.hget(f"rq:execution:{entry}", "last_heartbeat")
+        worker, data = self.connection.hmget(AllowedJob.key_for(job), "worker_name", "data")
+        return Lease(
+            task_id=task,
+            attempt=attempt,
+            worker=(worker or b"").decode(),
+            key=f"{key} {entry}",
+            beat=f"{score}/{(beat or b'').decode()}",
+            message=_message(data),
+        )
+
+    def release(self, lease: Lease) -> None:
+        key, entry = lease.key.split(" ")
+        with _mapped(), self.connection.pipeline(transaction=True) as pipe:
+            pipe.zrem(key, entry)
+            pipe.delete(f"rq:execution:{entry}", f"rq:executions:{entry.partition(':')[0]}")
+            pipe.delete(AllowedJob.key_for(entry.partition(":")[0]))
+            pipe.execute()
+
+    def workers(self) -> list[WorkerBeat]:
+        with _mapped():
+            names = sorted(name.decode() for name in self.connection.smembers(WORKERS))
+            found = self.connection.mget([worker_key(name) for name in names]) if names else []
+            if gone := [name for name, data in zip(names, found, strict=True) if data is None]:
+                self.connection.srem(WORKERS, *gone)
+        beats = [json.loads(data) for data in found if data is not None]
+        return [WorkerBeat(**beat | {"stages": tuple(map(Stage, beat["stages"]))}) for beat in beats]
+
+    def publish(self, event: Event) -> None:
+        with _mapped():
+            self.connection.xadd(
+                EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True
+            )
+
+    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        with _mapped():
+            try:
+                found = self._read_group(limit, wait_s)
+            except ResponseError as error:
+                if not str(error).startswith("NOGROUP"):
+                    raise
+                self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
+                found = self._read_group(limit, wait_s)
+        return found
+
+    def _read_group(self, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        # First what an earlier keeper took and never acknowledged, then what is new.
+        if self._unread != ">":
+            reply = self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: self._unread}, count=limit)
+            if pending := self._events(reply):
+                self._unread = pending[-1][0]
+                return pending
+            self._unread = ">"
+        block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
+        return self._events(self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: ">"}, count=limit, block=block))
+
+    def acknowledge(self, event_ids: Sequence[str]) -> None:
+        if event_ids:
+            with _mapped():
+                self.connection.xack(EVENTS, _GROUP, *event_ids)
+
+    def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+        with _mapped():
+            block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
+            return self._events(self.connection.xread({EVENTS: after}, count=limit, block=block))
+
+    def close(self) -> None:
+        self.connection.close()
+
+    @staticmethod
+    def _events(reply: Any) -> list[tuple[str, Event]]:
+        streams = reply.values() if isinstance(reply, dict) else [entries for _, entries in reply or []]
+        events = []
+        for entries in streams:
+            for entry in entries:
+                for event_id, fields in [entry] if isinstance(entry, tuple) else entry:
+                    if fields and (event := _event(fields.get(b"e"))):
+                        events.append((event_id.decode(), event))
+        return events
+
+
+def connect(url: str, *, patience: int = 3) -> Redis:
+    """A client that reconnects by itself; `patience` is how often it tries before it gives up."""
+    try:
+        return Redis.from_url(
+            url,
+            socket_timeout=_SOCKET_TIMEOUT_S,
+            socket_connect_timeout=3.0,
+            socket_keepalive=True if not url.startswith("unix:") else None,
+            health_check_interval=30,
+            retry=Retry(ExponentialBackoff(cap=1.0, base=0.05), patience),
+        )
+    except (ValueError, TypeError) as error:
+        raise QueueUnavailable(f"the Redis URL cannot be used: {error}; give redis://, rediss:// or unix://") from None
+
+
+def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
+    """The queue that the settings name; it need not answer yet."""
+    return RqQueue(connect(redis_url(settings), patience=patience))
+
+
+def queue_name(lane: Lane, stage: Stage) -> str:
+    """Name of the RQ queue of a lane and stage."""
+    return f"{lane.value}-{stage.value}"
+
+
+def queue_names(stages: Collection[Stage]) -> list[str]:
+    """Queues of a worker that serves these stages, in the order in which it takes tasks."""
+    return [queue_name(lane, stage) for lane in Lane for stage in _STAGE_ORDER if stage in stages]
+
+
+def rq_id(task_id: str, attempt: int) -> str:
+    """RQ's job id: one a task and attempt, so that a slow worker's end cannot touch the attempt that replaced it."""
+    return f"{task_id}-{attempt}"
+
+
+def task_of(job: str) -> tuple[str, int]:
+    """Task id and attempt of an RQ job id; a forged one is a task of its own."""
+    task, dash, attempt = job.rpartition("-")
+    return (task, int(attempt)) if dash and attempt.isdecimal() else (job, 0)
+
+
+def cancel_key(task_id: str) -> str:
+    """Key that tells a worker to stop a task."""
+    return f"graspd:cancel:{task_id}"
+
+
+def worker_key(name: str) -> str:
+    """Key that a living worker keeps alive."""
+    return f"graspd:worker:{name}"
+
+
+def _queue_keys() -> list[str]:
+    return [f"rq:queue:{queue_name(lane, stage)}" for lane, stage in product(Lane, Stage)]
+
+
+def _message(data: bytes | None) -> Message | None:
+    if data is None:
+        return None
+    job = AllowedJob(serializer=JSONSerializer, connection=None)
+    try:
+        job.restore({b"data": data})
+        raw = job.args[0]
+        return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
+    except Exception:  # forged data may fail anywhere
+        return None
+
+
+def _event(data: bytes | None) -> Event | None:
+    try:
+        return Event.model_validate_json(data or b"")
+    except ValidationError:
+        return None
+
+
+@contextmanager
+def _mapped() -> Iterator[None]:
+    try:
+        yield
+    except (RedisError, OSError) as error:
+        line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise QueueUnavailable(f"Redis does not answer ({line}); start `graspd up`, or set GRASPD_REDIS_URL") from None
