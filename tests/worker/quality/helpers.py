@@ -1,0 +1,52 @@
+"""Postures and grasp sets for the tests of quality."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from tests.worker.models import piece, two_finger_hand
+from worker.grasps import GraspSet, Posture
+from worker.hands.model import HandModel, PalmFrame
+
+
+def posture(*rows: tuple[tuple[float, float, float], tuple[float, ...]]) -> Posture:
+    """Postures with the root's axes along the object's: (position, joints) each."""
+    pose = np.array([[*position, 1.0, 0, 0, 0] for position, _ in rows])
+    return Posture(pose, np.array([joints for _, joints in rows], float))
+
+
+def grasp_set(grasp: Posture) -> GraspSet:
+    return GraspSet(grasp, grasp, grasp, np.full(len(grasp), np.nan))
+
+
+def plate_hand(size: tuple[float, float, float] = (0.05, 0.05, 0.01)) -> HandModel:
+    """A gripper: two parallel plates that slide along x towards each other from a small base far below."""
+    base = two_finger_hand()
+    plate = trimesh.creation.box(size)
+    foot = trimesh.creation.box((0.02, 0.02, 0.02))
+    pieces = (
+        piece(0, foot, "box", (0.02, 0.02, 0.02), (0, 0, -0.15)),
+        piece(1, plate, "box", size, (0, 0, 0)),
+        piece(2, plate, "box", size, (0, 0, 0)),
+    )
+    turn = np.sqrt(0.5)
+    origin = np.array([[0, 0, 0, 1, 0, 0, 0], [-0.1, 0, 0, turn, 0, turn, 0], [0.1, 0, 0, turn, 0, -turn, 0]])
+    return HandModel(
+        **{
+            **{name: getattr(base, name) for name in base.__dataclass_fields__},
+            "name": "plates",
+            "digest": f"{hash(size) & 0xFFFFFFFF:032x}",
+            "joint_type": np.array([0, 2, 2], np.int32),
+            "origin": origin,
+            "axis": np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1]], float),
+            "lower": np.zeros(2),
+            "upper": np.full(2, 0.1),
+            "effort": np.full(2, 100.0),
+            "stiffness": np.full(2, 500.0),
+            "pieces": pieces,
+            "neighbours": frozenset({(0, 1), (0, 2)}),
+            "palm": PalmFrame(np.array([0.0, 0, -0.14]), np.array([0.0, 0, 1])),
+            "masses": np.array([0.3, 0.1, 0.1]),
+        }
+    )

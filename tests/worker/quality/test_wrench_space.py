@@ -1,0 +1,168 @@
+"""The wrench space against closed forms and published values."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from service.errors import InputError
+from worker.quality.wrench_space import cone_edges, measure_space, tangents, wrenches
+
+#: The table of reference values is printed with six digits.
+PRINTED = 1e-5
+#: qhull joggles its input by about 1e-9 of the coordinates' range; six dimensions multiply that.
+JOGGLE = 1e-6
+ORIGIN = np.zeros(3)
+OCTAHEDRON = np.vstack([np.eye(3), -np.eye(3)])
+
+
+def sphere_space(points: np.ndarray, friction: float, *, radius: float = 1.0, edges: int = 8) -> tuple[float, float]:
+    return measure_space(wrenches(points, -points, friction=friction, centre=ORIGIN, radius=radius, edges=edges))
+
+
+def test_tangents_form_a_right_handed_orthonormal_frame() -> None:
+    normals = Rotation.random(50, rng=1).apply([0, 0, 1.0])
+    t1, t2 = tangents(normals)
+    frames = np.stack([t1, t2, normals], axis=-1)
+    assert np.allclose(np.linalg.det(frames), 1)
+    assert np.allclose(frames.transpose(0, 2, 1) @ frames, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(("dimension", "volume"), [(6, 64 / 720), (3, 4 / 3)])
+def test_cross_polytope_has_radius_one_over_root_dimension(dimension: int, volume: float) -> None:
+    points = np.vstack([np.eye(dimension), -np.eye(dimension)])[:, None, :]
+    assert measure_space(points) == pytest.approx((1 / math.sqrt(dimension), volume), abs=PRINTED)
+
+
+def test_antipodal_forces_reach_the_apothem_of_the_friction_pyramid() -> None:
+    forces = cone_edges(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5)
+    assert measure_space(forces) == pytest.approx(
+        (0.5 * math.cos(math.pi / 8), 8 * 0.25 * math.sin(math.pi / 4)), abs=PRINTED
+    )
+
+
+def test_antipodal_hard_fingers_cannot_resist_torsion() -> None:
+    assert sphere_space(np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 0.5) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("friction", "epsilon", "volume"),
+    [(0.2, 0.163299, 0.024992), (0.5, 0.408248, 0.598634), (1.0, 0.816497, 10.615952)],
+)
+def test_octahedral_contacts_on_the_unit_sphere(friction: float, epsilon: float, volume: float) -> None:
+    assert epsilon == pytest.approx(friction * math.sqrt(2 / 3), abs=PRINTED)
+    assert sphere_space(OCTAHEDRON, friction) == pytest.approx((epsilon, volume), abs=PRINTED)
+
+
+@pytest.mark.parametrize(("friction", "volume"), [(0.2, 0.014643), (0.5, 0.3125), (1.0, 4.088889)])
+def test_octahedral_contacts_with_four_edges(friction: float, volume: float) -> None:
+    found = sphere_space(OCTAHEDRON, friction, edges=4)
+    assert found == pytest.approx((friction / math.sqrt(3), volume), abs=PRINTED)
+
+
+def test_torque_scale_divides_the_volume_by_its_cube() -> None:
+    assert sphere_space(OCTAHEDRON, 0.5, radius=2.0) == pytest.approx((0.204124, 0.598634 / 8), abs=PRINTED)
+
+
+def test_six_face_centres_of_a_cube() -> None:
+    points = 0.05 * OCTAHEDRON
+    edges = wrenches(points, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
+    assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
+
+
+def test_unit_force_convention_shrinks_the_octahedral_space() -> None:
+    force = cone_edges(-OCTAHEDRON, 0.5, unit="force")
+    edges = np.concatenate([force, np.cross(OCTAHEDRON[:, None], force)], axis=-1)
+    assert measure_space(edges) == pytest.approx((0.365148, 0.306500), abs=PRINTED)
+
+
+TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arange(3) / 3])
+
+
+@pytest.mark.parametrize(
+    ("points", "friction", "bound"),
+    [(TETRAHEDRON, 0.2, 0.142), (TETRAHEDRON, 0.5, 0.370), (TETRAHEDRON, 1.0, 0.747),
+     (TRIPOD, 0.2, 0.1055), (TRIPOD, 0.5, 0.2887), (TRIPOD, 1.0, 0.5787)],
+)  # fmt: skip
+def test_more_edges_approach_the_cone_limit_from_below(points: np.ndarray, friction: float, bound: float) -> None:
+    eight, many = (sphere_space(points, friction, edges=edges)[0] for edges in (8, 32))
+    assert eight <= many <= bound * 1.001
+    # A pyramid of 8 edges holds a cone of cos(pi/8) of the friction.
+    assert eight >= 0.9 * math.cos(math.pi / 8) * bound
+
+
+def test_rotation_and_order_of_contacts_do_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    points = Rotation.random(7, rng=rng).apply([0, 0, 1.0])
+    force = cone_edges(-points, 0.7)
+    edges = np.concatenate([force, np.cross(points[:, None], force)], axis=-1)
+    turn = Rotation.random(rng=rng).as_matrix()
+    turned = np.einsum("ab,neb->nea", np.kron(np.eye(2), turn), edges)[rng.permutation(7)]
+    assert measure_space(turned) == pytest.approx(measure_space(edges), abs=JOGGLE)
+
+
+def test_size_of_the_object_does_not_matter() -> None:
+    points = Rotation.random(6, rng=4).apply([0, 0, 1.0])
+    small = wrenches(0.03 * points, -points, friction=0.5, centre=ORIGIN, radius=0.04)
+    large = wrenches(3.0 * points, -points, friction=0.5, centre=ORIGIN, radius=4.0)
+    assert np.allclose(small, large, atol=1e-12)
+
+
+def test_origin_outside_the_space_has_no_ball() -> None:
+    rng = np.random.default_rng(0)
+    epsilon, volume = measure_space(rng.normal(size=(20, 8, 6)) + 10)
+    assert epsilon == 0.0
+    assert volume > 0.0
+
+
+def test_l_infinity_space_is_the_minkowski_sum() -> None:
+    contacts = np.array([[[1.0, 0]], [[-1.0, 0]], [[0, 1.0]], [[0, -1.0]]])
+    assert measure_space(contacts, norm="linf") == pytest.approx((1.0, 4.0), abs=JOGGLE)
+    assert measure_space(contacts, norm="l1") == pytest.approx((math.sqrt(0.5), 2.0), abs=JOGGLE)
+
+
+def test_l_infinity_space_of_many_contacts_is_refused() -> None:
+    contacts = np.random.default_rng(0).normal(size=(12, 8, 6))
+    with pytest.raises(InputError, match="at most 4 contacts"):
+        measure_space(contacts, norm="linf")
+
+
+def frogger_edges(grasp: dict[str, list[list[float]]]) -> np.ndarray:
+    """Edge wrenches by the contact model that the reference files state."""
+    normal = np.array(grasp["contact_normals_into_object_derived"])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    seed = np.array([1.2, 2.3, 3.4])
+    t1 = seed - (normal @ seed)[:, None] * normal
+    t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
+    t2 = np.cross(normal, t1)
+    angle = np.pi / 2 * np.arange(4)
+    around = np.cos(angle)[:, None] * t1[:, None] + np.sin(angle)[:, None] * t2[:, None]
+    force = (normal[:, None] + 0.5 * around) / math.sqrt(1.25)
+    return np.concatenate([force, np.cross(np.array(grasp["contact_points_object"])[:, None], force)], axis=-1)
+
+
+def test_published_frogger_grasps_have_their_ferrari_canny_recomputed(shared_data: Path) -> None:
+    files = sorted((shared_data / "reference_grasps" / "frogger_allegro").glob("*.json"))
+    worst, count = 0.0, 0
+    for file in files:
+        for grasp in json.loads(file.read_text())["grasps"]:
+            epsilon = measure_space(frogger_edges(grasp))[0]
+            worst = max(worst, abs(epsilon - max(0.0, grasp["ferrari_canny_L1_recomputed_here"])))
+            count += 1
+    assert count == 378
+    # Stored points and normals are rounded to 1e-7 m and 1e-6, the stored metric to 1e-8.
+    assert worst < 1e-6
+
+
+def test_hull_of_a_published_grasp_agrees_with_exact_merging(shared_data: Path) -> None:
+    file = shared_data / "reference_grasps" / "frogger_allegro" / "061_foam_brick.json"
+    edges = frogger_edges(json.loads(file.read_text())["grasps"][0])
+    exact = ConvexHull(edges.reshape(-1, 6), qhull_options="Qt Qx")
+    assert measure_space(edges)[1] == pytest.approx(exact.volume, rel=JOGGLE)

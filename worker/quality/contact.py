@@ -1,0 +1,78 @@
+"""Contact between hand and object: area, contact points, links in touch, evenness over the fingers."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.hands.model import HandModel
+from worker.hands.surface import farthest_points
+
+Floats = NDArray[np.float64]
+
+#: A body nearer than this is in contact [m] (DexGraspBench).
+LINK_CONTACT_M: Final = 0.002
+#: Contact distances count as at most this in the contact distance consistency [m] (DexGraspBench's contact margin).
+CONSISTENCY_CAP_M: Final = 0.010
+#: Most contacts in a wrench space: what its hull costs grows with their number, its radius hardly does.
+MAX_CONTACTS: Final = 20
+
+
+def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Floats:
+    """(B, T) hand surface within each threshold of the object, on either side of its surface [cm^2].
+
+    Args:
+        distance: (B, N) signed distances of hand points [m].
+        area: (N,) area that each point stands for [m^2].
+        thresholds_m: (T,) [m].
+    """
+    near = np.abs(distance)
+    return np.stack([(near < t) @ area for t in thresholds_m], axis=-1) * 1e4
+
+
+def choose_contacts(
+    distance: Floats, place: Floats, normal: Floats, threshold: float, *, scale: float
+) -> NDArray[np.intp]:
+    """At most `MAX_CONTACTS` indices of points within `threshold`, spread as widely as can be.
+
+    Args:
+        distance: (N,) signed distances [m].
+        place: (N, 3) contact points [m].
+        normal: (N, 3) unit normals; two contacts count as apart by place over `scale` and by direction.
+        threshold: [m]
+        scale: length to weigh places against directions: the torque scale [m].
+    """
+    near = np.flatnonzero((np.abs(distance) < threshold) & ((normal**2).sum(axis=1) > 0.5))
+    if len(near) <= MAX_CONTACTS:
+        return near
+    return near[farthest_points(np.hstack([place[near] / scale, normal[near]]), MAX_CONTACTS)]
+
+
+def contact_links(body_distance: Floats) -> NDArray[np.int32]:
+    """(B,) number of bodies nearer than `LINK_CONTACT_M`, from (B, L) distances [m]."""
+    return (body_distance < LINK_CONTACT_M).sum(axis=1).astype(np.int32)
+
+
+def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
+    """(L,) finger (index into `HandModel.fingertips`) that each body belongs to; -1 for the palm and shared bodies."""
+    finger = np.full(hand.bodies, -1, np.int32)
+    members = np.zeros(hand.bodies, np.int32)
+    for number, body in enumerate(hand.fingertips):
+        while body > 0:
+            finger[body] = number
+            members[body] += 1
+            body = int(hand.parent[body])
+    finger[members > 1] = -1
+    return finger
+
+
+def contact_distance_consistency_mm(hand: HandModel, body_distance: Floats) -> Floats:
+    """(B,) CDC: largest minus least finger distance, each within [0, 10 mm] (DexGraspBench) [mm]."""
+    finger = finger_of_body(hand)
+    least = [body_distance[:, finger == f].min(axis=1) for f in np.unique(finger[finger >= 0])]
+    if not least:
+        return np.zeros(len(body_distance))
+    capped = np.clip(np.stack(least, axis=1), 0.0, CONSISTENCY_CAP_M)
+    return (capped.max(axis=1) - capped.min(axis=1)) * 1e3

@@ -1,0 +1,178 @@
+"""Distances between a posed hand and an object, for many grasps at once. On the CPU, in parallel threads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel, SurfacePoints
+from worker.hands.surface import sample_surface
+from worker.objects.model import ObjectModel
+from worker.simulation.device import DeviceHand, to_xyzw
+from worker.simulation.kernels import distance as kernels
+from worker.simulation.sampling import object_samples
+from worker.transforms import compose, quat_to_matrix
+
+Floats = NDArray[np.float64]
+
+#: Hand points that contact area and penetration are measured with; the optimiser's own points use other seeds.
+HAND_POINTS: Final = 2000
+OBJECT_POINTS: Final = 3000
+#: Held-out sample: a metric must not be measured at the very points that were optimised.
+SEED: Final = 7919
+#: Distances beyond this are reported as this [m].
+REACH_M: Final = 0.012
+
+
+@dataclass(frozen=True)
+class Distances:
+    """B grasps, N hand points, P pieces; all in the object frame, metres."""
+
+    bodies: Floats
+    """(B, L, 7) poses of the bodies."""
+    hand_points: Floats
+    """(B, N, 3)"""
+    distance: Floats
+    """(B, N) signed distance of hand points to the object, at most `REACH_M`."""
+    closest: Floats
+    """(B, N, 3) closest points on the object."""
+    normal: Floats
+    """(B, N, 3) outward unit normals of the object there; 0 beyond reach."""
+    piece_distance: Floats
+    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: the point is inside."""
+    self_depth: Floats
+    """(B,) deepest hand point inside another, non-neighbouring body."""
+
+
+class Probe:
+    """A (hand, object) pair made ready once for distance queries. Safe to use from several threads."""
+
+    def __init__(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        *,
+        hand_points: int = HAND_POINTS,
+        object_points: int = OBJECT_POINTS,
+    ) -> None:
+        self.hand, self.obj = hand, obj
+        self.points: SurfacePoints = sample_surface(hand, hand_points, seed=SEED)
+        self.samples: Floats = object_samples(obj, object_points, seed=SEED)
+        self._pieces = DeviceHand.create(hand, "cpu").pieces
+        self._piece_body = np.array([p.body for p in hand.pieces], np.intp)
+        self._piece_frame = np.array([_kernel_frame(p.kind, p.pose, p.vertices) for p in hand.pieces])
+        margin = 1e-4
+        self._low = wp.vec3(*(obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin))
+        self._high = wp.vec3(*(obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin))
+        with wp.ScopedDevice("cpu"):
+            # Loading here keeps threads from compiling the same module at once.
+            wp.load_module(module=kernels, device="cpu")
+            self._body = wp.array(self.points.body, dtype=wp.int32)
+            self._samples = wp.array(self.samples - obj.centre_of_mass, dtype=wp.vec3)
+            self._corner_normals = wp.array(obj.corner_normals.reshape(-1, 3), dtype=wp.vec3)
+            self._mesh = wp.Mesh(
+                points=wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3),
+                indices=wp.array(obj.faces.ravel(), dtype=wp.int32),
+                support_winding_number=not obj.watertight,
+            )
+
+    @cached_property
+    def sample_spacing(self) -> float:
+        """Distance between neighbouring object points if they were on a square grid [m]."""
+        corners = self.obj.vertices[self.obj.faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return float(np.sqrt(0.5 * np.linalg.norm(cross, axis=1).sum() / len(self.samples)))
+
+    def signed_distance(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Signed distance (P,), closest point (P, 3), outward normal (P, 3) of points (P, 3) in the object frame."""
+        count = len(points)
+        with wp.ScopedDevice("cpu"):
+            given = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
+            distance = wp.empty(count, dtype=wp.float32)
+            closest = wp.empty(count, dtype=wp.vec3)
+            normal = wp.empty(count, dtype=wp.vec3)
+            wp.launch(
+                kernels.mesh_distance,
+                dim=count,
+                inputs=[
+                    self._mesh.id,
+                    int(not self.obj.watertight),
+                    self._corner_normals,
+                    self._low,
+                    self._high,
+                    REACH_M,
+                    given,
+                ],
+                outputs=[distance, closest, normal],
+                device="cpu",
+            )
+        reached = np.minimum(distance.numpy().astype(float), REACH_M)
+        return reached, closest.numpy().astype(float) + self.obj.centre_of_mass, normal.numpy().astype(float)
+
+    def posed_points(self, bodies: Floats) -> Floats:
+        """(B, N, 3) hand points in the object frame for body poses (B, L, 7)."""
+        body = self.points.body
+        rotation = quat_to_matrix(bodies[..., 3:])
+        turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], self.points.position)
+        return turned + bodies[:, body, :3]
+
+    def measure(self, posture: Posture) -> Distances:
+        """All distances of B postures."""
+        bodies = body_poses(self.hand, posture.hand_pose, posture.joint_positions)
+        points = self.posed_points(bodies)
+        shape = points.shape[:2]
+        distance, closest, normal = self.signed_distance(points.reshape(-1, 3))
+        pieces, depth = self._piece_distances(bodies, points)
+        return Distances(
+            bodies=bodies,
+            hand_points=points,
+            distance=distance.reshape(shape),
+            closest=closest.reshape(*shape, 3),
+            normal=normal.reshape(*shape, 3),
+            piece_distance=pieces,
+            self_depth=depth,
+        )
+
+    def body_distance(self, found: Distances) -> Floats:
+        """(B, L) least distance between each body and the object, from both sides' points [m]."""
+        least = np.full((len(found.bodies), self.hand.bodies), REACH_M)
+        for body in range(self.hand.bodies):
+            mine = self.points.body == body
+            if mine.any():
+                least[:, body] = found.distance[:, mine].min(axis=1)
+            own = self._piece_body == body
+            if own.any():
+                least[:, body] = np.minimum(least[:, body], found.piece_distance[:, own].min(axis=1))
+        return least
+
+    def _piece_distances(self, bodies: Floats, points: Floats) -> tuple[Floats, Floats]:
+        frames = compose(bodies[:, self._piece_body], self._piece_frame[None])
+        count = len(bodies)
+        with wp.ScopedDevice("cpu"):
+            position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
+            rotation: Any = wp.array(to_xyzw(frames[..., 3:]), dtype=wp.quat)
+            own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
+            least = wp.full((count, len(self._piece_body)), REACH_M, dtype=wp.float32)
+            depth = wp.zeros(count, dtype=wp.float32)
+            posed = [self._pieces, position, rotation]
+            dim = (count, len(self.samples))
+            wp.launch(
+                kernels.pieces_distance, dim, inputs=[*posed, REACH_M, self._samples], outputs=[least], device="cpu"
+            )
+            wp.launch(kernels.self_distance, points.shape[:2], inputs=[*posed, self._body, own, depth], device="cpu")
+        return least.numpy().astype(float), depth.numpy().astype(float)
+
+
+def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
+    """Pose of a piece's frame as the kernels have it: a hull's stands in the middle of its box."""
+    if kind != "hull":
+        return pose
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return np.concatenate([middle, [1.0, 0, 0, 0]])

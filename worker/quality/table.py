@@ -1,0 +1,150 @@
+"""The quality table: every metric of every grasp of one hand on one object."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError, TaskCancelled
+from worker.grasps import GraspSet, Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.contact import choose_contacts, contact_area_cm2, contact_links
+from worker.quality.penetration import penetration_depth
+from worker.quality.probe import REACH_M, Distances, Probe
+from worker.quality.volume import SharedVolume
+from worker.quality.wrench_space import Norm, measure_space, wrenches
+
+Floats = NDArray[np.float64]
+Progress = Callable[[float, float, str], None]
+Cancelled = Callable[[], bool]
+
+#: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
+DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
+DEFAULT_FRICTION: Final = 1.0
+#: Grasps a thread works on at a time: small enough to cancel soon, large enough to fill a kernel launch.
+CHUNK: Final = 16
+
+
+def measure(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    friction: float = DEFAULT_FRICTION,
+    thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
+    norm: Norm = "l1",
+    threads: int = 0,
+    progress: Progress = lambda done, total, message: None,
+    cancelled: Cancelled = lambda: False,
+) -> dict[str, NDArray[np.generic]]:
+    """Quality columns of a base shard for N grasps, at the posture of contact.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        friction: Coulomb coefficient of the wrench space.
+        thresholds_m: T contact thresholds, at most `REACH_M` [m].
+        norm: l1 (GraspIt!'s) or linf wrench space.
+        threads: 0: all cores.
+        progress: called with grasps done.
+        cancelled: polled between chunks.
+
+    Returns:
+        All `quality/...` datasets of the base schema but `valid`, `success` and `simulated_displacement_cm`.
+
+    Raises:
+        InputError: no thresholds, or one beyond `REACH_M`.
+        TaskCancelled: when `cancelled()` answers True.
+    """
+    thresholds = np.asarray(thresholds_m, float)
+    if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
+        raise InputError(
+            f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
+        )
+    pair = _Pair(hand, obj, friction, thresholds, norm)
+    chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
+    done, lock = 0, threading.Lock()
+
+    def work(chunk: slice) -> dict[str, NDArray[np.generic]]:
+        nonlocal done
+        if cancelled():
+            raise TaskCancelled("the quality table was cancelled")
+        columns = pair.columns(Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]))
+        with lock:
+            done += chunk.stop - chunk.start
+            progress(done, len(grasps), "quality")
+        return columns
+
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="quality") as pool:
+        parts = list(pool.map(work, chunks))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in pair.names} if parts else pair.empty()
+    columns["quality/thresholds_m"] = thresholds
+    columns["quality/stability_loss"] = np.asarray(grasps.stability_loss, float)
+    return columns
+
+
+class _Pair:
+    """What the chunks of one table share."""
+
+    names: Final = (
+        "quality/contact_area_cm2",
+        "quality/intersection_volume_cm3",
+        "quality/epsilon",
+        "quality/wrench_volume",
+        "quality/penetration_depth_mm",
+        "quality/self_penetration_depth_mm",
+        "quality/contact_links",
+    )
+
+    def __init__(self, hand: HandModel, obj: ObjectModel, friction: float, thresholds: Floats, norm: Norm) -> None:
+        self.obj, self.friction, self.thresholds, self.norm = obj, friction, thresholds, norm
+        self.probe = Probe(hand, obj)
+        self.volume = SharedVolume(hand, obj)
+
+    def empty(self) -> dict[str, NDArray[np.generic]]:
+        """Columns of no grasps."""
+        swept = ("quality/contact_area_cm2", "quality/epsilon", "quality/wrench_volume")
+        return {name: np.zeros((0, len(self.thresholds)) if name in swept else (0,)) for name in self.names}
+
+    def columns(self, posture: Posture) -> dict[str, NDArray[np.generic]]:
+        found = self.probe.measure(posture)
+        # An object's face may enter a piece between two object points, half a diagonal of their grid away from either.
+        near = found.piece_distance < self.probe.sample_spacing
+        epsilon, volume = self._spaces(found)
+        columns: tuple[NDArray[np.generic], ...] = (
+            contact_area_cm2(found.distance, self.probe.points.area, self.thresholds),
+            self.volume.of(found.bodies, near),
+            epsilon,
+            volume,
+            penetration_depth(found) * 1e3,
+            found.self_depth * 1e3,
+            contact_links(self.probe.body_distance(found)),
+        )
+        return dict(zip(self.names, columns, strict=True))
+
+    def _spaces(self, found: Distances) -> tuple[Floats, Floats]:
+        shape = (len(found.distance), len(self.thresholds))
+        epsilon, volume = np.zeros(shape), np.zeros(shape)
+        for b in range(shape[0]):
+            place, normal = found.closest[b], found.normal[b]
+            last: NDArray[np.intp] = np.zeros(0, np.intp)
+            for t, threshold in enumerate(self.thresholds):
+                chosen = choose_contacts(found.distance[b], place, normal, threshold, scale=self.obj.radius)
+                if t and np.array_equal(chosen, last):
+                    epsilon[b, t], volume[b, t] = epsilon[b, t - 1], volume[b, t - 1]
+                elif len(chosen):
+                    edges = wrenches(
+                        place[chosen], -normal[chosen], friction=self.friction,
+                        centre=self.obj.centre_of_mass, radius=self.obj.radius,
+                    )  # fmt: skip
+                    epsilon[b, t], volume[b, t] = measure_space(edges, norm=self.norm)
+                last = chosen
+        return epsilon, volume

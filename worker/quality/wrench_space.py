@@ -1,0 +1,126 @@
+"""Grasp wrench space by the conventions of GraspIt! (Miller & Allen 2004): epsilon (Ferrari & Canny 1992) and volume.
+
+Each contact's friction cone is a pyramid of 8 edges with unit normal component, f = n + mu (cos a t1 + sin a t2); its
+torque about the centre of mass is divided by the object's largest radius. The L1 space is the convex hull of all edges
+(normal forces sum to at most 1), the L-infinity space the Minkowski sum of the contacts' pyramids with their apex
+(each at most 1).
+
+Epsilon is the radius of the largest ball around the origin inside the space, hence 0 where the origin is not inside
+(GraspIt! reports -1 there); flat spaces have epsilon 0 and volume 0.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from service.errors import InputError
+
+Floats = NDArray[np.float64]
+Norm = Literal["l1", "linf"]
+
+EDGES: Final = 8
+#: Least over largest singular value below which a set of wrenches is flat.
+FLATNESS: Final = 1e-7
+#: Largest number of points in a Minkowski sum before its hull is taken.
+MAX_SUM: Final = 40_000
+
+
+def tangents(normals: Floats) -> tuple[Floats, Floats]:
+    """Two unit tangents (N, 3) each, t1 x t2 = n; along the coordinate axes where the normal is."""
+    n = np.asarray(normals, float)
+    axis = np.eye(3)[np.argmin(np.abs(n), axis=-1)]
+    t1 = np.cross(n, axis)
+    t1 /= np.linalg.norm(t1, axis=-1, keepdims=True)
+    return t1, np.cross(n, t1)
+
+
+def cone_edges(
+    normals: Floats, friction: float, *, edges: int = EDGES, unit: Literal["normal", "force"] = "normal"
+) -> Floats:
+    """(N, E, 3) edge forces of the friction pyramids about inward unit normals (N, 3).
+
+    `unit` says what has length 1: the normal component (GraspIt!) or the force itself (FRoGGeR).
+    """
+    t1, t2 = tangents(normals)
+    angle = 2 * np.pi * np.arange(edges) / edges
+    around = np.cos(angle)[:, None] * t1[:, None] + np.sin(angle)[:, None] * t2[:, None]
+    force: Floats = np.asarray(normals, float)[:, None] + friction * around
+    return force / np.sqrt(1 + friction**2) if unit == "force" else force
+
+
+def wrenches(
+    points: Floats,
+    normals: Floats,
+    *,
+    friction: float,
+    centre: Floats,
+    radius: float,
+    edges: int = EDGES,
+) -> Floats:
+    """(N, E, 6) edge wrenches: force, then torque about `centre` over `radius`.
+
+    Args:
+        points: (N, 3) contact points [m].
+        normals: (N, 3) unit normals into the object.
+        friction: Coulomb coefficient.
+        centre: (3,) torque origin, the centre of mass [m].
+        radius: torque scale, the object's largest radius [m].
+        edges: edges of the pyramid.
+    """
+    force = cone_edges(normals, friction, edges=edges)
+    torque = np.cross((np.asarray(points, float) - centre)[:, None] / radius, force)
+    return np.concatenate([force, torque], axis=-1)
+
+
+def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, float]:
+    """Epsilon and volume of the wrench space of N contacts.
+
+    Args:
+        edge_wrenches: (N, E, D) edge wrenches of each contact; D is 6, or fewer for a subspace.
+        norm: l1 or linf.
+
+    Raises:
+        InputError: linf with more contacts than its Minkowski sum can be built for.
+    """
+    dimension = edge_wrenches.shape[-1]
+    points = edge_wrenches.reshape(-1, dimension) if norm == "l1" else _minkowski(edge_wrenches)
+    hull = _hull(points)
+    if hull is None:
+        return 0.0, 0.0
+    return max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume)
+
+
+def _hull(points: Floats) -> ConvexHull | None:
+    if len(points) <= points.shape[1]:
+        return None
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if spread[-1] <= FLATNESS * max(spread[0], 1e-300):
+        return None
+    # Joggled input is fastest and simplicial; exact merging is for what defeats it.
+    for options in ("QJ", "Qt Qx"):
+        try:
+            return ConvexHull(points, qhull_options=options)
+        except QhullError:
+            continue
+    return None
+
+
+def _minkowski(edge_wrenches: Floats) -> Floats:
+    """Corners of the Minkowski sum of the contacts' pyramids, each with its apex at the origin."""
+    dimension = edge_wrenches.shape[-1]
+    total = np.zeros((1, dimension))
+    for edges in edge_wrenches:
+        pyramid = np.vstack([np.zeros((1, dimension)), edges])
+        if len(total) * len(pyramid) > MAX_SUM:
+            raise InputError(
+                f"the L-infinity space of {len(edge_wrenches)} contacts is too large; use at most 4 contacts, or L1"
+            )
+        total = (total[:, None] + pyramid[None]).reshape(-1, dimension)
+        hull = _hull(total)
+        if hull is not None:
+            total = total[hull.vertices]
+    return total
