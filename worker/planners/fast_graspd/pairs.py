@@ -12,6 +12,7 @@ from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.schedule import loss_options
+from worker.simulation import kernels
 from worker.simulation.device import DeviceHand, DeviceObject
 from worker.simulation.sampling import object_samples
 from worker.simulation.simulation import LossOptions, Simulation
@@ -50,6 +51,7 @@ def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) 
         if key in _pairs:
             _pairs.move_to_end(key)
             return _pairs[key]
+        kernels.load(device)
         samples = object_samples(obj, fidelity.object_points)
         pair = Pair(
             hand=DeviceHand.create(hand, device),

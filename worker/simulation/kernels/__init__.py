@@ -3,3 +3,21 @@
 Arguments end in `_in` or `_out`; `_inout` is read and written. Quaternions are x y z w here, and here only. Each module
 compiles on first use and is cached on disk. The object frame of all kernels has its origin at the centre of mass.
 """
+
+from __future__ import annotations
+
+import threading
+from importlib import import_module
+from typing import Final
+
+import warp as wp
+
+MODULES: Final = ("kinematics", "surface", "contact", "pieces", "penalties", "optimizers", "projection")
+_lock = threading.Lock()
+
+
+def load(device: str) -> None:
+    """Compile, or read from the cache, all kernels for a device. Warp must not load one module from two threads."""
+    with _lock:
+        for name in MODULES:
+            wp.load_module(import_module(f"{__name__}.{name}"), device=device)
