@@ -1,0 +1,107 @@
+"""The HTTP application. It keeps nothing between requests that another process would need."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi.staticfiles import StaticFiles
+
+from api import problems
+from api.auth import KeyFile
+from api.catalog import Catalog
+from api.dashboard import pages
+from api.dashboard.rendering import STATIC, problem_page
+from api.guard import RequestContext, SameOrigin, host_name, is_loopback
+from api.limits import BodyLimit
+from api.metrics import Metrics
+from api.routes import grasps, jobs, shards, system
+from api.routes.assets import asset_router
+from service.domain import AssetKind
+from service.errors import InputError
+from service.parts import Parts
+from service.settings import Settings
+from service.version import PACKAGE_VERSION
+
+_log = logging.getLogger("graspd.api")
+_LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
+    """The application over given parts, or over parts it opens from the settings and closes at its end.
+
+    Raises:
+        InputError: the address to bind is reachable from elsewhere and no key exists.
+        StoreUnavailable, IndexUnavailable: where the parts cannot be opened.
+    """
+    keys = KeyFile(settings.data_dir / "keys.json")
+    check_exposure(settings.host, keys)
+    opened = parts or Parts.open(settings)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        if parts is None:
+            opened.close()
+
+    app = FastAPI(
+        title="graspd",
+        version=PACKAGE_VERSION,
+        description="Grasp datasets as a service. Errors are application/problem+json (RFC 9457).",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    app.state.settings = settings
+    app.state.keys = keys
+    app.state.catalog = Catalog(opened)
+    app.state.metrics = Metrics()
+    problems.install(app, problem_page)
+    for router in (jobs.router, grasps.router, shards.router, *map(asset_router, AssetKind), system.router):
+        app.include_router(router)
+    pages.install(app)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    _add_middleware(app, settings, keys)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+def check_exposure(host: str, keys: KeyFile) -> None:
+    """InputError if strangers could reach a service that asks for no key."""
+    if keys.is_open and not is_loopback(host):
+        raise InputError(
+            f"{host} is reachable from other machines and no key exists; "
+            "make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1"
+        )
+
+
+def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile) -> None:
+    """Innermost first: limits on bodies, then foreign web pages, then request ids around everything."""
+    uploads = frozenset({"/v1/hands", "/v1/objects", "/submit"})
+    app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
+    allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None
+    app.add_middleware(SameOrigin, allowed_hosts=allowed)
+    app.add_middleware(RequestContext, metrics=app.state.metrics)
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document, with problem documents where FastAPI would declare its own error form."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        schemas.pop("HTTPValidationError", None)
+        schemas.pop("ValidationError", None)
+        problem = problems.Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas |= problem.pop("$defs")
+        schemas["Problem"] = problem
+        for path in document["paths"].values():
+            for operation in path.values():
+                answers = operation.get("responses", {})
+                if "application/json" in answers.get("422", {}).get("content", {}):
+                    answers["422"] = problems.responses(422)[422]
+        app.openapi_schema = document
+    return app.openapi_schema

@@ -1,0 +1,283 @@
+"""What the routes and the pages read and do, as documents: index, store, queue and pipeline stand behind them.
+
+Nothing is kept here between two requests but what may be lost, so any number of API processes answer alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Final, Literal
+
+from api.idempotency import Idempotency
+from api.models import GraspQuery, Health, Histogram, Job, JobDetail, MeanMetrics, Part, Shard
+from api.progress import Paces, eta_of_job, progress_of_job, stage_statuses
+from service import library, pipeline
+from service.digests import digest_files
+from service.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.errors import ConflictError, GraspdError, NotFoundError
+from service.index.filters import GraspFilter, GraspSort, Metric
+from service.index.views import (
+    AssetView,
+    FailureGroup,
+    GraspView,
+    JobView,
+    Page,
+    ShardView,
+    Stats,
+    TaskView,
+    WorkerView,
+)
+from service.parts import Parts
+from service.store import Store
+
+_HEALTH_S: Final = 2.0
+_PAGE: Final = 200
+MEAN_METRICS: Final[tuple[Metric, ...]] = (
+    "epsilon",
+    "contact_area_cm2",
+    "intersection_volume_cm3",
+    "penetration_depth_mm",
+)
+
+
+class Catalog:
+    """The service as the front door shows it. Methods raise the errors of `service.errors`."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._idempotency = Idempotency(parts.settings)
+        self._paces = Paces()
+        self._health: tuple[float, Health] | None = None
+
+    @property
+    def store(self) -> Store:
+        """Where the files are."""
+        return self._parts.store
+
+    @property
+    def parts(self) -> Parts:
+        return self._parts
+
+    def submit(self, request: JobRequest, *, idempotency_key: str | None = None, owner: str = "") -> JobDetail:
+        """Record a job, or find the same one.
+
+        Raises:
+            InputError: the idempotency key came with another request before.
+        """
+        if idempotency_key is not None:
+            self._idempotency.claim(owner, idempotency_key, request)
+        job, _ = pipeline.submit(self._parts, request)
+        return self._detail(job)
+
+    def cancel(self, job_id: str) -> JobDetail:
+        return self._detail(pipeline.cancel(self._parts, job_id))
+
+    def retry(self, job_id: str) -> JobDetail:
+        return self._detail(pipeline.retry(self._parts, job_id))
+
+    def jobs(
+        self,
+        *,
+        state: State | None = None,
+        hand: str | None = None,
+        object: str | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[Job]:
+        """Jobs, newest first."""
+        page = self._parts.index.jobs(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
+        return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
+
+    def job(self, job_id: str) -> JobDetail:
+        return self._detail(self._parts.index.job(job_id))
+
+    def job_state(self, job_id: str) -> Job:
+        """A job with the progress of its stages and nothing else: what a stream of events repeats."""
+        return self._job(self._parts.index.job(job_id), self._running(job_id))
+
+    def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
+        """Grasps that pass every filter."""
+        sort = GraspSort(by=query.sort, descending=query.order == "desc")
+        return self._parts.index.grasps(grasp_filter(query), sort=sort, limit=limit, cursor=cursor)
+
+    def shards(
+        self,
+        *,
+        job: str | None = None,
+        kind: Literal["base", "scene", "views"] | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[Shard]:
+        page = self._parts.index.shards(job=job, kind=kind, limit=limit, cursor=cursor)
+        return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
+
+    def shard(self, shard_id: str) -> Shard:
+        return _shard(self._parts.index.shard(shard_id))
+
+    def assets(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
+        return self._parts.index.assets(kind, limit=limit, cursor=cursor)
+
+    def asset(self, kind: AssetKind, name: str) -> AssetView:
+        return self._parts.index.asset(kind, name)
+
+    def add_asset(self, kind: AssetKind, name: str, files: dict[str, bytes]) -> AssetView:
+        """Keep an uploaded hand or object; the keeper queues its check.
+
+        Raises:
+            ConflictError: the name stands for other content, or the content has another name.
+        """
+        digest = digest_files(kind, files)
+        with contextlib.suppress(NotFoundError):
+            known = self._parts.index.asset(kind, name)
+            if known.digest != digest:
+                raise ConflictError(f"there is another {kind.value} named {name!r}; choose a name of its own")
+        asset = library.publish_asset(self._parts.store, kind, name, files)
+        self._parts.index.add_asset(asset, library.load_check(self._parts.store, kind, asset.digest))
+        return self._parts.index.asset(kind, asset.digest)
+
+    def workers(self) -> list[WorkerView]:
+        return self._parts.index.workers()
+
+    def stats(self) -> Stats:
+        return self._parts.index.stats()
+
+    def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
+        """Valid grasps made in each of the last minutes, the oldest first."""
+        start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
+        made = [0] * minutes
+        for bucket in self._parts.index.throughput(since=start.isoformat().replace("+00:00", "Z"), bucket_s=60):
+            minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
+            made[min(max(minute, 0), minutes - 1)] += bucket.valid
+        return made
+
+    def failures(self, *, limit: int = 5) -> list[FailureGroup]:
+        return self._parts.index.failures(limit=limit)
+
+    def depths(self) -> dict[tuple[Lane, Stage], int]:
+        return self._parts.queue.depths()
+
+    def health(self) -> Health:
+        """State of the three parts; asked anew at most every two seconds."""
+        now = time.monotonic()
+        if self._health is None or now - self._health[0] > _HEALTH_S:
+            probes: dict[str, Callable[[], float]] = {
+                "redis": self._parts.queue.ping,
+                "index": self._parts.index.ping,
+                "store": self._parts.store.probe,
+            }
+            parts = {name: _probe(probe) for name, probe in probes.items()}
+            self._health = (now, Health(ok=all(part.ok for part in parts.values()), parts=parts))
+        return self._health[1]
+
+    def histograms(self, job_id: str, *, bins: int = 20, limit: int = 2000) -> list[Histogram]:
+        """Distribution of each metric over a job's valid grasps, of at most `limit` of them."""
+        rows = self._valid_grasps(job_id, limit)
+        found = []
+        for metric in MEAN_METRICS:
+            values = [value for row in rows if (value := getattr(row, metric)) is not None]
+            if values:
+                found.append(_histogram(metric, values, bins))
+        return found
+
+    def _detail(self, job: JobView) -> JobDetail:
+        mean = {data.metric: data.mean for data in self.histograms(job.id)} if job.valid else {}
+        return JobDetail(
+            **self._job(job, self._running(job.id)).model_dump(),
+            request=job.request,
+            hand_digest=job.hand_digest,
+            object_digest=job.object_digest,
+            attempts=self._parts.index.attempts(job=job.id, limit=50),
+            mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
+            shards=self.shards(job=job.id, limit=_PAGE).items,
+        )
+
+    def _job(self, job: JobView, running: Sequence[TaskView]) -> Job:
+        fidelity = job.request.fidelity
+        stages = stage_statuses(job, running, self._paces)
+        return Job(
+            id=job.id,
+            state=job.state,
+            hand=job.request.hand,
+            object=job.request.object,
+            method=job.request.method,
+            fidelity=fidelity if isinstance(fidelity, str) else fidelity.name,
+            requested=job.request.grasps,
+            grasps=job.grasps,
+            valid=job.valid,
+            progress=progress_of_job(job),
+            eta_s=eta_of_job(job, stages),
+            created=job.created,
+            finished=job.finished,
+            reason=job.reason,
+            stages=stages,
+        )
+
+    def _running(self, job_id: str) -> list[TaskView]:
+        return self._parts.index.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
+
+    def _valid_grasps(self, job_id: str, limit: int) -> list[GraspView]:
+        rows: list[GraspView] = []
+        where = GraspFilter(job=job_id, valid=True)
+        cursor: str | None = None
+        while len(rows) < limit:
+            page = self._parts.index.grasps(where, limit=_PAGE, cursor=cursor)
+            rows += page.items
+            cursor = page.next
+            if cursor is None:
+                break
+        return rows
+
+
+def grasp_filter(query: GraspQuery) -> GraspFilter:
+    """The index's filter behind a request's parameters."""
+    bounds: dict[str, dict[Metric, float]] = {"min": {}, "max": {}}
+    for end, metrics in bounds.items():
+        for metric in MEAN_METRICS:
+            value = getattr(query, f"{end}_{metric}", None)
+            if value is not None:
+                metrics[metric] = value
+    return GraspFilter(
+        job=query.job,
+        hand=query.hand,
+        object=query.object,
+        valid=query.valid,
+        success=query.success,
+        at_least=bounds["min"],
+        at_most=bounds["max"],
+    )
+
+
+def all_pages(fetch: Callable[[str | None], Page[AssetView]]) -> Iterator[AssetView]:
+    """Items of every page of a list of assets."""
+    cursor: str | None = None
+    while True:
+        page = fetch(cursor)
+        yield from page.items
+        cursor = page.next
+        if cursor is None:
+            return
+
+
+def _shard(shard: ShardView) -> Shard:
+    return Shard(**shard.model_dump(), file=f"/v1/shards/{shard.id}/file")
+
+
+def _probe(probe: Callable[[], float]) -> Part:
+    try:
+        return Part(ok=True, latency_ms=round(1000 * probe(), 3))
+    except GraspdError as error:
+        return Part(ok=False, detail=str(error))
+
+
+def _histogram(metric: Metric, values: list[float], bins: int) -> Histogram:
+    low, high = min(values), max(values)
+    counts = [0] * bins
+    width = (high - low) / bins
+    for value in values:
+        counts[min(bins - 1, int((value - low) / width)) if width > 0 else 0] += 1
+    return Histogram(
+        metric=metric, count=len(values), mean=sum(values) / len(values), low=low, high=high, counts=counts
+    )

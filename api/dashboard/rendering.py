@@ -1,0 +1,44 @@
+"""Templates to pages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from fastapi import Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from api.dashboard import filters
+from service.version import PACKAGE_VERSION
+
+_HERE: Final = Path(__file__).parent
+STATIC: Final = _HERE / "static"
+
+
+def environment() -> Environment:
+    """Templates that escape everything and stop at an unknown name."""
+    made = Environment(
+        loader=FileSystemLoader(_HERE / "templates"),
+        autoescape=select_autoescape(),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters.install(made)
+    return made
+
+
+def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
+    """A page. `page` marks the place in the navigation, `events` the stream that moves it."""
+    context = {"page": "", "events": "", "refresh_s": 0, "health": request.app.state.catalog.health()} | context
+    context |= {"version": PACKAGE_VERSION, "signed_in": not request.app.state.keys.is_open}
+    text = request.app.state.templates.get_template(template).render(context)
+    return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
+
+
+def problem_page(request: Request, problem: dict[str, Any]) -> Response:
+    """What a visitor sees of an error; without a key, the way to sign in."""
+    if problem["status"] == 401:
+        return RedirectResponse("/login", status_code=303)
+    return render(request, "problem.html", status=problem["status"], problem=problem, health=None)

@@ -1,0 +1,30 @@
+"""Code to copy: how to load a job's files."""
+
+from __future__ import annotations
+
+from api.models import JobDetail
+
+
+def loader(job: JobDetail, base_url: str) -> str:
+    """Python that downloads the job's first shard of grasps and reads it with h5py."""
+    shard = next((shard for shard in job.shards if shard.kind == "base"), None)
+    if shard is None:
+        return ""
+    return f"""import io, urllib.request
+import h5py
+
+url = "{base_url.rstrip("/")}{shard.file}"
+with h5py.File(io.BytesIO(urllib.request.urlopen(url).read())) as shard:
+    poses = shard["grasp/hand_pose"][:]          # (N, 7) x y z [m], quaternion w x y z
+    joints = shard["grasp/joint_positions"][:]   # (N, J) rad or m
+    names = shard["grasp/joint_positions"].attrs["joint_names"]
+    valid = shard["quality/valid"][:].astype(bool)
+    epsilon = shard["quality/epsilon"][:]        # (N, T) at the thresholds in quality/thresholds_m
+print(valid.sum(), "of", len(valid), "grasps are valid")"""
+
+
+def curl(job: JobDetail, base_url: str) -> str:
+    """Shell lines that download every shard of the job shown on its page."""
+    base = base_url.rstrip("/")
+    lines = [f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base}{shard.file}" for shard in job.shards]
+    return "\n".join(lines)

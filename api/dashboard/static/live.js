@@ -1,0 +1,62 @@
+// Live pages: on each server event, and at most once a second, the page is fetched again and the regions marked
+// data-live are replaced. Without this script the pages read the same; they just do not move.
+(() => {
+  "use strict";
+  const relative = new Intl.RelativeTimeFormat("en", { numeric: "auto", style: "short" });
+
+  function sayTimes(root) {
+    for (const element of root.querySelectorAll("time[datetime]")) {
+      const seconds = (new Date(element.dateTime) - Date.now()) / 1000;
+      const size = Math.abs(seconds);
+      const [unit, length] = size < 60 ? ["second", 1] : size < 3600 ? ["minute", 60] : size < 86400 ? ["hour", 3600] : ["day", 86400];
+      element.textContent = size < 5 ? "just now" : relative.format(Math.round(seconds / length), unit);
+      element.title = new Date(element.dateTime).toLocaleString();
+    }
+  }
+
+  function swap(text) {
+    const fresh = new DOMParser().parseFromString(text, "text/html");
+    for (const region of document.querySelectorAll("[data-live]")) {
+      const next = fresh.getElementById(region.id);
+      if (!next || region.contains(document.activeElement) && document.activeElement.matches("input, select")) continue;
+      if (next.outerHTML === region.dataset.was) continue;
+      const was = next.outerHTML;
+      sayTimes(next);
+      region.replaceWith(document.adoptNode(next));
+      document.getElementById(next.id).dataset.was = was;
+    }
+  }
+
+  let pending = null;
+  async function refresh() {
+    pending = null;
+    const answer = await fetch(location.href, { headers: { Accept: "text/html" } });
+    if (answer.ok) swap(await answer.text());
+  }
+
+  function watch() {
+    const source = new EventSource(document.body.dataset.events);
+    const lamp = document.getElementById("lamp");
+    const onEvent = () => { pending ??= setTimeout(() => refresh().catch(() => {}), document.hidden ? 10000 : 300); };
+    source.addEventListener("progress", onEvent);
+    source.addEventListener("end", () => { onEvent(); source.close(); });
+    source.addEventListener("open", () => lamp && lamp.removeAttribute("data-lost"));
+    source.addEventListener("error", () => lamp && lamp.setAttribute("data-lost", ""));
+    addEventListener("pagehide", () => source.close());
+  }
+
+  document.addEventListener("click", (event) => {
+    const button = event.target.closest("button[data-copy]");
+    if (!button) return;
+    const text = document.getElementById(button.dataset.copy).textContent;
+    navigator.clipboard.writeText(text).then(() => {
+      button.textContent = "Copied";
+      setTimeout(() => { button.textContent = "Copy"; }, 1500);
+    }, () => {});
+  });
+
+  for (const button of document.querySelectorAll("button[data-copy]")) button.hidden = false;
+  sayTimes(document);
+  setInterval(() => sayTimes(document), 15000);
+  if (document.body.dataset.events) watch();
+})();

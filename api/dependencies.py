@@ -1,0 +1,34 @@
+"""What routes ask for: the catalogue of this application, and the right to use it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Depends, Query, Request
+
+from api.auth import Scope, authorize
+from api.catalog import Catalog
+
+MAX_LIMIT = 200
+
+
+def get_catalog(request: Request) -> Catalog:
+    """The catalogue that `create_app` opened."""
+    return request.app.state.catalog
+
+
+def may_read(request: Request) -> None:
+    authorize(request, Scope.READ)
+
+
+def may_submit(request: Request) -> None:
+    authorize(request, Scope.SUBMIT)
+
+
+def may_administer(request: Request) -> None:
+    authorize(request, Scope.ADMIN)
+
+
+CatalogOf = Annotated[Catalog, Depends(get_catalog)]
+Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
+Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]

@@ -1,0 +1,137 @@
+"""What the HTTP API answers where it says more than the index. Times are RFC 3339 in UTC, units stand in the names."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.domain import JobRequest, Stage, State
+from service.index.views import AttemptView, ShardView, StageProgress
+
+
+class StageStatus(StageProgress):
+    """How far one stage of a job is, and when it will end."""
+
+    state: State
+    progress: float = Field(ge=0, le=1, description="share done; running batches count by their own progress")
+    message: str = Field("", description="what a running batch does now")
+    rate_per_s: float | None = Field(None, description="batches per second over the present workers")
+    eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
+
+
+class Job(BaseModel):
+    """A job as the list shows it."""
+
+    id: str
+    state: State
+    hand: str
+    object: str
+    method: str
+    fidelity: str
+    requested: int = Field(description="grasps asked for")
+    grasps: int = Field(description="grasps made so far")
+    valid: int = Field(description="of these, past the geometric gate")
+    progress: float = Field(ge=0, le=1)
+    eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
+    created: str
+    finished: str | None = None
+    reason: str | None = Field(None, description="why it failed")
+    stages: list[StageStatus]
+
+
+class MeanMetrics(BaseModel):
+    """Means over the valid grasps of a job; absent while there are none."""
+
+    epsilon: float | None = None
+    contact_area_cm2: float | None = None
+    intersection_volume_cm3: float | None = None
+    penetration_depth_mm: float | None = None
+
+
+class Shard(ShardView):
+    """A shard and where to download it."""
+
+    file: str
+
+
+class JobDetail(Job):
+    """A job with its request, failed attempts and results."""
+
+    request: JobRequest
+    hand_digest: str
+    object_digest: str
+    attempts: list[AttemptView]
+    mean: MeanMetrics
+    shards: list[Shard]
+
+
+class GraspQuery(BaseModel):
+    """Filters and order of a list of grasps. A range leaves out grasps whose metric is unknown."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    job: str | None = Field(None, max_length=64)
+    hand: str | None = Field(None, max_length=64)
+    object: str | None = Field(None, max_length=64)
+    valid: bool | None = None
+    success: bool | None = None
+    min_epsilon: float | None = Field(None, ge=0, allow_inf_nan=False)
+    min_contact_area_cm2: float | None = Field(None, ge=0, allow_inf_nan=False)
+    max_intersection_volume_cm3: float | None = Field(None, ge=0, allow_inf_nan=False)
+    max_penetration_depth_mm: float | None = Field(None, ge=0, allow_inf_nan=False)
+    sort: Literal["epsilon", "contact_area_cm2", "intersection_volume_cm3", "penetration_depth_mm"] = "epsilon"
+    order: Literal["asc", "desc"] = "desc"
+
+
+class Part(BaseModel):
+    """One part the API needs."""
+
+    ok: bool
+    latency_ms: float | None = Field(None, description="absent where it does not answer")
+    detail: str = ""
+
+
+class Health(BaseModel):
+    """Readiness, part by part."""
+
+    ok: bool
+    parts: dict[str, Part]
+
+
+class Histogram(BaseModel):
+    """Distribution of one metric over valid grasps."""
+
+    metric: str
+    count: int
+    mean: float
+    low: float
+    high: float
+    counts: list[int] = Field(description="equal bins from low to high")
+
+    @property
+    def bars(self) -> list[float]:
+        """Heights as shares of the highest bin."""
+        top = max(self.counts) or 1
+        return [count / top for count in self.counts]
+
+
+def stage_state(stage: StageProgress) -> State:
+    """State of a stage, from the states of its tasks."""
+    if stage.succeeded == stage.tasks:
+        return State.SUCCEEDED
+    if stage.running:
+        return State.RUNNING
+    if stage.failed:
+        return State.FAILED
+    if stage.cancelled:
+        return State.CANCELLED
+    return State.RUNNING if stage.succeeded else State.QUEUED
+
+
+STAGE_LABELS: dict[Stage, str] = {
+    Stage.SYNTHESIZE: "Synthesize",
+    Stage.SCENE: "Scene",
+    Stage.RENDER: "Render",
+    Stage.INGEST: "Check",
+}

@@ -1,0 +1,228 @@
+"""Every error as `application/problem+json` (RFC 9457): domain errors by their slug, HTTP errors by their status."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException
+
+from service.errors import (
+    BusyError,
+    ConflictError,
+    GraspdError,
+    HandError,
+    IndexUnavailable,
+    InputError,
+    LimitError,
+    MeshError,
+    NotFoundError,
+    QueueUnavailable,
+    StoreUnavailable,
+    TaskCancelled,
+    TaskError,
+    TaskRefused,
+    UnavailableError,
+)
+
+MEDIA_TYPE: Final = "application/problem+json"
+RETRY_AFTER_S: Final = 2
+
+_log = logging.getLogger("graspd.api")
+
+#: Domain errors by problem type, for the client and the reference page.
+ERRORS: Final[dict[str, type[GraspdError]]] = {
+    error.slug: error
+    for error in (
+        InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, UnavailableError, QueueUnavailable,
+        StoreUnavailable, IndexUnavailable, BusyError, TaskError, TaskCancelled, TaskRefused, GraspdError,
+    )
+}  # fmt: skip
+
+#: Problem types of answers that HTTP itself defines.
+HTTP_SLUGS: Final[dict[int, str]] = {
+    400: "bad-request",
+    401: "unauthorized",
+    403: "forbidden",
+    404: "not-found",
+    405: "method-not-allowed",
+    406: "not-acceptable",
+    411: "length-required",
+    413: "too-large",
+    415: "unsupported-media-type",
+    416: "range-not-satisfiable",
+    421: "misdirected-request",
+    422: "invalid-input",
+    429: "too-many-requests",
+}
+
+
+class FieldError(BaseModel):
+    """One mistake in a request."""
+
+    pointer: str = Field(description="JSON pointer into the body, or the name of the parameter")
+    detail: str
+    type: str = Field(description="machine name of the rule that was broken")
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem details."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = Field(description="URI reference of the problem type; opens its description")
+    title: str
+    status: int
+    detail: str = Field(description="what is wrong and the mend, in one line")
+    instance: str = Field(description="path of the request")
+    request_id: str | None = Field(None, description="the same as in header X-Request-Id and in the log")
+    errors: list[FieldError] | None = None
+
+
+class ApiError(Exception):
+    """An HTTP answer that is no domain error: authentication, limits, a browser's foreign form."""
+
+    def __init__(self, status: int, detail: str, *, headers: dict[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.headers = headers or {}
+
+
+def problem_response(
+    request_path: str,
+    request_id: str | None,
+    *,
+    slug: str,
+    title: str,
+    status: int,
+    detail: str,
+    errors: list[FieldError] | None = None,
+    headers: dict[str, str] | None = None,
+) -> JSONResponse:
+    """The answer to a request that failed."""
+    problem = Problem(
+        type=f"/problems/{slug}",
+        title=title,
+        status=status,
+        detail=detail,
+        instance=request_path,
+        request_id=request_id,
+        errors=errors,
+    )
+    headers = dict(headers or {})
+    if status in (429, 503):
+        headers.setdefault("Retry-After", str(RETRY_AFTER_S))
+    return JSONResponse(
+        problem.model_dump(exclude_none=True), status_code=status, media_type=MEDIA_TYPE, headers=headers
+    )
+
+
+def describe(error: Exception) -> tuple[str, str, int, str]:
+    """(slug, title, status, detail) of an exception; an unforeseen one tells nothing of its inside."""
+    if isinstance(error, GraspdError):
+        return error.slug, error.title, error.status, str(error) or error.title
+    if isinstance(error, ApiError):
+        return HTTP_SLUGS.get(error.status, "internal"), HTTPStatus(error.status).phrase, error.status, str(error)
+    if isinstance(error, HTTPException):
+        phrase = HTTPStatus(error.status_code).phrase
+        return HTTP_SLUGS.get(error.status_code, "internal"), phrase, error.status_code, str(error.detail)
+    detail = "an unforeseen error; the log names it under this request id"
+    return GraspdError.slug, GraspdError.title, GraspdError.status, detail
+
+
+def answer(request: Request, error: Exception) -> JSONResponse:
+    """Problem document of any exception."""
+    slug, title, status, detail = describe(error)
+    if isinstance(error, HTTPException) and status == 404:
+        detail = f"there is no {request.url.path}"
+    if isinstance(error, HTTPException) and status == 405:
+        detail = f"{request.method} is not possible on {request.url.path}"
+    headers = dict(getattr(error, "headers", None) or {})
+    return problem_response(
+        request.url.path, request_id_of(request), slug=slug, title=title, status=status, detail=detail, headers=headers
+    )
+
+
+def validation_answer(request: Request, error: RequestValidationError) -> JSONResponse:
+    """Problem document that names every field in error."""
+    errors = [_field_error(entry) for entry in error.errors()]
+    is_syntax = any(entry.type == "json_invalid" for entry in errors)
+    first = errors[0]
+    where = first.pointer.lstrip("#/").replace("/", ".") or "body"
+    detail = f"the body is not JSON: {first.detail}" if is_syntax else f"{where}: {first.detail}"
+    return problem_response(
+        request.url.path,
+        request_id_of(request),
+        slug="bad-request" if is_syntax else InputError.slug,
+        title="The body cannot be read" if is_syntax else InputError.title,
+        status=400 if is_syntax else InputError.status,
+        detail=detail,
+        errors=errors,
+    )
+
+
+def _field_error(entry: dict[str, Any]) -> FieldError:
+    place, *path = entry["loc"]
+    tokens = [str(token).replace("~", "~0").replace("/", "~1") for token in path]
+    message = str(entry["msg"]).removeprefix("Value error, ")
+    if entry["type"] == "json_invalid":
+        message = str(entry.get("ctx", {}).get("error", message))
+        tokens = []
+    pointer = "#/" + "/".join(tokens) if place == "body" else ".".join(tokens)
+    return FieldError(pointer=pointer if tokens else "#", detail=message, type=str(entry["type"]))
+
+
+def request_id_of(request: Request) -> str | None:
+    """The request id that the outermost middleware gave."""
+    return request.scope.get("state", {}).get("request_id")
+
+
+def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response] | None = None) -> None:
+    """Answer every exception of the application with a problem document.
+
+    Args:
+        page: makes a page of the problem, for addresses of the dashboard opened in a browser.
+    """
+
+    async def any_error(request: Request, error: Exception) -> Response:
+        if page is not None and _is_page(request):
+            slug, title, status, detail = describe(error)
+            facts = {"type": slug, "title": title, "status": status, "detail": detail}
+            return page(request, facts | {"request_id": request_id_of(request)})
+        return answer(request, error)
+
+    async def bad_request(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, RequestValidationError)
+        return validation_answer(request, error)
+
+    app.add_exception_handler(GraspdError, any_error)
+    app.add_exception_handler(ApiError, any_error)
+    app.add_exception_handler(HTTPException, any_error)
+    app.add_exception_handler(RequestValidationError, bad_request)
+
+
+def _is_page(request: Request) -> bool:
+    is_api = request.url.path.startswith(("/v1/", "/healthz", "/readyz", "/metrics", "/openapi.json"))
+    return not is_api and "text/html" in request.headers.get("accept", "")
+
+
+def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = None) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries of the problem answers a route may give, beside its `others`."""
+    return (others or {}) | {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+        for status in statuses
+    }
+
+
+def log_unforeseen(path: str, request_id: str, error: Exception) -> None:
+    """Keep the stack trace where the operator finds it."""
+    _log.error("request %s on %s failed", request_id, path, exc_info=error)

@@ -1,0 +1,72 @@
+"""`/v1/hands` and `/v1/objects`: what can be grasped, and with what."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
+from starlette.datastructures import UploadFile as AnyUpload
+
+from api.catalog import Catalog
+from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.paging import link_next
+from api.problems import responses
+from api.uploads import files_of_upload, name_of_upload
+from service.domain import AssetKind, Name
+from service.errors import LimitError
+from service.index.views import AssetView, Page
+
+
+def asset_router(kind: AssetKind) -> APIRouter:
+    """The routes of one kind of asset."""
+    router = APIRouter(prefix=f"/v1/{kind.value}s", tags=[f"{kind.value}s"])
+
+    @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503), name=f"list_{kind}s")
+    def list_assets(
+        request: Request, response: Response, catalog: CatalogOf, limit: Limit = 50, cursor: Cursor = None
+    ) -> Page[AssetView]:
+        """All of them, by name."""
+        page = catalog.assets(kind, limit=limit, cursor=cursor)
+        link_next(request, response, page.next)
+        return page
+
+    @router.get(
+        "/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503), name=f"get_{kind}"
+    )
+    def get_asset(name: str, catalog: CatalogOf) -> AssetView:
+        """One of them, with what the check found."""
+        return catalog.asset(kind, name)
+
+    @router.post(
+        "",
+        status_code=202,
+        dependencies=[Depends(may_submit)],
+        responses=responses(400, 401, 403, 409, 413, 422, 503),
+        name=f"add_{kind}",
+    )
+    def add_asset(
+        file: UploadFile,
+        response: Response,
+        request: Request,
+        catalog: CatalogOf,
+        name: Annotated[Name | None, Form()] = None,
+    ) -> AssetView:
+        """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
+        asset = store_upload(catalog, kind, file, name, limit_bytes=request.app.state.settings.max_upload_bytes)
+        response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
+        response.headers["Retry-After"] = "1"
+        return asset
+
+    return router
+
+
+def store_upload(
+    catalog: Catalog, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int
+) -> AssetView:
+    """Take an upload whole: an asset of immutable bytes, and the task that checks it."""
+    data = file.file.read(limit_bytes + 1)
+    if len(data) > limit_bytes:
+        raise LimitError(f"{file.filename} is larger than {limit_bytes} bytes; simplify it or raise the limit")
+    filename = file.filename or ""
+    files = files_of_upload(kind, filename, data, limit_bytes=limit_bytes)
+    return catalog.add_asset(kind, name or name_of_upload(filename), files)

@@ -1,0 +1,30 @@
+"""`/v1/grasps`: the index of every grasp."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+
+from api.dependencies import CatalogOf, Cursor, Limit, may_read
+from api.models import GraspQuery
+from api.paging import link_next
+from api.problems import responses
+from service.index.views import GraspView, Page
+
+router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
+
+
+@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+def list_grasps(
+    request: Request,
+    response: Response,
+    catalog: CatalogOf,
+    query: Annotated[GraspQuery, Query()],
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[GraspView]:
+    """Grasps that pass every filter, in the order asked for."""
+    page = catalog.grasps(query, limit=limit, cursor=cursor)
+    link_next(request, response, page.next)
+    return page

@@ -1,0 +1,107 @@
+"""`/v1/jobs`: submit, list, watch, cancel, retry."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterable
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from api import events
+from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.models import Job, JobDetail
+from api.paging import link_next
+from api.problems import responses
+from service.domain import JobRequest, State
+from service.index.views import Page
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(max_length=255, description="the same key with another body is refused; the same request is the same job"),
+]
+
+
+@router.post(
+    "",
+    status_code=202,
+    dependencies=[Depends(may_submit)],
+    responses=responses(
+        400,
+        401,
+        403,
+        404,
+        409,
+        413,
+        422,
+        503,
+        others={200: {"model": JobDetail, "description": "It has ended"}},
+    ),
+)
+def submit(
+    body: JobRequest, response: Response, catalog: CatalogOf, idempotency_key: IdempotencyKey = None
+) -> JobDetail:
+    """Submit a job. The same content is the same job: its id follows from the request, the hand and the object."""
+    job = catalog.submit(body, idempotency_key=idempotency_key)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    if job.state.is_final:
+        response.status_code = 200
+    else:
+        response.headers["Retry-After"] = "1"
+    return job
+
+
+@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
+def list_jobs(
+    request: Request,
+    response: Response,
+    catalog: CatalogOf,
+    state: State | None = None,
+    hand: Annotated[str | None, Query(max_length=64)] = None,
+    object: Annotated[str | None, Query(max_length=64)] = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[Job]:
+    """Jobs, the newest first."""
+    page = catalog.jobs(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
+    link_next(request, response, page.next)
+    return page
+
+
+@router.get("/{job_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+def get_job(job_id: str, catalog: CatalogOf) -> JobDetail:
+    """A job with the progress of its stages, failed attempts, mean metrics and shards."""
+    return catalog.job(job_id)
+
+
+@router.post(
+    "/{job_id}/cancel",
+    status_code=202,
+    dependencies=[Depends(may_submit)],
+    responses=responses(401, 403, 404, 409, 503),
+)
+def cancel(job_id: str, catalog: CatalogOf) -> JobDetail:
+    """Stop a job's waiting and running tasks; what is written stays."""
+    return catalog.cancel(job_id)
+
+
+@router.post(
+    "/{job_id}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
+)
+def retry(job_id: str, catalog: CatalogOf) -> JobDetail:
+    """Run again what failed or was cancelled; what is written is not made twice."""
+    return catalog.retry(job_id)
+
+
+@router.get(
+    "/{job_id}/events",
+    dependencies=[Depends(may_read)],
+    response_class=EventSourceResponse,
+    responses=responses(401, 403, 404, 503),
+)
+async def watch(job_id: str, request: Request, catalog: CatalogOf) -> AsyncIterable[ServerSentEvent]:
+    """Progress of a job: `progress` with the job at each change, `end` with its last state."""
+    async for event in events.job_events(catalog, job_id, request):
+        yield event

@@ -1,0 +1,102 @@
+"""`/v1/shards`: the HDF5 files, with byte ranges."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.responses import RedirectResponse, StreamingResponse
+
+from api.dependencies import CatalogOf, Cursor, Limit, may_read
+from api.models import Shard
+from api.paging import link_next
+from api.problems import ApiError, responses
+from service.index.views import Page
+
+router = APIRouter(prefix="/v1/shards", tags=["shards"])
+
+_MEDIA_TYPE = "application/x-hdf5"
+_RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+
+
+@router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+def list_shards(
+    request: Request,
+    response: Response,
+    catalog: CatalogOf,
+    job: Annotated[str | None, Query(max_length=64)] = None,
+    kind: Literal["base", "scene", "views"] | None = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+) -> Page[Shard]:
+    """Shards, all or those of a job."""
+    page = catalog.shards(job=job, kind=kind, limit=limit, cursor=cursor)
+    link_next(request, response, page.next)
+    return page
+
+
+@router.get("/{shard_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
+def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
+    """A shard with its whole manifest."""
+    return catalog.shard(shard_id)
+
+
+@router.get(
+    "/{shard_id}/file",
+    dependencies=[Depends(may_read)],
+    response_class=StreamingResponse,
+    responses=responses(
+        401,
+        403,
+        404,
+        416,
+        503,
+        others={
+            200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
+            206: {"content": {_MEDIA_TYPE: {}}, "description": "The bytes asked for"},
+            307: {"description": "The store hands the file out itself, under a signed address"},
+        },
+    ),
+)
+def get_file(shard_id: str, request: Request, catalog: CatalogOf) -> Response:
+    """The HDF5 file: from the store itself where it signs addresses, else through the API, by Range if asked."""
+    shard = catalog.shard(shard_id)
+    if (address := catalog.store.sign(shard.key)) is not None:
+        return RedirectResponse(address, status_code=307)
+    size = catalog.store.size(shard.key)
+    span = parse_range(request.headers.get("range"), size)
+    start, end = span or (0, size)
+    headers = {
+        "Accept-Ranges": "bytes",
+        "Content-Length": str(end - start),
+        "Content-Disposition": f'attachment; filename="{shard.kind}-{shard_id}.h5"',
+        "ETag": f'"{shard.sha256}"',
+        # The name says the content: what was fetched once never changes.
+        "Cache-Control": "private, max-age=31536000, immutable",
+    }
+    if span is not None:
+        headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+    chunks: Iterator[bytes] = catalog.store.stream(shard.key, start, end - start)
+    status = 200 if span is None else 206
+    return StreamingResponse(chunks, status_code=status, media_type=_MEDIA_TYPE, headers=headers)
+
+
+def parse_range(header: str | None, size: int) -> tuple[int, int] | None:
+    """(start, end) of a single byte range; None where the whole file is to be sent (RFC 9110 §14.2).
+
+    Raises:
+        ApiError: 416, the range lies behind the end of the file.
+    """
+    match = _RANGE.fullmatch(header.strip()) if header else None
+    if match is None or match.groups() == ("", ""):
+        return None
+    first, last = match.groups()
+    if not first:
+        start, end = max(0, size - int(last)), size
+    else:
+        start, end = int(first), min(size, int(last) + 1) if last else size
+    if start >= size or end <= start:
+        raise ApiError(416, f"the file has {size} bytes", headers={"Content-Range": f"bytes */{size}"})
+    return start, end

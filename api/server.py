@@ -1,0 +1,64 @@
+"""Runs the application: one uvicorn in this process, on a socket that was bound before anything else was done."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import socket
+import sys
+
+import uvicorn
+
+from api.app import create_app
+from service.errors import BusyError, InputError
+from service.settings import Settings
+
+#: Open event streams end with their clients; a stop does not wait longer than this.
+_GRACE_S = 3
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        BusyError: the port is taken.
+        InputError: the address is none of this machine, or the port needs other rights.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(socket.SOMAXCONN)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise BusyError(f"port {port} on {host} is taken; stop what uses it, or choose another: --port 0") from None
+        raise InputError(f"{host}:{port} cannot be bound: {error.strerror or error}") from None
+    return listener
+
+
+def serve(settings: Settings) -> None:
+    """Answer requests until SIGINT or SIGTERM.
+
+    Raises:
+        BusyError: the port is taken.
+        InputError: strangers could reach the service without a key.
+        StoreUnavailable, IndexUnavailable: where they cannot be opened.
+    """
+    listener = bind(settings.host, settings.port)
+    with listener:
+        logging.basicConfig(level=settings.log_level, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+        app = create_app(settings)
+        host, port = listener.getsockname()[:2]
+        shown = f"[{host}]" if ":" in host else host
+        print(f"graspd answers at http://{shown}:{port}", file=sys.stderr, flush=True)  # noqa: T201
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            timeout_graceful_shutdown=_GRACE_S,
+            server_header=False,
+            log_level=settings.log_level.lower(),
+        )
+        uvicorn.Server(config).run(sockets=[listener])

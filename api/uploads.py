@@ -1,0 +1,69 @@
+"""What a stranger uploads as a hand or an object: one file or a ZIP of a folder, turned into the files of an asset."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import PurePosixPath
+from typing import Final
+
+from service.assets import check_path, unpack
+from service.domain import AssetKind
+from service.errors import InputError
+
+MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
+    AssetKind.HAND: (".urdf", ".xml"),
+    AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off"),
+}
+#: A small archive may unpack to much more: robot meshes compress about four to one, so this refuses only bombs.
+UNPACK_FACTOR: Final = 8
+_NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+def files_of_upload(kind: AssetKind, filename: str, data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
+    """Files of an asset, `asset.json` among them, from an uploaded file or ZIP.
+
+    Raises:
+        InputError: empty, an unknown suffix, or a ZIP in which the main file cannot be told.
+        LimitError: the ZIP unpacks to more than `UNPACK_FACTOR` times the limit, or holds too many files.
+    """
+    leaf = PurePosixPath(filename.replace("\\", "/")).name
+    if not leaf or not data:
+        raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
+    if PurePosixPath(leaf).suffix.lower() == ".zip":
+        files = _without_common_folder(unpack(data, limit_bytes=limit_bytes * UNPACK_FACTOR))
+    else:
+        files = {check_path(leaf): data}
+    if "asset.json" not in files:
+        files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
+    return files
+
+
+def name_of_upload(filename: str) -> str:
+    """A name a user may give, made of a file's name: `My mug (2).stl` is `My-mug-2`."""
+    stem = PurePosixPath(filename.replace("\\", "/")).stem
+    return _NAME.sub("-", stem).strip("-._")[:64] or "unnamed"
+
+
+def _main_file(kind: AssetKind, upload: str, files: dict[str, bytes]) -> str:
+    suffixes = MAIN_SUFFIXES[kind]
+    found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in suffixes]
+    if kind is AssetKind.HAND and any(name.lower().endswith(".urdf") for name in found):
+        found = [name for name in found if name.lower().endswith(".urdf")]
+    known = ", ".join(suffixes)
+    if not found:
+        raise InputError(f"{upload} holds no {kind.value} file; one of {known} is needed, or a ZIP of its folder")
+    if len(found) > 1:
+        names = ", ".join(found[:5])
+        raise InputError(
+            f'{upload} holds several {kind.value} files ({names}); add an asset.json that says {{"file": ...}}'
+        )
+    return found[0]
+
+
+def _without_common_folder(files: dict[str, bytes]) -> dict[str, bytes]:
+    """A folder zipped whole has its own name before every file: take it off."""
+    tops = {name.partition("/")[0] for name in files}
+    if len(tops) != 1 or any("/" not in name for name in files):
+        return files
+    return {name.partition("/")[2]: data for name, data in files.items()}

@@ -1,0 +1,44 @@
+"""The application over a file store, an SQLite index and the queue's twin; no network, no Redis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from api.app import create_app
+from service.index.index import Index
+from service.parts import Parts
+from service.queue.memory import MemoryQueue
+from service.settings import Settings
+from service.store import open_store
+from tests.api.factories import add_builtins
+
+BASE_URL = "http://127.0.0.1:8000"
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings(data_dir=tmp_path / "data")
+
+
+@pytest.fixture
+def parts(settings: Settings) -> Iterator[Parts]:
+    opened = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
+    add_builtins(opened)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def app(settings: Settings, parts: Parts) -> FastAPI:
+    return create_app(settings, parts)
+
+
+@pytest.fixture
+def http(app: FastAPI) -> Iterator[TestClient]:
+    with TestClient(app, base_url=BASE_URL, raise_server_exceptions=False) as client:
+        yield client

@@ -1,0 +1,151 @@
+"""Jobs in any state, made as the pipeline and the workers make them: records in the store, rows in the index."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service import names
+from service.clock import timestamp
+from service.digests import job_id
+from service.domain import AssetKind, JobRequest, Lane, Stage
+from service.library import publish_builtins
+from service.manifests import ShardManifest, manifest_of, publish_shard
+from service.parts import Parts
+from service.planning import PlannedTask, message_of, plan
+from service.queue.port import WorkerBeat
+from service.records import AttemptRecord, JobRecord, put_record
+from service.shards import check_columns, write_shard
+
+JOINTS = 16
+Arrays = dict[str, NDArray[np.generic]]
+
+
+def add_builtins(parts: Parts) -> None:
+    """The built-in hands and objects, as `graspd up` publishes them."""
+    for asset in publish_builtins(parts.store):
+        parts.index.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
+
+
+def add_job(parts: Parts, **fields: object) -> JobRecord:
+    """A job that waits."""
+    request = JobRequest.model_validate({"hand": "allegro", "object": "mug", "grasps": 32} | fields)
+    hand = parts.index.asset(AssetKind.HAND, request.hand).digest
+    object_ = parts.index.asset(AssetKind.OBJECT, request.object).digest
+    record = JobRecord(
+        id=job_id(request, hand, object_),
+        request=request,
+        hand_digest=hand,
+        object_digest=object_,
+        lane=Lane.INTERACTIVE,
+        created=timestamp(),
+    )
+    put_record(parts.store, names.job_record(record.id), record)
+    parts.index.add_job(record)
+    return record
+
+
+def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
+    """A task's shard, with columns of the right shapes and random values, as a worker publishes it."""
+    random = np.random.default_rng(task.batch)
+    kind = names.SHARD_KINDS[task.stage]
+    arrays = _ARRAYS[task.stage](random, task.count, record.request)
+    attributes = {"hand": record.request.hand, "object": record.request.object}
+    if task.stage is Stage.SYNTHESIZE:
+        attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
+    data = write_shard(kind, arrays, attributes)
+    message = message_of(record, task, attempt=1, max_attempt=3)
+    manifest = manifest_of(
+        message, data, arrays, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
+    )
+    publish_shard(parts.store, manifest, data)
+    parts.index.add_manifest(manifest)
+    return manifest
+
+
+def finish_all(parts: Parts, record: JobRecord) -> list[ShardManifest]:
+    """Every task of a job, done."""
+    return [finish(parts, record, task) for task in plan(record)]
+
+
+def fail(parts: Parts, record: JobRecord, reason: str) -> None:
+    """The first task of a job, failed for the last time."""
+    task = next(plan(record))
+    now = timestamp()
+    attempt = AttemptRecord(
+        task_id=task.id, job_id=record.id, stage=task.stage, number=1, kind="MeshError", reason=reason,
+        trace=None, worker="worker-1", started=now, ended=now, last=True,
+    )  # fmt: skip
+    put_record(parts.store, names.attempt(task.id, 1), attempt)
+    parts.index.add_attempt(attempt)
+
+
+def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> None:
+    """A worker that lives."""
+    now = timestamp()
+    beat = WorkerBeat(
+        name=name, host="here", pid=1, device="cpu", device_name="x86_64, 2 cores", stages=tuple(Stage),
+        version="0.1.0", state=state, task_id="", started=now, seen=now,
+    )  # fmt: skip
+    parts.index.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
+
+
+def _poses(random: np.random.Generator, count: int) -> NDArray[np.float64]:
+    quaternions = random.normal(size=(count, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.concatenate([random.normal(0, 0.1, (count, 3)), quaternions], axis=1)
+
+
+def _base(random: np.random.Generator, count: int, request: JobRequest) -> Arrays:
+    thresholds = np.array([0.001, 0.005])
+    arrays: Arrays = {"quality/thresholds_m": thresholds}
+    for posture in ("grasp", "pregrasp", "squeeze"):
+        arrays[f"{posture}/hand_pose"] = _poses(random, count)
+        arrays[f"{posture}/joint_positions"] = random.normal(0.6, 0.3, (count, JOINTS))
+    for name, scale in (("contact_area_cm2", 9.0), ("epsilon", 0.25), ("wrench_volume", 0.8)):
+        arrays[f"quality/{name}"] = random.gamma(4.0, scale / 4, (count, len(thresholds)))
+    for name, scale in (
+        ("intersection_volume_cm3", 0.3), ("penetration_depth_mm", 0.8), ("self_penetration_depth_mm", 0.1),
+        ("stability_loss", 0.05),
+    ):  # fmt: skip
+        arrays[f"quality/{name}"] = random.gamma(2.0, scale / 2, count)
+    arrays["quality/contact_links"] = random.integers(2, 9, count).astype(np.int32)
+    arrays["quality/valid"] = (random.random(count) < 0.8).astype(np.uint8)
+    return arrays
+
+
+def _scene(random: np.random.Generator, count: int, request: JobRequest) -> Arrays:
+    scenes, rows = request.scenes, count * request.scenes
+    return {
+        "scene/object_pose": _poses(random, scenes),
+        "scene/rest_probability": np.full(scenes, 1 / scenes),
+        "scene/drop_seconds": np.full(scenes, 0.8),
+        "grasp/base_index": np.tile(np.arange(count, dtype=np.int32), scenes),
+        "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), count),
+        "grasp/hand_pose": _poses(random, rows),
+        "grasp/table_clearance_m": random.normal(0.01, 0.01, rows),
+        "grasp/valid": (random.random(rows) < 0.5).astype(np.uint8),
+    }
+
+
+def _views(random: np.random.Generator, count: int, request: JobRequest) -> Arrays:
+    eyes = 2 if request.stereo else 1
+    views = request.scenes * request.views * eyes
+    height, width = request.height, request.width
+    shade = np.linspace(40, 220, width, dtype=np.uint8)
+    return {
+        "camera/intrinsics": np.tile(np.eye(3), (views, 1, 1)),
+        "camera/extrinsics": np.tile(np.eye(4), (views, 1, 1)),
+        "camera/scene_index": np.zeros(views, np.int32),
+        "camera/eye": np.resize(np.array([1, 2] if request.stereo else [0], np.uint8), views),
+        "camera/stereo_baseline_m": np.full(views, 0.06),
+        "image/rgb": np.broadcast_to(shade[None, None, :, None], (views, height, width, 3)).copy(),
+        "image/depth": np.ones((views, height, width), np.float32),
+        "image/segmentation": np.ones((views, height, width), np.uint8),
+        "box/bounding_box_2d_tight": np.zeros((views, 4), np.float32),
+        "box/bounding_box_2d_loose": np.zeros((views, 4), np.float32),
+        "box/bounding_box_3d": np.zeros((views, 8, 3), np.float32),
+    }
+
+
+_ARRAYS = {Stage.SYNTHESIZE: _base, Stage.SCENE: _scene, Stage.RENDER: _views}
