@@ -37,9 +37,9 @@ _FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
 _HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
 _PALM: Final = Look(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
 _TIP: Final = Look(hexadecimal("#2fa7a0"), roughness=0.38)
-_OBJECT: Final = Look(hexadecimal("#e0813f"), roughness=0.5)
+_OBJECT: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
 _STUDIO: Final = Lamp(
-    key=(2.1, 2.04, 1.94), sky=(0.8, 0.83, 0.88), ground=(0.3, 0.29, 0.28),
+    key=(1.85, 1.8, 1.7), sky=(0.76, 0.79, 0.84), ground=(0.3, 0.29, 0.28),
     backdrop_low=(1.15, 1.17, 1.19), backdrop_high=(1.4, 1.42, 1.44),
 )  # fmt: skip
 

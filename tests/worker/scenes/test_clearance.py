@@ -1,0 +1,111 @@
+"""Grasps moved onto a table: poses, clearances, the way in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.errors import InputError
+from tests.worker.models import two_finger_hand
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.scenes import transfer
+from worker.scenes.clearance import MARGIN_M, approach
+from worker.transforms import apply, compose, invert, quat_from_axis_angle
+
+HAND = two_finger_hand()
+#: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.
+TESSELLATION_M = 6e-5
+IDENTITY = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+
+
+def postures(rng: np.random.Generator, count: int) -> Posture:
+    quaternion = rng.normal(size=(count, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    return Posture(
+        np.concatenate([rng.uniform(-0.1, 0.3, (count, 3)), quaternion], 1), rng.uniform(-0.3, 1, (count, 2))
+    )
+
+
+def lowest_vertex(posture: Posture, object_pose: np.ndarray) -> np.ndarray:
+    """Lowest corner of all tessellated pieces in the table frame, by brute force."""
+    bodies = compose(object_pose, body_poses(HAND, posture.hand_pose, posture.joint_positions))
+    return np.min([apply(bodies[:, p.body][:, None], p.vertices)[..., 2].min(axis=1) for p in HAND.pieces], axis=0)
+
+
+def test_clearance_agrees_with_all_corners_of_all_pieces_on_the_way():
+    rng = np.random.default_rng(0)
+    grasp, pregrasp = postures(rng, 5), postures(rng, 5)
+    scenes = postures(rng, 3).hand_pose
+    found = transfer(HAND, grasp, pregrasp, scenes)["grasp/table_clearance_m"].reshape(3, 5)
+    path = approach(grasp, pregrasp)
+    expected = np.array([lowest_vertex(path, scene).reshape(5, -1).min(axis=1) for scene in scenes])
+    assert np.all(found <= expected + 1e-12)
+    np.testing.assert_allclose(found, expected, atol=TESSELLATION_M)
+
+
+def test_transferred_poses_are_the_base_poses_seen_from_the_table():
+    rng = np.random.default_rng(1)
+    grasp, scenes = postures(rng, 4), postures(rng, 2).hand_pose
+    result = transfer(HAND, grasp, grasp, scenes)
+    assert result["grasp/scene_index"].tolist() == [0] * 4 + [1] * 4
+    assert result["grasp/base_index"].tolist() == [0, 1, 2, 3] * 2
+    back = compose(invert(scenes[result["grasp/scene_index"]]), result["grasp/hand_pose"])
+    points = rng.normal(size=(8, 3))
+    np.testing.assert_allclose(
+        apply(back, points), apply(grasp.hand_pose[result["grasp/base_index"]], points), atol=1e-12
+    )
+
+
+def test_a_hand_pointing_down_clears_the_table_by_its_fingertips():
+    # Palm looks down from 0.2 m: the tips' spheres end 0.068 + 0.011 below the root.
+    down = np.concatenate([[0, 0, 0.2], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])[None]
+    posture = Posture(down, np.zeros((1, 2)))
+    result = transfer(HAND, posture, posture, IDENTITY)
+    assert result["grasp/table_clearance_m"][0] == pytest.approx(0.2 - 0.079, abs=1e-12)
+
+
+@pytest.mark.parametrize(("gap", "valid"), [(MARGIN_M + 1e-6, 1), (MARGIN_M - 1e-6, 0)])
+def test_a_grasp_is_valid_from_the_stated_margin_on(gap, valid):
+    # Palm up: the lowest point is the bottom of the palm box, 0.03 below the root.
+    posture = Posture(np.array([[0, 0, 0.03 + gap, 1, 0, 0, 0]]), np.zeros((1, 2)))
+    assert transfer(HAND, posture, posture, IDENTITY)["grasp/valid"].tolist() == [valid]
+
+
+def test_a_hand_that_sweeps_through_the_table_between_its_two_postures_is_caught():
+    """Fingers point sideways at both ends and straight down half-way."""
+    y = np.array([0.0, 1, 0])
+    start, end = (np.concatenate([[0, 0, 0.075], quat_from_axis_angle(y, np.asarray(np.pi + a))]) for a in (-1.4, 1.4))
+    pregrasp, grasp = Posture(start[None], np.zeros((1, 2))), Posture(end[None], np.zeros((1, 2)))
+    at_ends = min(lowest_vertex(p, IDENTITY[0])[0] for p in (pregrasp, grasp))
+    result = transfer(HAND, grasp, pregrasp, IDENTITY)
+    assert at_ends > MARGIN_M
+    # Pointing straight down the tips reach 0.079 below the root.
+    assert result["grasp/table_clearance_m"][0] <= 0.075 - 0.079
+    assert result["grasp/valid"][0] == 0
+
+
+def test_many_grasps_give_what_each_gives_alone():
+    rng = np.random.default_rng(2)
+    grasp, scenes = postures(rng, 130), postures(rng, 1).hand_pose
+    together = transfer(HAND, grasp, grasp, scenes)["grasp/table_clearance_m"]
+    alone = [
+        transfer(HAND, *[Posture(grasp.hand_pose[[k]], grasp.joint_positions[[k]])] * 2, scenes)[
+            "grasp/table_clearance_m"
+        ][0]
+        for k in (0, 64, 129)
+    ]
+    np.testing.assert_allclose(together[[0, 64, 129]], alone, atol=1e-12)
+
+
+def test_no_grasps_give_empty_arrays():
+    none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
+    result = transfer(HAND, none, none, IDENTITY)
+    assert result["grasp/hand_pose"].shape == (0, 7)
+    assert result["grasp/valid"].shape == (0,)
+
+
+def test_grasps_without_their_pregrasps_are_refused():
+    rng = np.random.default_rng(3)
+    with pytest.raises(InputError, match="2 grasps come with 1 pregrasps"):
+        transfer(HAND, postures(rng, 2), postures(rng, 1), IDENTITY)
