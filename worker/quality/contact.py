@@ -33,21 +33,21 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
 
 
 def choose_contacts(
-    distance: Floats, place: Floats, normal: Floats, threshold: float, *, scale: float
+    near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> NDArray[np.intp]:
-    """At most `MAX_CONTACTS` indices of points within `threshold`, spread as widely as can be.
+    """At most `limit` indices of the points that are near, spread as widely as can be.
 
     Args:
-        distance: (N,) signed distances [m].
+        near: (N,) points to choose from.
         place: (N, 3) contact points [m].
         normal: (N, 3) unit normals; two contacts count as apart by place over `scale` and by direction.
-        threshold: [m]
         scale: length to weigh places against directions: the torque scale [m].
+        limit: most contacts wanted.
     """
-    near = np.flatnonzero((np.abs(distance) < threshold) & ((normal**2).sum(axis=1) > 0.5))
-    if len(near) <= MAX_CONTACTS:
-        return near
-    return near[farthest_points(np.hstack([place[near] / scale, normal[near]]), MAX_CONTACTS)]
+    index = np.flatnonzero(near)
+    if len(index) <= limit:
+        return index
+    return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
 
 
 def contact_links(body_distance: Floats) -> NDArray[np.int32]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -29,6 +31,8 @@ OBJECT_POINTS: Final = 3000
 SEED: Final = 7919
 #: Distances beyond this are reported as this [m].
 REACH_M: Final = 0.012
+#: Hand and object normals of a contact are opposite to within 60 degrees.
+FACING_COS: Final = -0.5
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,14 @@ class Distances:
     """(B, L, 7) poses of the bodies."""
     hand_points: Floats
     """(B, N, 3)"""
+    hand_normals: Floats
+    """(B, N, 3) outward unit normals of the hand at its points."""
     distance: Floats
     """(B, N) signed distance of hand points to the object, at most `REACH_M`."""
     closest: Floats
     """(B, N, 3) closest points on the object."""
     normal: Floats
-    """(B, N, 3) outward unit normals of the object there; 0 beyond reach."""
+    """(B, N, 3) gradient of the distance: the object's outward unit normal, seen from the point; 0 beyond reach."""
     piece_distance: Floats
     """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: the point is inside."""
     self_depth: Floats
@@ -118,10 +124,12 @@ class Probe:
 
     def posed_points(self, bodies: Floats) -> Floats:
         """(B, N, 3) hand points in the object frame for body poses (B, L, 7)."""
-        body = self.points.body
+        return self._turned(bodies, self.points.position) + bodies[:, self.points.body, :3]
+
+    def _turned(self, bodies: Floats, vectors: Floats) -> Floats:
         rotation = quat_to_matrix(bodies[..., 3:])
-        turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], self.points.position)
-        return turned + bodies[:, body, :3]
+        turned: Floats = np.einsum("bnij,nj->bni", rotation[:, self.points.body], vectors)
+        return turned
 
     def measure(self, posture: Posture) -> Distances:
         """All distances of B postures."""
@@ -133,12 +141,19 @@ class Probe:
         return Distances(
             bodies=bodies,
             hand_points=points,
+            hand_normals=self._turned(bodies, self.points.normal),
             distance=distance.reshape(shape),
             closest=closest.reshape(*shape, 3),
             normal=normal.reshape(*shape, 3),
             piece_distance=pieces,
             self_depth=depth,
         )
+
+    def facing(self, found: Distances) -> NDArray[np.bool_]:
+        """(B, N) points whose hand surface looks at the object: only there can it press."""
+        cosine = np.einsum("bni,bni->bn", found.hand_normals, found.normal)
+        facing: NDArray[np.bool_] = cosine < FACING_COS
+        return facing
 
     def body_distance(self, found: Distances) -> Floats:
         """(B, L) least distance between each body and the object, from both sides' points [m]."""
@@ -176,3 +191,22 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
         return pose
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     return np.concatenate([middle, [1.0, 0, 0, 0]])
+
+
+_KEPT: Final = 8
+_probes: OrderedDict[tuple[str, str, int, int], Probe] = OrderedDict()
+_lock = threading.Lock()
+
+
+def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int) -> Probe:
+    """The probe of a pair, from memory where it was used lately."""
+    key = (hand.digest, obj.digest, hand_points, object_points)
+    with _lock:
+        probe = _probes.get(key)
+        if probe is None or probe.hand is not hand or probe.obj is not obj:
+            probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points)
+            _probes[key] = probe
+        _probes.move_to_end(key)
+        while len(_probes) > _KEPT:
+            _probes.popitem(last=False)
+        return probe

@@ -15,9 +15,9 @@ from service.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.quality.contact import choose_contacts, contact_area_cm2, contact_links
+from worker.quality.contact import MAX_CONTACTS, choose_contacts, contact_area_cm2, contact_links
 from worker.quality.penetration import penetration_depth
-from worker.quality.probe import REACH_M, Distances, Probe
+from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from worker.quality.volume import SharedVolume
 from worker.quality.wrench_space import Norm, measure_space, wrenches
 
@@ -106,7 +106,7 @@ class _Pair:
 
     def __init__(self, hand: HandModel, obj: ObjectModel, friction: float, thresholds: Floats, norm: Norm) -> None:
         self.obj, self.friction, self.thresholds, self.norm = obj, friction, thresholds, norm
-        self.probe = Probe(hand, obj)
+        self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
         self.volume = SharedVolume(hand, obj)
 
     def empty(self) -> dict[str, NDArray[np.generic]]:
@@ -133,11 +133,13 @@ class _Pair:
     def _spaces(self, found: Distances) -> tuple[Floats, Floats]:
         shape = (len(found.distance), len(self.thresholds))
         epsilon, volume = np.zeros(shape), np.zeros(shape)
+        facing = self.probe.facing(found)
         for b in range(shape[0]):
             place, normal = found.closest[b], found.normal[b]
             last: NDArray[np.intp] = np.zeros(0, np.intp)
             for t, threshold in enumerate(self.thresholds):
-                chosen = choose_contacts(found.distance[b], place, normal, threshold, scale=self.obj.radius)
+                near = facing[b] & (np.abs(found.distance[b]) < threshold)
+                chosen = choose_contacts(near, place, normal, scale=self.obj.radius, limit=MAX_CONTACTS)
                 if t and np.array_equal(chosen, last):
                     epsilon[b, t], volume[b, t] = epsilon[b, t - 1], volume[b, t - 1]
                 elif len(chosen):

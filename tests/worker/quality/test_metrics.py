@@ -14,7 +14,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, plate_hand, posture
 from worker.grasps import Posture
 from worker.hands.surface import sample_surface
-from worker.quality.contact import MAX_CONTACTS, choose_contacts, contact_distance_consistency_mm, finger_of_body
+from worker.quality.contact import choose_contacts, contact_distance_consistency_mm, finger_of_body
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, Probe
 from worker.quality.table import measure
@@ -156,8 +156,8 @@ def test_threshold_beyond_reach_is_refused() -> None:
 
 def test_no_more_contacts_than_the_limit_and_they_span_the_patch() -> None:
     place = np.stack(np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30), [0.0]), axis=-1).reshape(-1, 3)
-    chosen = choose_contacts(np.zeros(900), place, np.tile([0, 0, 1.0], (900, 1)), 0.001, scale=1.0)
-    assert len(chosen) == MAX_CONTACTS
+    chosen = choose_contacts(np.ones(900, bool), place, np.tile([0, 0, 1.0], (900, 1)), scale=1.0, limit=12)
+    assert len(chosen) == 12
     assert np.ptp(place[chosen], axis=0)[:2] == pytest.approx([1.0, 1.0])
 
 

@@ -11,6 +11,10 @@ from worker.simulation.kernels.pieces import Pieces, piece_distance
 wp.set_module_options({"enable_backward": False})
 
 
+#: Gap over which the normal turns from the surface's own to the direction of the closest point [m].
+BLEND = wp.constant(2.0e-4)
+
+
 @wp.kernel
 def mesh_distance(
     mesh_in: wp.uint64,
@@ -24,7 +28,7 @@ def mesh_distance(
     closest_out: wp.array(dtype=wp.vec3),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    """Signed distance, closest point and outward normal there (corner normals interpolated). Launch over points.
+    """Signed distance, closest point and the distance's gradient, an outward unit normal. Launch over points.
 
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
     The sign is ray parity, or the winding number where `winding` is 1 (open meshes): both are right near creases.
@@ -61,11 +65,17 @@ def mesh_distance(
         face = query.face
         distance_out[i] = sign * gap
         closest_out[i] = closest
-        normal_out[i] = wp.normalize(
+        smooth = wp.normalize(
             u * corner_normal_in[3 * face]
             + v * corner_normal_in[3 * face + 1]
             + (1.0 - u - v) * corner_normal_in[3 * face + 2]
         )
+        # Beside an edge the face's normal says nothing about how a body touches it; the direction to the edge does.
+        share = wp.min(gap / BLEND, 1.0)
+        direction = (1.0 - share) * smooth
+        if gap > 1.0e-9:
+            direction = direction + (share * sign / gap) * (p - closest)
+        normal_out[i] = wp.normalize(direction)
 
 
 @wp.kernel
