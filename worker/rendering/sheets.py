@@ -143,14 +143,16 @@ def _depth(views: Arrays, view: int) -> Image.Image:
 
 
 def _scale_bar(image: Image.Image, near: float, far: float) -> None:
-    bar, thick = max(40, image.width // 4), 6
-    x, y = image.width - bar - 10, image.height - 14
+    ramp, before, after, thick = 64, 34, 46, 6
+    if image.width < 2 * (before + ramp + after):
+        return
+    x, y = image.width - ramp - after, image.height - 13
     draw = ImageDraw.Draw(image)
-    draw.rectangle([x - 44, y - 7, x + bar + 8, y + thick + 7], fill=type_.PAPER)
-    ramp = type_.depth_colours(np.linspace(near, far, bar - 46, dtype=np.float32)[None].repeat(thick, 0), near, far)
-    image.paste(Image.fromarray(ramp), (x, y))
-    type_.text(draw, (x - 38, y + thick + 1), f"{near:.2f}", 11, type_.INK)
-    type_.text(draw, (x + bar - 40, y + thick + 1), f"{far:.2f} m", 11, type_.INK)
+    draw.rectangle([x - before, y - 7, image.width, image.height], fill=type_.PAPER)
+    colours = type_.depth_colours(np.linspace(near, far, ramp, dtype=np.float32)[None].repeat(thick, 0), near, far)
+    image.paste(Image.fromarray(colours), (x, y))
+    type_.text(draw, (x - before + 6, y + thick + 1), f"{near:.2f}", 11, type_.INK)
+    type_.text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, type_.INK)
 
 
 def _segments(views: Arrays, view: int) -> Image.Image:

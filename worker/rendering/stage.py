@@ -29,6 +29,8 @@ SKY_EDGE: Final = 0.35
 #: The camera frame of the tracer (x right, y up, looks down -z) in the camera frame used here.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 NO_SHAPE: Final = 0xFFFFFFFF
+#: Pixels of one launch: image buffers take 64 bytes each.
+PIXELS_TOGETHER: Final = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -158,68 +160,107 @@ class Stage:
     def shoot(
         self, shot: Shot, *, tick: Callable[[float], None] | None = None, cancelled: Callable[[], bool]
     ) -> Pictures:
-        """Traces all cameras.
+        """Traces all cameras, `PIXELS_TOGETHER` pixels in a launch.
 
         Raises:
             TaskCancelled: `cancelled()` answered True between two passes.
         """
-        cameras = self._aim(shot)
-        views, height, width = len(shot.extrinsics), shot.height, shot.width
-        worlds = wp.array(shot.world, dtype=wp.int32, device=self.device)
-        lights = wp.array([_light(shot.lamps[w]) for w in shot.world], dtype=kernels.Light, device=self.device)
-        sensor = self._sensor
-        irradiance = sensor.allocate_image_color_hdr(views, width, height)
-        depth = sensor.allocate_image_depth_forward(views, width, height)
-        shape = sensor.allocate_image_shape_index(views, width, height)
-        normal = sensor.allocate_image_normal(views, width, height)
-        total = wp.zeros((views, height, width), dtype=wp.vec3f, device=self.device)
-        albedo = wp.zeros_like(total)
-        seen = wp.full((views, height, width), NO_SHAPE, dtype=wp.uint32, device=self.device)
+        self._turn(shot.turn)
+        views = len(shot.extrinsics)
+        together = max(1, PIXELS_TOGETHER // (shot.width * shot.height))
+        parts = []
+        for start in range(0, views, together):
+            done, share = start / views, min(together, views - start) / views
+
+            def inner(fraction: float, done: float = done, share: float = share) -> None:
+                if tick is not None:
+                    tick(done + share * fraction)
+
+            parts.append(self._expose(shot, slice(start, start + together), inner, cancelled))
+        return Pictures(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("rgb", "depth", "shape")))
+
+    def _expose(
+        self, shot: Shot, part: slice, tick: Callable[[float], None], cancelled: Callable[[], bool]
+    ) -> Pictures:
+        """All passes of some of the views."""
+        world = shot.world[part]
+        cameras = self._cameras(shot, part)
+        film = _Film(self._sensor, (len(world), shot.height, shot.width))
+        worlds = wp.array(world, dtype=wp.int32, device=self.device)
+        lights = wp.array([_light(shot.lamps[w]) for w in world], dtype=kernels.Light, device=self.device)
         first: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None
         for number, (shift, toward, key, sky) in enumerate(_passes(shot)):
             if cancelled():
                 raise TaskCancelled(f"cancelled after {number} of {shot.samples} passes")
             rays = _rays(shot, shift, self.device)
-            light = wp.vec3f(*toward)
-            sensor.create_default_light(enable_shadows=True, direction=wp.vec3f(*-toward))
-            sensor.update(
-                self._state, cameras, rays, hdr_color_image=irradiance, forward_depth_image=depth,
-                shape_index_image=shape, normal_image=normal, world_indices=worlds, clear_data=self._clear,
-                render_config=self._config,
+            self._sensor.create_default_light(enable_shadows=True, direction=wp.vec3f(*-toward))
+            self._sensor.update(
+                self._state, cameras, rays, hdr_color_image=film.irradiance, forward_depth_image=film.depth,
+                shape_index_image=film.shape, normal_image=film.normal, world_indices=worlds,
+                clear_data=self._clear, render_config=self._config,
             )  # fmt: skip
             wp.launch(
                 kernels.accumulate,
-                dim=(views, height, width),
+                dim=film.total.shape,
                 inputs=[
-                    rays, cameras, irradiance, depth, normal, shape, self._model.shape_transform, self._materials,
-                    lights, light, key, sky, number == 0,
+                    rays, cameras, film.irradiance, film.depth, film.normal, film.shape, self._model.shape_transform,
+                    self._materials, lights, wp.vec3f(*toward), key, sky, number == 0,
                 ],
-                outputs=[seen, albedo, total],
+                outputs=[film.seen, film.albedo, film.total],
                 device=self.device,
             )  # fmt: skip
             if first is None:
-                first = depth.numpy().copy(), self._solid_index(shape.numpy())
-            if tick is not None:
-                tick((number + 1) / shot.samples)
+                first = film.depth.numpy().copy(), self._solid_index(film.shape.numpy())
+            tick((number + 1) / shot.samples)
         assert first is not None
-        rgb = wp.empty((views, height, width, 3), dtype=wp.uint8, device=self.device)
-        wp.launch(
-            kernels.develop, dim=total.shape, inputs=[total, 1.0 / shot.samples], outputs=[rgb], device=self.device
-        )
-        return Pictures(rgb.numpy().copy(), *first)
+        return Pictures(film.develop(shot.samples), *first)
 
-    def _aim(self, shot: Shot) -> Any:
-        """Turns the worlds under the lamp, refits the tracer's tree and gives the cameras in the turned worlds."""
-        turns = np.zeros((self.worlds, 7))
-        turns[:, 3:] = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), shot.turn)
-        self._model.shape_transform.assign(_xyzw(compose(turns[:, None], self._poses)).reshape(-1, 7))
+    def _turn(self, turn: Floats) -> None:
+        """Turns the worlds under the lamp and refits the tracer's tree."""
+        poses = _xyzw(compose(_turns(turn)[:, None], self._poses)).reshape(-1, 7)
+        self._model.shape_transform.assign(poses)
         self._model.bvh_refit_shapes(self._state)
-        inverse = np.asarray(np.linalg.inv(shot.extrinsics) @ _FLIP, np.float64)
-        poses = compose(turns[shot.world], pose_from_matrix(inverse))
+
+    def _cameras(self, shot: Shot, part: slice) -> Any:
+        """Tracer poses of some of the cameras in the turned worlds."""
+        inverse = np.asarray(np.linalg.inv(shot.extrinsics[part]) @ _FLIP, np.float64)
+        poses = compose(_turns(shot.turn)[shot.world[part]], pose_from_matrix(inverse))
         return wp.array(_xyzw(poses), dtype=wp.transformf, device=self.device)
 
     def _solid_index(self, shape: NDArray[np.uint32]) -> NDArray[np.int64]:
         return np.where(shape == NO_SHAPE, -1, shape.astype(np.int64) % len(self.solids))
+
+
+class _Film:
+    """Image buffers of some views."""
+
+    def __init__(self, sensor: Any, shape: tuple[int, int, int]) -> None:
+        views, height, width = shape
+        self.irradiance = sensor.allocate_image_color_hdr(views, width, height)
+        self.depth = sensor.allocate_image_depth_forward(views, width, height)
+        self.shape = sensor.allocate_image_shape_index(views, width, height)
+        self.normal = sensor.allocate_image_normal(views, width, height)
+        self.total = wp.zeros(shape, dtype=wp.vec3f, device=sensor.device)
+        self.albedo = wp.zeros_like(self.total)
+        self.seen = wp.full(shape, NO_SHAPE, dtype=wp.uint32, device=sensor.device)
+
+    def develop(self, samples: int) -> NDArray[np.uint8]:
+        """(V, H, W, 3) sRGB of the mean over the passes."""
+        rgb = wp.empty((*self.total.shape, 3), dtype=wp.uint8, device=self.total.device)
+        wp.launch(
+            kernels.develop,
+            dim=self.total.shape,
+            inputs=[self.total, 1.0 / samples],
+            outputs=[rgb],
+            device=self.total.device,
+        )
+        return np.array(rgb.numpy())
+
+
+def _turns(angle: Floats) -> Floats:
+    poses = np.zeros((len(angle), 7))
+    poses[:, 3:] = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), angle)
+    return poses
 
 
 def _tracer_mesh(solid: Solid) -> Any:
