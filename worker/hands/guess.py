@@ -81,7 +81,7 @@ def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
 
 def _guess_approach(hand: HandModel) -> Floats:
     """Mean direction in which the fingertips move as the hand closes, snapped to a root axis within 40 degrees."""
-    motion = _tips(hand, _posture(hand, 0.6)) - _tips(hand, _posture(hand, 0.1))
+    motion = _tips(hand, _posture(hand, 0.4)) - _tips(hand, _posture(hand, 0.05))
     mean = motion.sum(axis=0)
     if np.linalg.norm(mean) < 1e-6:
         return np.array([0.0, 0, 1])

@@ -30,15 +30,15 @@ class MeshDistance:
         self._radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
         self._tree = cKDTree(centres)
 
-    def __call__(self, points: Floats) -> Floats:
-        """(N,) distance of points (N, 3) to the surface [m]."""
+    def __call__(self, points: Floats, enough: float = 0.0) -> Floats:
+        """(N,) distance of points (N, 3) to the surface [m]; below `enough` it may come out larger, up to `enough`."""
         found = np.full(len(points), np.inf)
         todo, k = np.arange(len(points)), min(_CANDIDATES, len(self._face))
         while len(todo):
             reach, nearest = (np.asarray(part) for part in self._tree.query(points[todo], k=np.arange(1, k + 1)))
             triangles = self._corners[self._face[nearest]]
             found[todo] = point_triangle_distance(points[todo][:, None], triangles).min(axis=1)
-            open_ = reach[:, -1] < found[todo] + self._radius
+            open_ = (reach[:, -1] < found[todo] + self._radius) & (found[todo] > enough)
             if k == len(self._face):
                 break
             todo, k = todo[open_], min(4 * k, len(self._face))

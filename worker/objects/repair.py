@@ -76,8 +76,8 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
     used, inverse = np.unique(soup.faces, return_inverse=True)
     vertices, faces = soup.vertices[used] * UNITS[options.units], inverse.reshape(-1, 3)
     extent = float(np.ptp(vertices, axis=0).max())
-    if extent <= 0:
-        raise MeshError("the mesh encloses no volume: all its vertices are one point")
+    if float(np.ptp(vertices, axis=0).min()) <= 1e-7 * extent:
+        raise MeshError("the mesh encloses no volume: it is flat; give the surface a thickness")
     if options.scale_to is not None:
         vertices, extent = vertices * (options.scale_to / extent), options.scale_to
     if extent > MAX_EXTENT_M:
@@ -126,7 +126,7 @@ def _close(mesh: Repaired) -> Repaired:
         mesh = mesh.but(mesh.vertices, faces, f"winding of {turned} faces made consistent with their neighbours")
     crowded = int((topology.edge_faces(mesh.faces)[1] > 2).sum())
     if crowded:
-        split = topology.split_edges(mesh.vertices, mesh.faces)
+        split = topology.part_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
         if not topology.open_edges(split[1]) > topology.open_edges(mesh.faces):
             mesh = mesh.but(*split, f"took {crowded} non-manifold edges apart")
     if topology.open_edges(mesh.faces):

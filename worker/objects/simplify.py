@@ -38,7 +38,7 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
     original = Original(vertices, faces, closed)
-    best: tuple[Floats, Indices, float] | None = None
+    best: Mesh | None = None
     low, high = float(FEW_FACES), float(len(faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
@@ -49,7 +49,7 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
             high, best = target, trial
     if best is None and closed:
         best = _thinned(original, error_m)
-    return best if best is not None else (vertices, faces, 0.0)
+    return (*best, original.deviation(best)) if best is not None else (vertices, faces, 0.0)
 
 
 class Original:
@@ -59,7 +59,7 @@ class Original:
         self.vertices, self.faces, self.closed = vertices, faces, closed
         self.shells = int(topology.components(faces).max())
         self._distance = MeshDistance(vertices, faces)
-        self._points = np.concatenate([vertices, sample_faces(vertices, faces, SAMPLES)[0]])
+        self._points = self._points_of((vertices, faces))
 
     def accepts(self, mesh: Mesh) -> bool:
         """Whether a mesh is closed, outward and in as many shells as the original, if that is closed."""
@@ -72,21 +72,27 @@ class Original:
             and solid.to_manifold(*mesh) is not None
         )
 
-    def deviation(self, mesh: Mesh, limit: float) -> float | None:
-        """Largest distance between the surfaces, both ways [m]; None as soon as it is known to exceed the limit."""
-        back = MeshDistance(*mesh)
-        own = np.concatenate([mesh[0], sample_faces(*mesh, SAMPLES)[0]])
-        furthest = 0.0
+    def within(self, mesh: Mesh, limit: float) -> bool:
+        """Whether the two surfaces lie within `limit` [m] of each other, both ways, over vertices and even samples."""
+        back, own = MeshDistance(*mesh), self._points_of(mesh)
         # A few points tell of most meshes that are too coarse; all of them are only asked when it may be accepted.
-        for step in (16, 1):
-            for distance, points in ((back, self._points), (self._distance, own)):
-                furthest = max(furthest, float(distance(points[::step]).max()))
-                if furthest > limit:
-                    return None
-        return furthest
+        return all(
+            float(distance(points[::step], limit).max()) <= limit
+            for step in (16, 1)
+            for distance, points in ((back, self._points), (self._distance, own))
+        )
+
+    def deviation(self, mesh: Mesh) -> float:
+        """Largest distance between the two surfaces, both ways, over vertices and even samples [m]."""
+        back = MeshDistance(*mesh)
+        return max(float(back(self._points).max()), float(self._distance(self._points_of(mesh)).max()))
+
+    @staticmethod
+    def _points_of(mesh: Mesh) -> Floats:
+        return np.concatenate([mesh[0], sample_faces(*mesh, SAMPLES)[0]])
 
 
-def _trial(original: Original, target: int, error_m: float) -> tuple[Floats, Indices, float] | None:
+def _trial(original: Original, target: int, error_m: float) -> Mesh | None:
     """A mesh of about `target` faces if it is sound and within the bound.
 
     A collapse that broke the surface at one count often does not at the next, so a few are tried.
@@ -95,8 +101,7 @@ def _trial(original: Original, target: int, error_m: float) -> tuple[Floats, Ind
         mesh = _collapse(original.vertices, original.faces, count)
         if mesh is None or not original.accepts(mesh):
             continue
-        error = original.deviation(mesh, error_m)
-        return None if error is None else (*mesh, error)
+        return mesh if original.within(mesh, error_m) else None
     return None
 
 
@@ -116,18 +121,16 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
     mesh = topology.compact(np.asarray(points, dtype=float) * scale + middle, triangles)
     if (topology.edge_faces(mesh[1])[1] > 2).any():
         # A tunnel that collapsed to an edge: taking the edge apart closes the tunnel.
-        mesh = topology.split_edges(*mesh)
+        mesh = topology.part_double_edges(*topology.split_edges(*mesh))
     return mesh
 
 
-def _thinned(original: Original, error_m: float) -> tuple[Floats, Indices, float] | None:
+def _thinned(original: Original, error_m: float) -> Mesh | None:
     whole = solid.to_manifold(original.vertices, original.faces)
     if whole is None:
         return None
     for share in (0.9, 0.5, 0.2):
         mesh = solid.from_manifold(whole.simplify(share * error_m))
-        if len(mesh[1]) < len(original.faces) and original.accepts(mesh):
-            error = original.deviation(mesh, error_m)
-            if error is not None:
-                return (*mesh, error)
+        if len(mesh[1]) < len(original.faces) and original.accepts(mesh) and original.within(mesh, error_m):
+            return mesh
     return None

@@ -177,6 +177,35 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     return vertices[faces.reshape(-1)[first]], inverse.reshape(-1, 3).astype(np.int64)
 
 
+def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
+    """Two edges between the same two vertices made distinct: all but one get a vertex in the middle.
+
+    Such edges are sound on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
+    """
+    index, counts = edge_faces(faces)
+    crowded = np.flatnonzero(counts > 2)
+    if not len(crowded):
+        return vertices, faces
+    count, edges, order = len(faces), directed_edges(faces), np.argsort(index, kind="stable")
+    starts = np.cumsum(counts) - counts
+    points, extra, touched = [vertices], [], set[int]()
+    changed = faces.copy()
+    for edge in crowded:
+        half = order[starts[edge] : starts[edge] + counts[edge]]
+        for pair in _pairs_around(vertices, faces, edges, half)[1:]:
+            if touched & {int(h % count) for h in pair}:
+                continue
+            middle = len(vertices) + len(points) - 1
+            points.append(vertices[edges[pair[0]]].mean(axis=0, keepdims=True))
+            for h in pair:
+                face, corner = int(h % count), int(h // count)
+                touched.add(face)
+                a, b, c = (int(faces[face, (corner + step) % 3]) for step in range(3))
+                changed[face] = (a, middle, c)
+                extra.append((middle, b, c))
+    return np.concatenate(points), np.concatenate([changed, np.array(extra, dtype=np.int64).reshape(-1, 3)])
+
+
 def _corner(half: Indices, count: int, step: int = 0) -> Indices:
     """Number 3 f + k of the corner at which a half-edge starts, or ends with step 1."""
     return 3 * (half % count) + (half // count + step) % 3

@@ -1,0 +1,78 @@
+"""Tell a user what became of a hand: taken, taken with repairs, or refused and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from service.errors import InputError
+from worker.hands.load import assemble, main_file
+from worker.hands.model import HandModel
+from worker.hands.options import parse_options
+from worker.hands.surface import sample_surface
+from worker.hands.urdf import Urdf, read_urdf
+
+#: Points with which the outer surface is measured.
+_SURFACE_POINTS = 512
+
+
+def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """What `load_hand` makes of these files.
+
+    Returns:
+        verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured or
+        guessed, in SI units.
+    """
+    try:
+        settings = parse_options(files, options)
+        main = main_file(files, settings)
+        urdf = read_urdf(files[main], main)
+        hand = assemble(urdf, settings, files, main, name=name, digest="0" * 32)
+        area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
+    except InputError as error:
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+    stated = {"palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing)}
+    facts = hand_facts(hand, urdf) | {
+        "surface_area_m2": area,
+        "guessed": [key for key, said in stated.items() if not said],
+    }
+    message = (
+        f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
+        f"{len(hand.pieces)} convex pieces; palm {hand.root_link!r} facing {_direction(hand)}"
+    )
+    return {"verdict": "accept", "message": "; ".join([message, *urdf.notes]), "repairs": [], "facts": facts}
+
+
+def hand_facts(hand: HandModel, urdf: Urdf) -> dict[str, Any]:
+    """What a user should look at before trusting a hand; numbers in SI units."""
+    return {
+        "links": len(urdf.links),
+        "bodies": hand.bodies,
+        "joints": list(hand.joint_names),
+        "dofs": list(hand.dof_names),
+        "root": hand.root_link,
+        "palm_centre": _rounded(hand.palm.centre),
+        "palm_approach": _rounded(hand.palm.approach),
+        "fingertips": [hand.body_names[body] for body in hand.fingertips],
+        "preshape": dict(zip(hand.dof_names, _rounded(hand.preshape), strict=True)),
+        "closing": dict(zip(hand.dof_names, (int(c) for c in hand.closing), strict=True)),
+        "lower": dict(zip(hand.dof_names, _rounded(hand.lower), strict=True)),
+        "upper": dict(zip(hand.dof_names, _rounded(hand.upper), strict=True)),
+        "effort": dict(zip(hand.dof_names, _rounded(hand.effort), strict=True)),
+        "mass": float(hand.masses.sum()),
+        "pieces": len(hand.pieces),
+        "notes": list(urdf.notes),
+    }
+
+
+def _rounded(values: Any) -> list[float]:
+    return [round(float(value), 6) for value in values]
+
+
+def _direction(hand: HandModel) -> str:
+    axis = int(np.argmax(np.abs(hand.palm.approach)))
+    if abs(hand.palm.approach[axis]) > 0.999:
+        return f"{'+' if hand.palm.approach[axis] > 0 else '-'}{'xyz'[axis]}"
+    return "(" + ", ".join(f"{v:.2f}" for v in hand.palm.approach) + ")"

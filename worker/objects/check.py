@@ -1,0 +1,68 @@
+"""Tell a user what became of an object: taken, taken with repairs, or refused and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from service.errors import InputError
+from worker.objects.options import ObjectOptions, parse_options
+from worker.objects.prepare import build, main_file, repaired_mesh
+from worker.objects.repair import Repaired
+
+#: Bound with which the prepared mesh of the report is simplified [m]: that of the standard fidelity.
+REPORT_ERROR_M = 3e-4
+
+
+def check_object(
+    files: Mapping[str, bytes], name: str, *, face_error_m: float = REPORT_ERROR_M, **options: Any
+) -> dict[str, Any]:
+    """What `load_object` makes of these files.
+
+    Args:
+        files: the mesh and perhaps `asset.json`.
+        name: name of the object.
+        face_error_m: simplification bound [m].
+        options: keys of `ObjectOptions` that go over `asset.json`; None is as not given.
+
+    Returns:
+        verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured, in
+        SI units.
+    """
+    try:
+        settings = parse_options(files, options)
+        main = main_file(files, settings)
+        mesh = repaired_mesh(main, files[main], settings)
+        facts = _facts(mesh, face_error_m, settings)
+    except InputError as error:
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+    size = " x ".join(f"{1e3 * extent:.0f}" for extent in facts["extents_m"])
+    parts = [
+        f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3",
+        *mesh.repairs,
+        *mesh.notes,
+    ]
+    verdict = "repair" if mesh.repairs else "accept"
+    return {"verdict": verdict, "message": "; ".join(parts), "repairs": list(mesh.repairs), "facts": facts}
+
+
+def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[str, Any]:
+    model = build(mesh, face_error_m)
+    mass = options.mass
+    if mass is None and options.density is not None:
+        mass = options.density * model.volume
+    return {
+        "faces": len(mesh.faces),
+        "prepared_faces": len(model.faces),
+        "deviation_m": model.deviation_m,
+        "extents_m": [float(extent) for extent in np.ptp(mesh.vertices, axis=0)],
+        "volume_m3": model.volume,
+        "mass_kg": mass,
+        "centre_of_mass_m": [float(value) for value in model.centre_of_mass],
+        "radius_m": model.radius,
+        "watertight": model.watertight,
+        "units": options.units,
+        "notes": list(mesh.notes),
+    }
