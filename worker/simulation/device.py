@@ -130,9 +130,7 @@ class DeviceObject:
     bvh: Any
 
     @classmethod
-    def create(
-        cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float
-    ) -> DeviceObject:
+    def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
         """Upload an object.
 
         Args:
@@ -160,7 +158,7 @@ class DeviceObject:
 def _add_field(skin: Any, obj: ObjectModel, cell: float) -> None:
     low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
     high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
-    # At most 96 cells a side: a large object is asked of a coarser grid, whose error grows with it and is accounted for.
+    # At most 96 cells a side: a large object has a coarser grid, whose larger error is accounted for.
     cell = max(cell, float((high - low).max()) / 96)
     shape = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
     field = wp.empty(shape, dtype=wp.float32)

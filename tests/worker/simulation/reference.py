@@ -53,9 +53,7 @@ def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Fl
     s = s0.copy()
     for _ in range(passes):
         a, rhs = world.mass, world.mass @ s0
-        for p, n, rho, w in zip(
-            contacts.points, contacts.normals, contacts.distances, contacts.weights, strict=True
-        ):
+        for p, n, rho, w in zip(contacts.points, contacts.normals, contacts.distances, contacts.weights, strict=True):
             u = motion_at(s, p)
             c = world.dilation - rho + n @ u
             if c <= 0:

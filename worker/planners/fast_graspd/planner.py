@@ -11,6 +11,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -99,7 +100,7 @@ def _cut(count: int, threads: int, device: str) -> list[range]:
         return [range(count)]
     parts = max(1, min(threads or os.cpu_count() or 1, count // PART))
     bounds = np.linspace(0, count, parts + 1).astype(int)
-    return [range(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [range(int(a), int(b)) for a, b in pairwise(bounds)]
 
 
 def _work(pair: Pair, part: _Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:

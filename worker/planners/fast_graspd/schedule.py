@@ -1,4 +1,4 @@
-"""What each iteration weighs: the coarse phase shrinks the dilation while penetration grows dear, the fine phase seats."""
+"""What each iteration weighs: the coarse phase shrinks the dilation, the fine phase seats the hand."""
 
 from __future__ import annotations
 

@@ -142,8 +142,8 @@ def direct(
     """Order-independent compliant contact: all contacts at once in one 6 x 6 system. Launch over (B, M).
 
     Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of magnitude at most mu k w_i C_i, by
-    iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking one
-    a spring of stiffness k w_i.
+    iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking
+    one a spring of stiffness k w_i.
     """
     b, m = wp.tid()
     if active_in[b] == 0:

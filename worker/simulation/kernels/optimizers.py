@@ -104,5 +104,5 @@ def gradient_descent(
 
 @wp.kernel
 def advance(iteration_inout: wp.array(dtype=wp.int32)):
-    """Count an iteration on the device: schedules are read there, so a captured graph can be replayed. Launch over 1."""
+    """Count an iteration on the device: schedules are read there, so a captured graph can be replayed. Over 1."""
     iteration_inout[0] = iteration_inout[0] + 1

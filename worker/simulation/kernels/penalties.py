@@ -77,7 +77,7 @@ def attract(
     weight_in: wp.array2d(dtype=wp.float32),
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
-    """The control without a simulation: free points are drawn to the object, fading with distance. Launch over (B, N)."""
+    """The control without a simulation: free points are drawn to the object, fading with distance. Over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0 or i >= count_in[b]:
         return

@@ -105,7 +105,7 @@ def object_in_pieces(
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Gradient of w sum depth^2 over object surface samples inside a piece; deepest depth per grasp. Launch over (B, P).
+    """Gradient of w sum depth^2 over object surface samples inside a piece; deepest depth per grasp. Over (B, P).
 
     Moving the body by +n deepens a sample that is nearest to the face with outward normal n, so the gradient at the
     sample is 2 w depth n.

@@ -64,9 +64,7 @@ def point_residuals(
     if rho < near_in:
         emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
     elif rho < hold_in:
-        emit(
-            residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - hold_target_in, hold_weight_in
-        )
+        emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - hold_target_in, hold_weight_in)
 
 
 @wp.kernel

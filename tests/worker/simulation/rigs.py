@@ -1,0 +1,44 @@
+"""Small simulations for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from worker.hands.model import HandModel
+from worker.hands.surface import sample_surface
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import build
+from worker.objects.repair import Repaired
+from worker.simulation import kernels
+from worker.simulation.device import DeviceHand, DeviceObject
+from worker.simulation.sampling import object_samples
+from worker.simulation.simulation import LossOptions, Schedule, Simulation
+
+
+def object_of(mesh: trimesh.Trimesh) -> ObjectModel:
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)
+    return build(Repaired(vertices, faces), 0.0)
+
+
+def ball(radius: float = 0.035, subdivisions: int = 3) -> ObjectModel:
+    return object_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
+
+
+def still(dilation: float = 0.0, weight: float = 0.0) -> Schedule:
+    return Schedule(np.full(1, dilation), np.full(1, weight), np.full(1, weight), np.full(1, weight), np.zeros((1, 3)))
+
+
+def rig(
+    hand: HandModel, obj: ObjectModel, *, capacity: int, points: int = 300, options: LossOptions | None = None,
+    cell: float = 0.0, alpha: float = 0.5, schedule: Schedule | None = None,
+) -> Simulation:  # fmt: skip
+    kernels.load("cpu")
+    device_hand = DeviceHand.create(hand, "cpu")
+    device_object = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 1000), phong_alpha=alpha, cell=cell)
+    simulation = Simulation(
+        device_hand, device_object, sample_surface(hand, points), sample_surface(hand, 300),
+        capacity=capacity, options=options or LossOptions(),
+    )  # fmt: skip
+    simulation.set_schedule(schedule or still())
+    return simulation

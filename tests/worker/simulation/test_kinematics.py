@@ -1,0 +1,145 @@
+"""Kernel kinematics against float64 NumPy, yourdfpy and MuJoCo; the transpose against finite differences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+import yourdfpy
+
+from tests.worker.simulation.rigs import ball, rig
+from worker.hands.kinematics import body_poses
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.simulation.kernels import kinematics
+from worker.simulation.simulation import HandState
+from worker.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
+
+#: float32 positions of a hand 0.2 m large through at most 8 joints.
+FK_TOLERANCE = 3e-7
+#: URDF origins given to 6 digits, read by two parsers in float64.
+PARSER_TOLERANCE = 1e-9
+
+REAL_HANDS = {
+    "allegro": "allegro/allegro_hand_right.urdf",
+    "barrett": "barrett/bhand_model.urdf",
+    "barrett_bh280": "barrett_bh280/bh280.urdf",
+}
+
+
+def random_state(hand: HandModel, count: int, seed: int = 0) -> HandState:
+    rng = np.random.default_rng(seed)
+    rotation = rng.normal(size=(count, 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    q = hand.lower + rng.random((count, hand.dofs)) * (hand.upper - hand.lower)
+    return HandState(0.05 * rng.normal(size=(count, 3)), rotation, q)
+
+
+def root_poses(hand: HandModel, state: HandState) -> np.ndarray:
+    return np.concatenate([state.pivot - quat_rotate(state.rotation, hand.palm.centre), state.rotation], axis=1)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_kernel_places_bodies_where_float64_kinematics_does(name: str) -> None:
+    hand = hand_from_path(name)
+    state = random_state(hand, 6)
+    simulation = rig(hand, ball(), capacity=6)
+    simulation.set_state(state)
+    simulation.record_placement()
+    simulation.run()
+    expected = body_poses(hand, root_poses(hand, state), hand.expand(state.q))
+    np.testing.assert_allclose(simulation.body_p.numpy(), expected[..., :3], atol=FK_TOLERANCE)
+
+
+@pytest.mark.parametrize("name", REAL_HANDS)
+def test_float64_kinematics_agrees_with_yourdfpy(shared_data: Path, name: str) -> None:
+    path = shared_data / "hands" / REAL_HANDS[name]
+    hand = hand_from_path(path)
+    robot = yourdfpy.URDF.load(str(path), load_meshes=False, build_scene_graph=True)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        q = hand.lower + rng.random(hand.dofs) * (hand.upper - hand.lower)
+        joints = dict(zip(hand.joint_names, hand.expand(q), strict=True))
+        robot.update_cfg({n: np.float64(joints[n]) for n in robot.actuated_joint_names})
+        poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), hand.expand(q))[0]
+        for body, link in enumerate(hand.body_names):
+            expected = robot.get_transform(link, hand.root_link)
+            np.testing.assert_allclose(pose_to_matrix(poses[body]), expected, atol=PARSER_TOLERANCE)
+
+
+def test_float64_kinematics_agrees_with_mujoco(shared_data: Path) -> None:
+    path = shared_data / "hands" / REAL_HANDS["allegro"]
+    hand = hand_from_path(path)
+    text = path.read_text().replace("<robot ", "<robot ", 1)
+    spec = mujoco.MjSpec.from_string(text, assets={p.name: p.read_bytes() for p in path.parent.rglob("*.obj")})
+    spec.compiler.fusestatic = False
+    for geom in list(spec.geoms):
+        spec.delete(geom)
+    spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.balanceinertia = 1e-3, 1e-9, True
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(2)
+    q = hand.lower + rng.random(hand.dofs) * (hand.upper - hand.lower)
+    for name, value in zip(hand.joint_names, hand.expand(q), strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_kinematics(model, data)
+    poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), hand.expand(q))[0]
+    found = [data.body(link).xpos - data.body(hand.root_link).xpos for link in hand.body_names[1:]]
+    # MuJoCo may turn the root: compare lengths between all pairs of bodies.
+    expected = poses[1:, :3]
+    for a in range(len(found)):
+        distances = np.linalg.norm(np.array(found) - found[a], axis=1)
+        np.testing.assert_allclose(distances, np.linalg.norm(expected - expected[a], axis=1), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None:
+    """Random forces at random points: their work by the transpose equals central differences in float64."""
+    hand = hand_from_path(name)
+    rng = np.random.default_rng(3)
+    state = random_state(hand, 1, seed=3)
+    local = 0.02 * rng.normal(size=(hand.bodies, 3))
+    force = rng.normal(size=(hand.bodies, 3))
+    joints = hand.expand(state.q)
+
+    def work(pivot: np.ndarray, rotation: np.ndarray, q: np.ndarray) -> float:
+        root = np.concatenate([pivot - quat_rotate(rotation, hand.palm.centre), rotation], axis=-1)
+        poses = body_poses(hand, root, hand.expand(q))[0]
+        return float((apply(poses, local) * force).sum())
+
+    step, expected = 1e-6, []
+    for k in range(3):
+        d = step * np.eye(3)[k]
+        args = (state.rotation, state.q)
+        expected.append((work(state.pivot + d, *args) - work(state.pivot - d, *args)) / (2 * step))
+    for k in range(3):
+        turned = [
+            quat_multiply(quat_from_axis_angle(np.eye(3)[k], np.array(s * step)), state.rotation[0])[None]
+            for s in (1, -1)
+        ]
+        expected.append((work(state.pivot, turned[0], state.q) - work(state.pivot, turned[1], state.q)) / (2 * step))
+    for k in range(hand.dofs):
+        d = step * np.eye(hand.dofs)[k]
+        expected.append(
+            (work(state.pivot, state.rotation, state.q + d) - work(state.pivot, state.rotation, state.q - d))
+            / (2 * step)
+        )
+    simulation = rig(hand, ball(), capacity=1)
+    simulation.set_state(state)
+    simulation.record_placement()
+    simulation.run()
+    poses = body_poses(hand, root_poses(hand, state), joints)[0]
+    points = apply(poses, local)
+    simulation.force.assign(force[None].astype(np.float32))
+    simulation.torque.assign(np.cross(points, force)[None].astype(np.float32))
+    wp.launch(
+        kinematics.backward, 1,
+        [simulation.hand.tree, simulation.active, simulation.pivot, simulation.body_p, simulation.axis,
+         simulation.force, simulation.torque, simulation.gradient],
+        device="cpu",
+    )  # fmt: skip
+    # Sums of up to 23 float32 products of size 1.
+    np.testing.assert_allclose(simulation.gradient.numpy()[0], expected, atol=2e-5)
