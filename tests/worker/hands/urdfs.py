@@ -1,0 +1,26 @@
+"""Small hands for tests."""
+
+from __future__ import annotations
+
+BOX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+
+
+def link(name: str, body: str = BOX) -> str:
+    return f'<link name="{name}">{body}</link>'
+
+
+def joint(name: str, parent: str, child: str, *, kind: str = "revolute", extra: str = "", limit: str = "") -> str:
+    limit = limit or '<limit lower="0" upper="1.5" effort="1" velocity="2"/>'
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="0 0 0.04"/><axis xyz="0 1 0"/>{limit}{extra}</joint>'
+    )
+
+
+def robot(*parts: str) -> bytes:
+    return ('<robot name="test">' + "".join(parts) + "</robot>").encode()
+
+
+def chain(*joints: str, links: str = "abc") -> bytes:
+    """Palm and links a, b, c with the given joints."""
+    return robot(link("palm"), *(link(name) for name in links), *joints)
