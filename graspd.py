@@ -2,10 +2,87 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import Any, Final
+
+import typer
+from typer.core import TyperGroup
+
+from service.version import PACKAGE_VERSION
+
+#: Command, module of its group, panel of the overview, help.
+COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
+    (
+        "demo",
+        "demo",
+        "Start here",
+        "The main job on built-in data: grasps, scenes, pictures, and a page that shows them.",
+    ),
+    ("up", "service.commands", "Start here", "The whole service on this machine, until Ctrl-C."),
+    ("submit", "api.commands", "Jobs", "Submit a job: one hand on one object."),
+    ("jobs", "api.commands", "Jobs", "List jobs, the newest first."),
+    ("status", "api.commands", "Jobs", "Stages, progress and quality of a job."),
+    ("cancel", "api.commands", "Jobs", "Stop a job; what is written stays."),
+    ("retry", "api.commands", "Jobs", "Run again what failed or was cancelled."),
+    ("logs", "api.commands", "Jobs", "Failed attempts of a job, with their reasons."),
+    ("hands", "api.commands", "Jobs", "List, show and add hands."),
+    ("objects", "api.commands", "Jobs", "List, show and add objects."),
+    ("api", "api.commands", "Parts of the service", "The HTTP API and the dashboard."),
+    ("keeper", "service.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
+    ("worker", "worker.commands", "Parts of the service", "One worker on one device."),
+    ("index", "service.commands", "Parts of the service", "Rebuild the index from the store."),
+    ("keys", "api.commands", "Parts of the service", "Make, list and revoke API keys."),
+    ("synth", "worker.planners.commands", "Without a server", "Grasps of a hand file on an object file."),
+)
+
+
+class LazyGroup(TyperGroup):
+    """A group whose overview needs no import: a command's room is imported when the command is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, command, rest = super().resolve_command(ctx, args)
+        module = next((module for known, module, _, _ in COMMANDS if known == name), None)
+        return name, load(module, name, ctx) if module and name else command, rest
+
+
+def load(module: str, name: str, ctx: Any = None) -> Any:
+    """The command of a room, imported now."""
+    group: Any = typer.main.get_command(import_module(module).app)
+    # A Typer with a single command is that command itself, not a group.
+    return group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
+
+
+def build() -> typer.Typer:
+    """The root command with a light entry for every command."""
+    app = typer.Typer(
+        cls=LazyGroup,
+        help="A grasp-dataset factory: stable, contact-rich multi-finger grasps by differentiable simulation.",
+        epilog="Try `graspd demo`, or `graspd COMMAND --help`.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+    )
+
+    @app.callback()
+    def root(
+        version: bool = typer.Option(False, "--version", help="Say the version and stop.", is_eager=True),
+    ) -> None:
+        if version:
+            typer.echo(PACKAGE_VERSION)
+            raise typer.Exit
+
+    for name, _, panel, text in COMMANDS:
+        app.command(name, help=text, rich_help_panel=panel)(_entry)
+    return app
+
+
+def _entry() -> None:
+    """Stands for a command in the overview; `LazyGroup` calls the real one."""
+
 
 def main() -> None:
     """Entry point of the `graspd` command."""
-    raise SystemExit("graspd: no command yet")
+    build()()
 
 
 if __name__ == "__main__":

@@ -8,9 +8,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
+from urllib.parse import urlsplit
 
 import httpx
 
+from api.guard import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
 from api.problems import ERRORS
 from service.domain import AssetKind, JobRequest, State
@@ -35,9 +37,12 @@ class Client:
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self.url = url.rstrip("/")
+        # A proxy of the environment cannot reach this machine's own addresses.
+        is_local = is_loopback(urlsplit(self.url).hostname or "")
         self._http = httpx.Client(
-            base_url=self.url, headers=headers, timeout=_TIMEOUT, transport=transport, follow_redirects=True
-        )
+            base_url=self.url, headers=headers, timeout=_TIMEOUT, transport=transport, follow_redirects=True,
+            trust_env=not is_local,
+        )  # fmt: skip
 
     def __enter__(self) -> Self:
         return self

@@ -84,6 +84,13 @@ class GraspQuery(BaseModel):
     order: Literal["asc", "desc"] = "desc"
 
 
+class GraspPageQuery(GraspQuery):
+    """One page of a list of grasps."""
+
+    limit: int = Field(50, ge=1, le=200, description="items on a page")
+    cursor: str | None = Field(None, max_length=512, description="`next` of the page before")
+
+
 class Part(BaseModel):
     """One part the API needs."""
 

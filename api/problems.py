@@ -12,6 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from service.errors import (
     BusyError,
@@ -144,9 +145,21 @@ def answer(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, HTTPException) and status == 405:
         detail = f"{request.method} is not possible on {request.url.path}"
     headers = dict(getattr(error, "headers", None) or {})
+    if status == 405 and (allowed := _allowed_methods(request)):
+        headers["Allow"] = ", ".join(allowed)
     return problem_response(
         request.url.path, request_id_of(request), slug=slug, title=title, status=status, detail=detail, headers=headers
     )
+
+
+def _allowed_methods(request: Request) -> list[str]:
+    """Methods that some route takes at this path (RFC 9110 §15.5.6); one route alone knows only its own."""
+    routes = request.app.routes if "app" in request.scope else []
+    return [
+        method
+        for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+        if any(route.matches(dict(request.scope) | {"method": method})[0] is Match.FULL for route in routes)
+    ]
 
 
 def validation_answer(request: Request, error: RequestValidationError) -> JSONResponse:

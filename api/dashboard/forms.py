@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any, Final
 
 from fastapi import APIRouter, Depends, Request
@@ -16,8 +17,11 @@ from api.dependencies import CatalogOf, may_read, may_submit
 from api.routes.assets import store_upload
 from service.domain import FIDELITIES, AssetKind, JobRequest
 from service.errors import GraspdError, InputError
+from service.index.views import AssetView
 
 router = APIRouter(include_in_schema=False)
+
+_CHECK_WAIT_S: Final = 15.0
 
 _DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
@@ -78,12 +82,22 @@ def _submit(request: Request, catalog: Catalog, fields: FormData) -> HTMLRespons
         if isinstance(file, UploadFile) and file.filename:
             limit = request.app.state.settings.max_upload_bytes
             asset = store_upload(catalog, AssetKind.OBJECT, file, None, limit_bytes=limit)
+            shown |= {"object": asset.name}
             body = body.model_copy(update={"object": asset.name})
+            _await_check(catalog, asset)
         job = catalog.submit(body)
     except InputError as error:
         problem = {"title": error.title, "detail": str(error)}
         return _form(request, catalog, shown, problem=problem, status=error.status)
     return RedirectResponse(f"/jobs/{job.id}", status_code=303)
+
+
+def _await_check(catalog: Catalog, asset: AssetView) -> None:
+    """Give a worker a moment to check an upload, so that one press of the button is enough."""
+    deadline = time.monotonic() + _CHECK_WAIT_S
+    while asset.verdict is None and time.monotonic() < deadline:
+        time.sleep(0.2)
+        asset = catalog.asset(asset.kind, asset.digest)
 
 
 def _by_field(error: ValidationError) -> dict[str, str]:

@@ -29,6 +29,8 @@ class Pictures:
             NotFoundError: the shard holds fewer pictures.
         """
         with h5py.File(io.BytesIO(self._fetch(key)), "r") as file:
+            if "image/rgb" not in file:
+                raise NotFoundError("the shard holds no pictures; only a views shard does")
             pictures = file["image/rgb"]
             if not 0 <= index < len(pictures):
                 raise NotFoundError(f"the shard holds {len(pictures)} pictures; there is no picture {index}")

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from api.dependencies import CatalogOf, Cursor, Limit, may_read
-from api.models import GraspQuery
+from api.dependencies import CatalogOf, may_read
+from api.models import GraspPageQuery
 from api.paging import link_next
 from api.problems import responses
 from service.index.views import GraspView, Page
@@ -20,11 +20,9 @@ def list_grasps(
     request: Request,
     response: Response,
     catalog: CatalogOf,
-    query: Annotated[GraspQuery, Query()],
-    limit: Limit = 50,
-    cursor: Cursor = None,
+    query: Annotated[GraspPageQuery, Query()],
 ) -> Page[GraspView]:
     """Grasps that pass every filter, in the order asked for."""
-    page = catalog.grasps(query, limit=limit, cursor=cursor)
+    page = catalog.grasps(query, limit=query.limit, cursor=query.cursor)
     link_next(request, response, page.next)
     return page

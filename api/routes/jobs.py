@@ -95,9 +95,14 @@ def retry(job_id: str, catalog: CatalogOf) -> JobDetail:
     return catalog.retry(job_id)
 
 
+def known_job(job_id: str, catalog: CatalogOf) -> None:
+    """A stream has begun before its first event: what can be refused is refused before that."""
+    catalog.job_state(job_id)
+
+
 @router.get(
     "/{job_id}/events",
-    dependencies=[Depends(may_read)],
+    dependencies=[Depends(may_read), Depends(known_job)],
     response_class=EventSourceResponse,
     responses=responses(401, 403, 404, 503),
 )

@@ -1,0 +1,373 @@
+"""Commands that talk to the API over HTTP, and the ones that run it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from api.auth import KeyFile, Scope
+from api.client import Client
+from api.dashboard.filters import count, duration, metric, percent, size
+from api.models import Job, JobDetail
+from api.uploads import MAIN_SUFFIXES, name_of_upload
+from api.watching import JobDisplay
+from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
+from service.domain import AssetKind, JobRequest, State
+from service.errors import InputError, TaskError
+
+app = typer.Typer(no_args_is_help=True)
+
+UrlOption = Annotated[str | None, typer.Option("--url", help="Where the API answers; default GRASPD_API_URL.")]
+JobArgument = Annotated[str, typer.Argument(help="Job id, or the beginning of one.")]
+
+
+@app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
+@reporting_errors
+def submit(
+    hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
+    object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
+    grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
+    method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
+    fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
+    seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
+    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 0,
+    views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
+    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Submit a job: one hand on one object."""
+    with open_client(url) as client:
+        request = job_request(
+            {
+                "hand": _uploaded(client, AssetKind.HAND, hand),
+                "object": _uploaded(client, AssetKind.OBJECT, object),
+                "grasps": grasps,
+                "method": method,
+                "fidelity": fidelity,
+                "seed": seed,
+                "scenes": scenes,
+                "views": views,
+                "stereo": stereo,
+                "friction": friction,
+            }
+        )
+        job = client.submit(request)
+        if wait:
+            job = watch(client, job.id)
+        show_job(job, json=json, url=client.url)
+
+
+@app.command(epilog="graspd jobs --state running")
+@reporting_errors
+def jobs(
+    state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
+    limit: Annotated[int, typer.Option(min=1, max=200, help="At most this many.")] = 20,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """List jobs, the newest first."""
+    with open_client(url) as client:
+        page = client.jobs(state=state, limit=limit)
+    if json:
+        emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
+        return
+    table = Table("job", "state", "hand", "object", "progress", "valid", "created", box=None, header_style="bold")
+    for job in page.items:
+        done = f"{count(job.valid)} of {count(job.grasps)}"
+        table.add_row(job.id[:12], job.state, job.hand, job.object, percent(job.progress), done, job.created)
+    Console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
+
+
+@app.command(epilog="graspd status 3f2a --json")
+@reporting_errors
+def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stages, progress and quality of a job."""
+    with open_client(url) as client:
+        show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+
+
+@app.command(epilog="graspd cancel 3f2a")
+@reporting_errors
+def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stop a job; what is written stays."""
+    with open_client(url) as client:
+        show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+
+
+@app.command(epilog="graspd retry 3f2a --wait")
+@reporting_errors
+def retry(
+    job_id: JobArgument,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Run again what failed or was cancelled; what is written is not made twice."""
+    with open_client(url) as client:
+        job = client.retry(_full_id(client, job_id))
+        if wait:
+            job = watch(client, job.id)
+        show_job(job, json=json, url=client.url)
+
+
+@app.command(epilog="graspd logs 3f2a")
+@reporting_errors
+def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Failed attempts of a job, with their reasons."""
+    with open_client(url) as client:
+        job = client.job(_full_id(client, job_id))
+    if json:
+        emit({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
+        return
+    console = Console(highlight=False)
+    if not job.attempts:
+        console.print("no attempt has failed")
+    for attempt in job.attempts:
+        console.print(
+            f"{attempt.ended}  task {attempt.task_id[:8]}  attempt {attempt.number}  {attempt.worker}", markup=False
+        )
+        console.print(f"    {attempt.kind}: {attempt.reason}", markup=False)
+        if attempt.trace:
+            console.print("\n".join("    " + line for line in attempt.trace.splitlines()), style="dim", markup=False)
+
+
+def asset_commands(kind: AssetKind) -> typer.Typer:
+    """`graspd hands ...` or `graspd objects ...`."""
+    group = typer.Typer(no_args_is_help=True, help=f"List, show and add {kind.value}s.")
+
+    @group.command("list")
+    @reporting_errors
+    def list_assets(url: UrlOption = None, json: JsonFlag = False) -> None:
+        """All of them."""
+        with open_client(url) as client:
+            assets = list(client.assets(kind))
+        if json:
+            emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
+            return
+        table = Table("name", "file", "size", "check", "digest", box=None, header_style="bold")
+        for asset in assets:
+            origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
+            table.add_row(asset.name, asset.filename, size(asset.size_bytes), origin, asset.digest[:12])
+        Console().print(table)
+
+    @group.command("show")
+    @reporting_errors
+    def show(
+        name: Annotated[str, typer.Argument(help=f"Name of the {kind.value}.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """One of them, with what the check found."""
+        with open_client(url) as client:
+            asset = client.asset(kind, name)
+        show_asset(asset.model_dump(mode="json"), json=json)
+
+    @group.command("add")
+    @reporting_errors
+    def add(
+        file: Annotated[Path, typer.Argument(help="The file, or a ZIP of its folder.")],
+        name: Annotated[str | None, typer.Option(help="Name to give it; default: the file's.")] = None,
+        wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")] = True,
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """Upload one, and wait for its check."""
+        with open_client(url) as client:
+            asset = client.upload(kind, file, name=name or name_of_upload(file.name))
+            if wait:
+                asset = client.wait_checked(kind, asset.name)
+        show_asset(asset.model_dump(mode="json"), json=json)
+        if asset.verdict == "refuse":
+            raise InputError(f"{file} was refused: {asset.message}")
+
+    return group
+
+
+app.add_typer(asset_commands(AssetKind.HAND), name="hands")
+app.add_typer(asset_commands(AssetKind.OBJECT), name="objects")
+
+
+@app.command(epilog="graspd api --port 8000")
+@reporting_errors
+def api(
+    host: Annotated[str | None, typer.Option(help="Address to bind; default GRASPD_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free one.")] = None,
+) -> None:
+    """Run the HTTP API and the dashboard."""
+    from api.server import serve
+
+    settings = load_settings(host=host, port=port)
+    log_to_stderr(settings)
+    serve(settings)
+
+
+keys = typer.Typer(no_args_is_help=True, help="Make, list and revoke API keys.")
+app.add_typer(keys, name="keys")
+
+
+@keys.command("add")
+@reporting_errors
+def add_key(
+    name: Annotated[str, typer.Argument(help="Whose key it is.")],
+    scope: Annotated[Scope, typer.Option(help="What it may do.")] = Scope.SUBMIT,
+    json: JsonFlag = False,
+) -> None:
+    """Make a key and show it, this once."""
+    token = _key_file().add(name, scope)
+    if json:
+        emit({"name": name, "scope": scope, "key": token})
+        return
+    typer.echo(token)
+    typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
+
+
+@keys.command("list")
+@reporting_errors
+def list_keys(json: JsonFlag = False) -> None:
+    """All keys, without their secrets."""
+    found = _key_file().list()
+    if json:
+        emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
+        return
+    table = Table("name", "scope", "created", "revoked", box=None, header_style="bold")
+    for key in found:
+        table.add_row(key.name, key.scope, key.created, key.revoked or "")
+    Console().print(table if found else "no key; the service is open and answers on this machine only")
+
+
+@keys.command("revoke")
+@reporting_errors
+def revoke_key(name: Annotated[str, typer.Argument(help="Whose key it is.")], json: JsonFlag = False) -> None:
+    """End a key's life; it is refused from the next request on."""
+    _key_file().revoke(name)
+    if json:
+        emit({"name": name, "revoked": True})
+        return
+    typer.echo(f"the key {name} is revoked")
+
+
+def open_client(url: str | None) -> Client:
+    """A client of the API that the settings or the option name."""
+    settings = load_settings()
+    key = settings.api_key.get_secret_value() if settings.api_key else None
+    return Client(url or settings.api_url, key=key)
+
+
+def job_request(values: dict[str, Any]) -> JobRequest:
+    """A job request; InputError names the first option that cannot be used."""
+    try:
+        return JobRequest.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = f"--{first['loc'][0]}: " if first["loc"] else ""
+        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
+
+
+def watch(client: Client, job_id: str) -> JobDetail:
+    """The job in its final state, with progress on standard error meanwhile."""
+    with JobDisplay(Console(stderr=True)) as display:
+        return client.wait(job_id, display.update)
+
+
+def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
+    """Say what became of a job; TaskError if it failed or was cancelled and should not have been."""
+    if json:
+        emit(job_summary(job))
+    else:
+        _print_job(job, url)
+    if must_succeed and job.state in (State.FAILED, State.CANCELLED):
+        why = f": {job.reason}" if job.reason else ""
+        raise TaskError(f"job {job.id[:12]} is {job.state}{why}; `graspd retry {job.id[:12]}` runs it again")
+
+
+def job_summary(job: JobDetail) -> dict[str, Any]:
+    """The keys that scripts rely on (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
+    return {
+        "job": job.id,
+        "state": job.state.value,
+        "hand": job.hand,
+        "object": job.object,
+        "grasps": job.grasps,
+        "valid": job.valid,
+        "progress": job.progress,
+        "reason": job.reason,
+        "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
+        "mean": {
+            name: value
+            for name, value in job.mean.model_dump().items()
+            if name in ("epsilon", "contact_area_cm2", "intersection_volume_cm3")
+        },
+        "shards": [shard.id for shard in job.shards],
+    }
+
+
+def show_asset(asset: dict[str, Any], *, json: bool) -> None:
+    """Say what is known of a hand or object."""
+    if json:
+        emit(asset)
+        return
+    console = Console(highlight=False)
+    for name in ("name", "kind", "filename", "size_bytes", "digest", "created", "verdict", "message"):
+        if asset.get(name) is not None:
+            console.print(f"{name:<11} {asset[name]}", markup=False)
+    for line in asset.get("repairs", []):
+        console.print(f"{'repair':<11} {line}", markup=False)
+    for name, value in asset.get("facts", {}).items():
+        console.print(f"{name:<11} {value}", markup=False)
+
+
+def _print_job(job: JobDetail, url: str) -> None:
+    console = Console(highlight=False)
+    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False)
+    if job.reason:
+        console.print(f"reason: {job.reason}", markup=False)
+    table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
+    for stage in job.stages:
+        done = f"{stage.succeeded} of {stage.tasks}"
+        table.add_row(
+            stage.stage, stage.state, done, percent(stage.progress), duration(stage.seconds), duration(stage.eta_s)
+        )
+    console.print(table)
+    if job.grasps:
+        mean = job.mean
+        console.print(
+            f"{count(job.valid)} of {count(job.grasps)} grasps valid; mean ε {metric(mean.epsilon)}, "
+            f"contact {metric(mean.contact_area_cm2)} cm², intersection {metric(mean.intersection_volume_cm3)} cm³",
+            markup=False,
+        )
+
+
+def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
+    """The name of a hand or object; a path that exists is uploaded and checked first."""
+    path = Path(value)
+    is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
+    if not is_file_name:
+        return value
+    if not path.is_file():
+        raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
+    asset = client.upload(kind, path, name=name_of_upload(path.name))
+    if not asset.builtin and (asset := client.wait_checked(kind, asset.name)).verdict == "refuse":
+        raise InputError(f"{value} was refused: {asset.message}")
+    return asset.name
+
+
+def _full_id(client: Client, prefix: str) -> str:
+    """The id of the one job that begins so, among the latest."""
+    if len(prefix) >= 32:
+        return prefix
+    found: list[Job] = [job for job in client.jobs(limit=200).items if job.id.startswith(prefix)]
+    if len(found) > 1:
+        raise InputError(f"{len(found)} jobs begin with {prefix!r}; give more letters")
+    return found[0].id if found else prefix
+
+
+def _key_file() -> KeyFile:
+    return KeyFile(load_settings().data_dir / "keys.json")

@@ -1,0 +1,198 @@
+"""`graspd demo`: the whole service on this machine, one real job through it over HTTP, and a page of what came out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from api.client import Client
+from api.commands import job_request, job_summary
+from api.dashboard.filters import count, duration, metric
+from api.models import GraspQuery, JobDetail
+from api.watching import JobDisplay
+from service.assets import builtin_files
+from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.domain import AssetKind, JobRequest, State
+from service.errors import TaskError
+from service.index.views import GraspView
+from service.shards import Shard, read_shard
+from service.supervisor import Supervisor
+from worker.hands.load import load_hand
+from worker.objects.prepare import load_object
+from worker.rendering.pictures import grasp_pictures
+from worker.rendering.sheets import best, contact_sheet, figures, views_page
+
+app = typer.Typer()
+
+
+@dataclass(frozen=True)
+class Results:
+    """Paths of what the demo leaves behind."""
+
+    shards: list[Path]
+    pictures: list[Path]
+    page: Path
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "shards": [str(path) for path in self.shards],
+            "pictures": [str(path) for path in self.pictures],
+            "page": str(self.page),
+        }
+
+
+#: A first start on a cold machine compiles Warp kernels before the worker answers.
+_READY_S: Final = 120.0
+_SHOWN_GRASPS: Final = 12
+
+
+@app.command("demo", epilog="graspd demo --out demo-out --grasps 32 --scenes 2 --views 3")
+@reporting_errors
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the service's data and the files it makes.")] = Path("demo-out"),
+    hand: Annotated[str, typer.Option(help="A built-in hand.")] = "allegro",
+    object: Annotated[str, typer.Option(help="A built-in object.")] = "mug",
+    grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
+    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 2,
+    views: Annotated[int, typer.Option(help="Stereo pairs per scene.")] = 3,
+    fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
+    seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """The main job on built-in data: grasps, scenes, pictures, and a page that shows them."""
+    request = job_request(
+        {
+            "hand": hand, "object": object, "grasps": grasps, "scenes": scenes, "views": views,
+            "stereo": views > 0, "fidelity": fidelity, "seed": seed,
+        }
+    )  # fmt: skip
+    console = Console(stderr=json, highlight=False)
+    out.mkdir(parents=True, exist_ok=True)
+    settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
+    with Supervisor(settings, workers=1) as service:
+        with console.status("starting Redis, API, keeper and a worker"):
+            service.wait_ready(_READY_S)
+        console.print(f"the service runs at {service.api_url} until the job is done")
+        with Client(service.api_url) as client:
+            job, top, files = run(client, request, out, console)
+    results = write_pages(out, job, files)
+    if json:
+        emit(job_summary(job) | results.as_json())
+    else:
+        print_results(console, top, job, results)
+
+
+def run(
+    client: Client, request: JobRequest, out: Path, console: Console
+) -> tuple[JobDetail, list[GraspView], list[Path]]:
+    """Submit, watch, and fetch the files.
+
+    Returns:
+        the job, its ten best grasps by epsilon, and the shards' paths.
+
+    Raises:
+        TaskError: the job did not succeed.
+    """
+    job = client.submit(request)
+    console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
+    with JobDisplay(console) as display:
+        job = client.wait(job.id, display.update)
+    if job.state is not State.SUCCEEDED:
+        raise TaskError(f"the job {job.state.value}: {job.reason or 'no reason was kept'}")
+    top = client.grasps(GraspQuery(job=job.id, valid=True), limit=10).items
+    folder = out / "shards"
+    folder.mkdir(exist_ok=True)
+    files = [client.download(shard, folder / f"{shard.kind}-{shard.batch:04}.h5") for shard in job.shards]
+    return job, top, sorted(files)
+
+
+def print_results(console: Console, best: list[GraspView], job: JobDetail, paths: Results) -> None:
+    """The quality table and where everything is."""
+    table = Table(title="Best grasps by ε", title_justify="left", header_style="bold", box=None)
+    for name in ("rank", "ε", "contact [cm²]", "intersection [cm³]", "penetration [mm]", "shard row"):
+        table.add_column(name, justify="right")
+    for rank, grasp in enumerate(best, start=1):
+        values = (
+            grasp.epsilon, grasp.contact_area_cm2, grasp.intersection_volume_cm3, grasp.penetration_depth_mm,
+        )  # fmt: skip
+        table.add_row(str(rank), *(metric(value) for value in values), f"{grasp.shard_id[:8]}:{grasp.row}")
+    console.print(table)
+    mean = job.mean
+    console.print(
+        f"\n{count(job.valid)} of {count(job.grasps)} grasps valid; mean ε {metric(mean.epsilon)}, contact "
+        f"{metric(mean.contact_area_cm2)} cm², intersection {metric(mean.intersection_volume_cm3)} cm³"
+    )
+    for stage in job.stages:
+        console.print(f"{stage.stage.value:<11} {stage.tasks} tasks in {duration(stage.seconds)} of worker time")
+    for path in (*paths.shards, *paths.pictures, paths.page):
+        console.print(str(path), soft_wrap=True)
+
+
+def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
+    """The contact sheet of the best grasps, the views of the first batch, and an index.html that shows both."""
+    pictures = []
+    bases = [path for path in shards if path.name.startswith("base")]
+    views = [path for path in shards if path.name.startswith("views")]
+    if bases:
+        pictures.append(_write(out / "grasps.png", draw_grasps(job, read_shard(bases[0], kind="base"))))
+    if views:
+        title = f"Views of the {job.object}"
+        data = read_shard(views[0], kind="views")
+        subtitle = f"{len(data['image/rgb'])} pictures of {job.request.scenes} scenes; depth in metres"
+        pictures.append(_write(out / "views.png", views_page(data.arrays, title=title, subtitle=subtitle)))
+    page = _write(out / "index.html", html_page(job, pictures, shards, out).encode())
+    return Results(shards, pictures, page)
+
+
+def draw_grasps(job: JobDetail, base: Shard) -> bytes:
+    """PNG of the best grasps of a shard, ranked by ε."""
+    hand_files, object_files = (
+        builtin_files(kind, name) for kind, name in ((AssetKind.HAND, job.hand), (AssetKind.OBJECT, job.object))
+    )
+    hand = load_hand(hand_files, name=job.hand, digest=job.hand_digest)
+    error_m = job.request.knobs.face_error_m
+    obj = load_object(object_files, name=job.object, digest=job.object_digest, face_error_m=error_m)
+    rows = best(base.arrays, _SHOWN_GRASPS)
+    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    pictures = grasp_pictures(hand, obj, poses, joints)[:, 0]
+    title = f"{job.hand} × {job.object}"
+    subtitle = f"the best {len(rows)} of {job.grasps} grasps by ε; {job.valid} are valid"
+    return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
+
+
+def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Path) -> str:
+    """A page that needs no server and no script."""
+    title = f"{escape(job.hand)} × {escape(job.object)}"
+    images = "".join(
+        f'<figure><a href="{p.name}"><img src="{p.name}" alt="{_ALT[p.stem]}"></a></figure>' for p in pictures
+    )
+    files = "".join(f"<li><a href='{p.relative_to(out)}'>{p.relative_to(out)}</a></li>" for p in shards)
+    return _HTML.format(title=title, valid=job.valid, grasps=job.grasps, job=job.id, images=images, files=files)
+
+
+def _write(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
+
+
+_ALT: Final = {"grasps": "The best grasps with their quality", "views": "Rendered views with depth and segmentation"}
+_HTML: Final = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>
+<style>
+:root {{ color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }}
+body {{ max-width: 1180px; margin: 40px auto; padding: 0 20px; }}
+figure {{ margin: 24px 0; }} img {{ max-width: 100%; border-radius: 8px; }} code {{ overflow-wrap: anywhere; }}
+</style>
+<h1>{title}</h1>
+<p>{valid} of {grasps} grasps are valid. Job <code>{job}</code>.</p>
+{images}
+<h2>Files</h2><ul>{files}</ul>
+</html>
+"""

@@ -1,0 +1,34 @@
+"""The front door is light: it pulls in no engine."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("warp", "newton", "trimesh", "mujoco", "scipy", "yourdfpy", "worker")
+
+
+def modules_after(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys\nprint(*sorted({{name.partition('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize("statement", ["import api.app", "import api.commands", "import api.client"])
+def test_the_front_door_imports_no_engine(statement: str) -> None:
+    assert modules_after(statement).isdisjoint(HEAVY)
+
+
+OVERVIEW = """
+import contextlib, io, sys
+import graspd
+sys.argv = ["graspd", "--help"]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    graspd.main()
+"""
+
+
+def test_the_overview_of_commands_imports_no_room() -> None:
+    assert modules_after(OVERVIEW).isdisjoint({*HEAVY, "fastapi", "sqlalchemy", "h5py", "numpy"})

@@ -1,0 +1,135 @@
+"""Every error is a problem document that names what is wrong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from service.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
+from service.parts import Parts
+
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+
+
+def problem(answer: Any, status: int, slug: str) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    document = answer.json()
+    assert document["type"] == f"/problems/{slug}"
+    assert document["status"] == status
+    assert document["request_id"] == answer.headers["x-request-id"]
+    assert "\n" not in document["detail"]
+    return document
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer", "words"),
+    [
+        ({"grasps": 0}, "#/grasps", "greater than or equal to 1"),
+        ({"grasps": -3}, "#/grasps", "greater than or equal to 1"),
+        ({"fidelity": "perfect"}, "#/fidelity", "draft, standard, fine"),
+        ({"seed": "x"}, "#/seed", "integer"),
+        ({"colour": "red"}, "#/colour", "not permitted"),
+        ({"views": 3}, "#", "scenes >= 1"),
+        ({"hand": "../etc"}, "#/hand", "pattern"),
+    ],
+)
+def test_a_field_in_error_is_pointed_at(http: TestClient, change: dict[str, Any], pointer: str, words: str) -> None:
+    document = problem(http.post("/v1/jobs", json=JOB | change), 422, "invalid-input")
+    first = document["errors"][0]
+    assert first["pointer"] == pointer
+    assert words in first["detail"]
+
+
+def test_a_body_that_is_no_json_is_said_so(http: TestClient) -> None:
+    answer = http.post("/v1/jobs", content=b"{hand: allegro", headers={"Content-Type": "application/json"})
+    assert "not JSON" in problem(answer, 400, "bad-request")["detail"]
+
+
+def test_an_unknown_hand_names_the_hand(http: TestClient) -> None:
+    assert "claw" in problem(http.post("/v1/jobs", json=JOB | {"hand": "claw"}), 404, "not-found")["detail"]
+
+
+def test_an_unknown_object_names_the_object(http: TestClient) -> None:
+    assert "teapot" in problem(http.post("/v1/jobs", json=JOB | {"object": "teapot"}), 404, "not-found")["detail"]
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs/none", "/v1/shards/none", "/v1/shards/none/file", "/v1/hands/none"])
+def test_an_unknown_id_is_not_found(http: TestClient, path: str) -> None:
+    assert "none" in problem(http.get(path), 404, "not-found")["detail"]
+
+
+def test_an_unknown_address_is_not_found(http: TestClient) -> None:
+    problem(http.get("/v1/nowhere"), 404, "not-found")
+
+
+def test_a_wrong_method_is_named_with_what_is_allowed(http: TestClient) -> None:
+    answer = http.delete("/v1/jobs")
+    problem(answer, 405, "method-not-allowed")
+    assert "GET" in answer.headers["allow"]
+
+
+def test_a_damaged_cursor_is_refused(http: TestClient) -> None:
+    problem(http.get("/v1/jobs", params={"cursor": "xyz"}), 422, "invalid-input")
+
+
+@pytest.mark.parametrize("limit", [0, 201])
+def test_a_page_has_between_1_and_200_items(http: TestClient, limit: int) -> None:
+    problem(http.get("/v1/jobs", params={"limit": limit}), 422, "invalid-input")
+
+
+def test_a_body_over_the_limit_is_refused_by_its_length(http: TestClient) -> None:
+    problem(http.post("/v1/jobs", content=b" " * (2 << 20)), 413, "too-large")
+
+
+def test_a_body_that_grows_over_the_limit_is_refused_while_it_arrives(http: TestClient) -> None:
+    answer = http.post("/v1/jobs", content=(b" " * 65536 for _ in range(32)))
+    problem(answer, 413, "too-large")
+
+
+@pytest.mark.parametrize(
+    ("part", "method", "error", "slug"),
+    [
+        ("queue", "ping", QueueUnavailable("Redis does not answer"), "queue-unavailable"),
+        ("store", "put", StoreUnavailable("the store cannot be written"), "store-unavailable"),
+        ("index", "add_job", IndexUnavailable("the index does not answer"), "index-unavailable"),
+    ],
+)
+def test_a_part_that_is_away_is_503_and_worth_another_try(
+    http: TestClient, parts: Parts, monkeypatch: pytest.MonkeyPatch, part: str, method: str, error: Exception, slug: str
+) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(type(getattr(parts, part)), method, away)
+    answer = http.post("/v1/jobs", json=JOB)
+    assert problem(answer, 503, slug)["detail"] == str(error)
+    assert int(answer.headers["retry-after"]) > 0
+
+
+def test_an_unforeseen_error_tells_nothing_of_its_inside(
+    app: FastAPI, http: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def burst() -> None:
+        raise RuntimeError("secret: /home/someone")
+
+    monkeypatch.setattr(app.state.catalog, "stats", burst)
+    document = problem(http.get("/v1/stats"), 500, "internal")
+    assert "secret" not in str(document)
+
+
+def test_every_problem_answer_has_the_security_headers(http: TestClient) -> None:
+    headers = http.get("/v1/nowhere").headers
+    assert "default-src 'none'" in headers["content-security-policy"]
+    assert "unsafe" not in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_a_page_that_does_not_exist_is_a_page_in_a_browser(http: TestClient) -> None:
+    answer = http.get("/jobs/none", headers={"Accept": "text/html"})
+    assert answer.status_code == 404
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "none" in answer.text
