@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
-from service.domain import JobRequest
-from service.index.views import JobView
+import logging
+from collections.abc import Sequence
+
+from service import names
+from service.clock import timestamp
+from service.digests import job_id
+from service.domain import AssetKind, JobRequest, Lane, State
+from service.errors import ConflictError, InputError, UnavailableError
+from service.index.feed import ReadyTask
+from service.index.views import AssetView, JobView
 from service.parts import Parts
+from service.planning import lane_of, message_of
+from service.queue.port import Event, EventKind
+from service.records import JobRecord, add_job_event, job_events, put_record, read_record
+
+log = logging.getLogger(__name__)
 
 
-def submit(parts: Parts, request: JobRequest) -> tuple[JobView, bool]:
+def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tuple[JobView, bool]:
     """Record a job and queue its first tasks. The same request on the same hand and object is the same job.
+
+    Args:
+        lane: bulk for the jobs of a dataset; by default a small job is interactive.
 
     Returns:
         the job, and whether it is new. A failed or cancelled job is returned as it is: `retry` starts it again.
@@ -19,7 +35,24 @@ def submit(parts: Parts, request: JobRequest) -> tuple[JobView, bool]:
         ConflictError: the check of the hand or object is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
-    raise NotImplementedError
+    hand = _usable(parts, AssetKind.HAND, request.hand)
+    obj = _usable(parts, AssetKind.OBJECT, request.object)
+    parts.queue.ping()
+    request = request.model_copy(update={"hand": hand.name, "object": obj.name})
+    record = JobRecord(
+        id=job_id(request, hand.digest, obj.digest),
+        request=request,
+        hand_digest=hand.digest,
+        object_digest=obj.digest,
+        lane=lane or lane_of(request),
+        created=timestamp(),
+    )
+    new = put_record(parts.store, names.job_record(record.id), record)
+    if not new:
+        record = read_record(JobRecord, parts.store, names.job_record(record.id))
+    parts.index.add_job(record)
+    _start(parts, record.id)
+    return parts.index.job(record.id), new
 
 
 def cancel(parts: Parts, job_id: str) -> JobView:
@@ -29,7 +62,17 @@ def cancel(parts: Parts, job_id: str) -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job is already finished.
     """
-    raise NotImplementedError
+    job = parts.index.job(job_id)
+    if job.state.is_final:
+        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+    in_queue = parts.index.unfinished_tasks(job_id)
+    add_job_event(parts.store, job_id, "cancelled")
+    parts.index.set_job_events(job_id, job_events(parts.store, job_id))
+    try:
+        parts.queue.discard(in_queue)
+    except UnavailableError as error:
+        log.warning("job %s is cancelled; its tasks in the queue follow when it answers: %s", job_id, error)
+    return _told(parts, job_id)
 
 
 def retry(parts: Parts, job_id: str) -> JobView:
@@ -39,4 +82,67 @@ def retry(parts: Parts, job_id: str) -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job neither failed nor was cancelled.
     """
-    raise NotImplementedError
+    job = parts.index.job(job_id)
+    if job.state not in (State.FAILED, State.CANCELLED):
+        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
+    add_job_event(parts.store, job_id, "retried", parts.index.failed_tasks(job_id))
+    parts.index.set_job_events(job_id, job_events(parts.store, job_id))
+    _start(parts, job_id)
+    return _told(parts, job_id)
+
+
+def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, again: bool = False) -> int:
+    """Put tasks into the queue and mark them in the index.
+
+    The mark comes first: a task marked but not queued is found missing and queued by the keeper; one queued but not
+    marked might run twice.
+    """
+    added = 0
+    if ready:
+        parts.index.set_queued([task.task.id for task in ready])
+    for lane in Lane:
+        messages = [
+            message_of(
+                task.job,
+                task.task,
+                attempt=task.last_attempt + 1,
+                max_attempt=task.retried_upto + parts.settings.task_attempts,
+            )
+            for task in ready
+            if task.lane is lane
+        ]
+        added += parts.queue.enqueue(messages, lane, again=again) if messages else 0
+    return added
+
+
+def _start(parts: Parts, job_id: str) -> None:
+    """Queue as much of a job as the queue's window holds; the keeper feeds the rest, and all of it if Redis is away."""
+    try:
+        room = parts.settings.queue_window - sum(parts.queue.depths().values())
+        if room > 0:
+            queue_tasks(parts, parts.index.ready_of_job(job_id, limit=room))
+        _told(parts, job_id)
+    except UnavailableError as error:
+        log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
+
+
+def _told(parts: Parts, job_id: str) -> JobView:
+    job = parts.index.job(job_id)
+    try:
+        parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))
+    except UnavailableError as error:
+        log.warning("nobody was told that job %s is %s: %s", job_id, job.state, error)
+    return job
+
+
+def _usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
+    asset = parts.index.asset(kind, name)
+    if asset.verdict == "refuse":
+        raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
+    if asset.verdict is None:
+        raise ConflictError(f"{kind.value} {name!r} is still being checked; submit again in a moment")
+    return asset
+
+
+def _ended(state: State) -> str:
+    return {"succeeded": "succeeded", "failed": "failed", "cancelled": "been cancelled"}[state.value]

@@ -20,6 +20,10 @@ CHAIN: Final = (Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER)
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
 
+#: Longest wait between two attempts of a task [s].
+MAX_BACKOFF_S: Final = 300.0
+
+
 @dataclass(frozen=True)
 class PlannedTask:
     """A task as it follows from its job. `inputs` and `output` are shard ids."""
@@ -100,6 +104,11 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
         inputs=task.inputs,
         output=task.output,
     )
+
+
+def backoff(first_s: float, failures: int) -> float:
+    """Wait before the next attempt [s]: doubles with each failure, up to `MAX_BACKOFF_S`."""
+    return min(MAX_BACKOFF_S, first_s * 2.0 ** max(0, failures - 1))
 
 
 def ingest_id(kind: AssetKind, digest: str) -> str:

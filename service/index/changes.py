@@ -18,39 +18,41 @@ from service.records import AttemptRecord, JobEvent, JobRecord
 
 
 class Changes(Database):
-    """Writes of the index."""
+    """Writes of the index. `within` makes a write part of a larger transaction."""
 
-    def add_job(self, record: JobRecord) -> State:
+    def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """A job with all its tasks; those whose shard is there already have succeeded."""
-        with self.writing() as connection:
+        with self.writing(within) as connection:
             return self._add_job(connection, record)
 
-    def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
+    def add_manifest(self, manifest: ShardManifest, *, within: Connection | None = None) -> dict[str, State]:
         """A shard, its grasps, and the success of every task, of whatever job, that was to make it.
 
         Returns:
             the states of the jobs concerned.
         """
-        with self.writing() as connection:
+        with self.writing(within) as connection:
             return self._add_manifest(connection, manifest)
 
-    def add_attempt(self, attempt: AttemptRecord, *, not_before: float = 0.0) -> State | None:
+    def add_attempt(
+        self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
+    ) -> State | None:
         """A failed attempt. Returns the job's state, None if the index knows no such task.
 
         Args:
             not_before: `time.time` before which the next attempt must not be queued.
         """
-        with self.writing() as connection:
+        with self.writing(within) as connection:
             return self._add_attempt(connection, attempt, not_before)
 
-    def set_job_events(self, job_id: str, events: Sequence[JobEvent]) -> State:
+    def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
         """What users did to a job: all its events so far, in order."""
-        with self.writing() as connection:
+        with self.writing(within) as connection:
             return self._set_job_events(connection, job_id, events)
 
-    def add_asset(self, asset: Asset, check: Mapping[str, Any] | None) -> None:
+    def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
         """A hand or object, with what ingest found, None while that is to come."""
-        with self.writing() as connection:
+        with self.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
@@ -96,14 +98,16 @@ class Changes(Database):
             for some in _chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
 
-    def set_waiting(self, task_ids: Sequence[str], *, not_before: float = 0.0) -> dict[str, State]:
+    def set_waiting(
+        self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
+    ) -> dict[str, State]:
         """Tasks that are neither in the queue nor with a worker: to be queued again after `not_before`.
 
         Returns:
             the states of the jobs concerned.
         """
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
-        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": None}
+        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message}
         touched: set[str] = set()
         with self.writing() as connection:
             for some in _chunks(task_ids):
@@ -190,11 +194,10 @@ class Changes(Database):
         connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
         for event in events:
             for task_id, upto in event.retried.items():
-                connection.execute(
-                    update(tasks)
-                    .where(tasks.c.id == task_id, tasks.c.retried_upto < upto)
-                    .values(retried_upto=upto, queued=False, not_before=0.0, finished=None, reason=None, worker=None)
-                )
+                task = (tasks.c.id == task_id, tasks.c.done.is_(False), tasks.c.retried_upto < upto)
+                fresh = {"reason": None, "finished": None, "worker": None, "queued": False, "not_before": 0.0}
+                connection.execute(update(tasks).where(*task, tasks.c.last_attempt <= upto).values(**fresh))
+                connection.execute(update(tasks).where(*task).values(retried_upto=upto))
         return settle(connection, job_id)
 
 

@@ -49,8 +49,11 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
-        """A transaction: all of it is kept or nothing. Threads of one process take turns."""
+    def writing(self, within: Connection | None = None) -> Iterator[Connection]:
+        """A transaction, or part of the one given: all of it is kept or nothing. Threads of one process take turns."""
+        if within is not None:
+            yield within
+            return
         with _mapped(), self._write_lock, self._engine.connect() as connection:
             if connection.dialect.name == "sqlite":
                 # A transaction that reads first and writes later fails at once when another one wrote in between.

@@ -6,12 +6,12 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Column, ColumnElement, or_, select
 
 from service.domain import AssetKind, Lane, Stage, State
 from service.index.database import Database
 from service.index.tables import assets, jobs, tasks
-from service.planning import PlannedTask
+from service.planning import MAX_BACKOFF_S, PlannedTask
 from service.records import JobRecord
 
 
@@ -45,7 +45,7 @@ class Feed(Database):
             select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest, jobs.c.created)
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.ready.is_(True), tasks.c.queued.is_(False), tasks.c.lane == lane.value)
-            .where(tasks.c.not_before <= now)
+            .where(_due(tasks.c.not_before, now))
             .order_by(tasks.c.batch, jobs.c.created, tasks.c.job_id)
             .limit(limit)
         )
@@ -66,7 +66,7 @@ class Feed(Database):
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
         """Uploads to be checked, oldest first."""
-        open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), assets.c.not_before <= now)
+        open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
         query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
         with self.reading() as connection:
             return [
@@ -89,11 +89,16 @@ class Feed(Database):
         with self.reading() as connection:
             return {task: (stage, shard) for task, stage, shard in connection.execute(query)}
 
-    def stopped(self, task_ids: Collection[str]) -> set[str]:
-        """Those of the tasks that should not be with a worker: cancelled, or unknown to the index."""
-        query = select(tasks.c.id).where(tasks.c.id.in_(list(task_ids)), tasks.c.state != State.CANCELLED.value)
+    def cancelled(self, task_ids: Collection[str]) -> set[str]:
+        """Those of the tasks that are cancelled."""
+        query = select(tasks.c.id).where(tasks.c.id.in_(list(task_ids)), tasks.c.state == State.CANCELLED.value)
         with self.reading() as connection:
-            return set(task_ids) - set(connection.scalars(query))
+            return set(connection.scalars(query))
+
+    def has_jobs(self) -> bool:
+        """Whether the index knows any job."""
+        with self.reading() as connection:
+            return connection.scalar(select(jobs.c.id).limit(1)) is not None
 
     def failed_tasks(self, job_id: str) -> dict[str, int]:
         """Failed and cancelled tasks of a job with the number of their last attempt."""
@@ -107,6 +112,11 @@ class Feed(Database):
         query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
         with self.reading() as connection:
             return list(connection.scalars(query))
+
+
+def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
+    # A wait longer than any back-off means that the clock was set back: then the task is due as well.
+    return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
 
 def _ready(row: Any) -> ReadyTask:

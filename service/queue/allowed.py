@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
+from redis.exceptions import RedisError
 from rq import Queue
+from rq.exceptions import NoSuchJobError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
@@ -38,6 +40,17 @@ class AllowedJob(Job):  # type: ignore[misc]
         if function is None:
             raise TaskRefused("this process runs no tasks; start `graspd worker`")
         return function
+
+    @classmethod
+    def fetch(cls, *args: Any, **options: Any) -> AllowedJob:
+        """A job from Redis. One that cannot be read counts as gone: it must not end the worker that took it."""
+        try:
+            job: AllowedJob = super().fetch(*args, **options)
+        except (NoSuchJobError, RedisError):
+            raise
+        except Exception as error:
+            raise NoSuchJobError(f"an entry of the queue cannot be read: {error}") from None
+        return job
 
     def restore(self, raw_data: Any) -> None:
         """Read a job from Redis without what could reach outside graspd or outlive its use."""

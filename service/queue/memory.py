@@ -31,6 +31,7 @@ class MemoryQueue:
     _cancelled: set[str] = field(default_factory=set)
     _events: list[Event] = field(default_factory=list)
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
+    _announced: dict[str, float] = field(default_factory=dict)
     _read: int = 0
     _acknowledged: set[str] = field(default_factory=set)
     _numbers: itertools.count[int] = field(default_factory=itertools.count)
@@ -96,6 +97,12 @@ class MemoryQueue:
             start = len(self._events) if after == "$" else int(after)
             self._changed.wait_for(lambda: len(self._events) > start, timeout=wait_s)
             return [(str(i + 1), e) for i, e in enumerate(self._events) if i >= start][:limit]
+
+    def announce(self, part: str, seconds: float) -> None:
+        self._announced[part] = time.monotonic() + seconds
+
+    def announced(self, part: str) -> bool:
+        return self._announced.get(part, 0.0) > time.monotonic()
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -47,6 +47,8 @@ class Event(Model):
     message: str = ""
     last: bool = False
     seconds: float = 0.0
+    output: str = ""
+    """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
 
     # A newer worker may say more than an older keeper knows.
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -131,6 +133,12 @@ class TaskQueue(Protocol):
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Events after an id, for any number of readers (SSE). `"$"`: only what comes from now on; `"0"`: all kept."""
+
+    def announce(self, part: str, seconds: float) -> None:
+        """Say that a part of the service (the keeper) lives, for that long."""
+
+    def announced(self, part: str) -> bool:
+        """Whether a part said so."""
 
     def close(self) -> None:
         """Give the connections back."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+import zlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
@@ -19,7 +20,6 @@ from redis.backoff import ExponentialBackoff
 from redis.exceptions import RedisError, ResponseError
 from redis.retry import Retry
 from rq.exceptions import DuplicateJobError
-from rq.serializers import JSONSerializer
 
 from service.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.embedded import redis_url
@@ -35,6 +35,7 @@ WORKERS: Final = "graspd:workers"
 _GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
 _SOCKET_TIMEOUT_S: Final = 10.0
+_NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
 #: Later stages first: a batch that was begun is finished before the next begins.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 
@@ -184,6 +185,14 @@ class RqQueue:
             block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
             return self._events(self.connection.xread({EVENTS: after}, count=limit, block=block))
 
+    def announce(self, part: str, seconds: float) -> None:
+        with _mapped():
+            self.connection.set(f"graspd:part:{part}", "1", px=int(seconds * 1000))
+
+    def announced(self, part: str) -> bool:
+        with _mapped():
+            return bool(self.connection.exists(f"graspd:part:{part}"))
+
     def close(self) -> None:
         self.connection.close()
 
@@ -201,12 +210,12 @@ class RqQueue:
 
 def connect(url: str, *, patience: int = 3) -> Redis:
     """A client that reconnects by itself; `patience` is how often it tries before it gives up."""
+    over_network: dict[str, Any] = {} if url.startswith("unix:") else _NETWORK
     try:
         return Redis.from_url(
             url,
+            **over_network,
             socket_timeout=_SOCKET_TIMEOUT_S,
-            socket_connect_timeout=3.0,
-            socket_keepalive=True if not url.startswith("unix:") else None,
             health_check_interval=30,
             retry=Retry(ExponentialBackoff(cap=1.0, base=0.05), patience),
         )
@@ -257,10 +266,8 @@ def _queue_keys() -> list[str]:
 def _message(data: bytes | None) -> Message | None:
     if data is None:
         return None
-    job = AllowedJob(serializer=JSONSerializer, connection=None)
     try:
-        job.restore({b"data": data})
-        raw = job.args[0]
+        _name, _instance, (raw, *_), _options = json.loads(zlib.decompress(data))
         return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
     except Exception:  # forged data may fail anywhere
         return None

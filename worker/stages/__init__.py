@@ -1,0 +1,35 @@
+"""From a task to a shard. Only here do store and queue meet the engine; each stage loads, calls, and hands back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+from service.domain import Stage
+
+if TYPE_CHECKING:
+    from worker.context import TaskContext
+    from worker.runner import StageFunction
+    from worker.stages.output import Output
+
+_MODULES: Final = {
+    Stage.INGEST: "worker.stages.ingest",
+    Stage.SYNTHESIZE: "worker.stages.synthesize",
+    Stage.SCENE: "worker.stages.scene",
+    Stage.RENDER: "worker.stages.render",
+}
+
+
+def stage_table() -> Mapping[Stage, StageFunction]:
+    """The real stages. Their modules are imported on the first task, so that a worker is there at once."""
+    return {stage: _Lazy(module) for stage, module in _MODULES.items()}
+
+
+class _Lazy:
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __call__(self, message: Any, context: TaskContext) -> Output | None:
+        made: Output | None = import_module(self._module).run(message, context)
+        return made

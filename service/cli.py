@@ -1,0 +1,85 @@
+"""What the commands of all rooms share: one-line errors with exit codes, JSON on the last line, logs."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar
+
+import typer
+from pydantic import BaseModel, ValidationError
+
+from service.errors import GraspdError, InputError
+from service.settings import Settings
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on the last line.")]
+
+
+def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """Turn errors into one line on stderr and an exit code: 2 for the caller's mistake, 1 for anything else."""
+
+    @functools.wraps(command)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return command(*args, **kwargs)
+        except GraspdError as error:
+            fail(str(error), error.exit_code)
+        except ValidationError as error:
+            fail(validation_line(error), InputError.exit_code)
+        except BrokenPipeError:
+            # The reader (head, less) has enough; Python must not complain about it at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except KeyboardInterrupt:
+            fail("interrupted", 130)
+
+    return wrapper
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Say what is wrong on stderr and end with that exit code."""
+    typer.echo(f"graspd: {' '.join(message.split())}", err=True)
+    raise typer.Exit(code)
+
+
+def emit(value: BaseModel | dict[str, Any]) -> None:
+    """One JSON object on one line of stdout."""
+    plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
+    typer.echo(json.dumps(plain, allow_nan=False, default=str))
+
+
+def load_settings(**overrides: Any) -> Settings:
+    """Settings of the environment, with those options of a command that were given; InputError for a bad value."""
+    try:
+        return Settings(**{name: value for name, value in overrides.items() if value is not None})
+    except ValidationError as error:
+        raise InputError(validation_line(error)) from None
+
+
+def log_to_stderr(settings: Settings) -> None:
+    """Log lines of this process: time, level, module, message."""
+    logging.basicConfig(
+        level=settings.log_level.upper(),
+        stream=sys.stderr,
+        format="%(asctime)s %(levelname)s %(name)s %(message)s",
+        force=True,
+    )
+    # Alembic tells of every migration check, RQ of every idle poll.
+    for name in ("alembic", "rq.worker", "rq.job", "rq.queue"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+
+
+def validation_line(error: ValidationError) -> str:
+    """The first thing that is wrong with a model's input, in a line."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if error.title == Settings.__name__:
+        where = f"GRASPD_{where.upper()}"
+    return f"{where}: {first['msg']}" if where else first["msg"]

@@ -1,0 +1,114 @@
+"""Commands that run the service itself: up, keeper, index."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
+
+app = typer.Typer(no_args_is_help=True)
+index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store.")
+app.add_typer(index_app, name="index")
+
+_READY_S = 60.0
+DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")]
+
+
+@app.command(epilog="graspd up --workers 2 --port 8000")
+@reporting_errors
+def up(
+    workers: Annotated[int, typer.Option(min=0, help="Worker processes on this machine.")] = 1,
+    host: Annotated[str | None, typer.Option(help="Address the API binds; GRASPD_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port of the API, 0: any; GRASPD_PORT.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device of the workers: cpu, cuda:0, auto; GRASPD_DEVICE.")] = None,
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """The whole service on this machine, until Ctrl-C."""
+    from service.supervisor import Supervisor
+
+    settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
+    log_to_stderr(settings)
+    stop = stop_on_signals()
+    console = Console(stderr=True)
+    supervisor = Supervisor(settings, workers=workers)
+    supervisor.start()
+    try:
+        supervisor.wait_ready(_READY_S)
+        console.print(f"graspd is up: {supervisor.api_url} (data in {supervisor.settings.data_dir}); Ctrl-C stops it")
+        if json:
+            emit({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
+        stop.wait()
+        console.print("stopping ...")
+    finally:
+        supervisor.stop()
+
+
+@app.command(epilog="graspd keeper")
+@reporting_errors
+def keeper(data_dir: DataDir = None) -> None:
+    """Reaper, delayed retries and indexer. One runs in a service; `graspd up` starts it."""
+    from service.keeper import Keeper
+    from service.parts import Parts
+
+    settings = load_settings(data_dir=data_dir)
+    log_to_stderr(settings)
+    stop = stop_on_signals()
+    parts = Parts.open(settings)
+    try:
+        Keeper(parts).run(stop)
+    finally:
+        parts.close()
+
+
+@index_app.command(epilog="graspd index rebuild --check")
+@reporting_errors
+def rebuild(
+    check: Annotated[bool, typer.Option("--check", help="Change nothing; print what would change.")] = False,
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """Make the rows of the index anew from the store. With --check exit code 1 says that they differ."""
+    from service.index.index import Index
+    from service.index.rebuild import differences
+    from service.index.rebuild import rebuild as make
+    from service.store import open_store
+
+    settings = load_settings(data_dir=data_dir)
+    store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
+    found = differences(index, store)
+    counts: dict[str, int] = {} if check else make(index, store)
+    if json:
+        emit({"differences": found, "changed": bool(found) and not check, **counts})
+    else:
+        for line in found:
+            typer.echo(line)
+        typer.echo("the index is what the store says" if not found else f"{len(found)} differences", err=True)
+    index.close()
+    if check and found:
+        raise typer.Exit(1)
+
+
+@index_app.command(epilog="graspd index path")
+@reporting_errors
+def path(data_dir: DataDir = None) -> None:
+    """Print where the index is; a password in the URL is left out."""
+    from sqlalchemy import make_url
+
+    typer.echo(make_url(load_settings(data_dir=data_dir).resolved_index_url).render_as_string(hide_password=True))
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that SIGINT and SIGTERM set."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Not set in the handler itself: it may interrupt the very `wait` whose lock `set` needs.
+        signal.signal(number, lambda *_: threading.Thread(target=stop.set, daemon=True).start())
+    return stop

@@ -1,0 +1,113 @@
+"""From events to the index. An event only says where to look: what enters the index is read from the store."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from service.clock import timestamp
+from service.domain import AssetKind, Stage, State
+from service.errors import UnavailableError
+from service.library import load_asset, load_check
+from service.manifests import load_manifest
+from service.names import attempt as attempt_key
+from service.parts import Parts
+from service.planning import backoff
+from service.queue.port import Event, EventKind
+from service.records import AttemptRecord, read_record
+
+log = logging.getLogger(__name__)
+_REMEMBERED_JOBS: Final = 10_000
+
+
+class Indexer:
+    """Applies events; tells listeners when a job's state changes."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._told: OrderedDict[str, State] = OrderedDict()
+        self._deferrals: dict[str, int] = {}
+
+    def apply(self, events: Sequence[Event]) -> None:
+        """Bring the index up to date. Applying an event twice changes nothing.
+
+        Raises:
+            UnavailableError: a part is away; apply the same events again later.
+        """
+        progress: dict[str, tuple[float, float, str]] = {}
+        for event in events:
+            if event.kind is EventKind.PROGRESS:
+                progress[event.task_id] = (event.done, event.total, event.message)
+                continue
+            progress.pop(event.task_id, None)
+            try:
+                self._apply(event)
+            except UnavailableError:
+                raise
+            except Exception:
+                # Anybody who can write to Redis can put an event there: a bad one must not stop those behind it.
+                log.exception("event %s of task %s is left out", event.kind, event.task_id)
+        if progress:
+            self._parts.index.set_progress(progress)
+
+    def tell(self, states: Mapping[str, State]) -> None:
+        """Publish the states of jobs where they changed."""
+        for job, state in states.items():
+            if self._told.get(job) is not state:
+                self._parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job, message=state.value))
+            self._told[job] = state
+            self._told.move_to_end(job)
+            if len(self._told) > _REMEMBERED_JOBS:
+                self._told.popitem(last=False)
+
+    def finished(self, stage: Stage, output: str) -> None:
+        """Index a shard, or what the check of an asset found."""
+        if stage is Stage.INGEST:
+            kind, _, digest = output.partition("/")
+            self.checked(AssetKind(kind), digest)
+        else:
+            self.tell(self._parts.index.add_manifest(load_manifest(self._parts.store, stage, output)))
+
+    def checked(self, kind: AssetKind, digest: str) -> None:
+        """Index a hand or object as the store has it now."""
+        asset = load_asset(self._parts.store, kind, digest)
+        self._parts.index.add_asset(asset, load_check(self._parts.store, kind, digest))
+
+    def failed(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
+        """Index a failed attempt; the next follows after a back-off, or at once."""
+        wait = 0.0 if at_once else backoff(self._parts.settings.retry_backoff_s, attempt.number)
+        not_before = time.time() + wait
+        state = self._parts.index.add_attempt(attempt, not_before=not_before)
+        if state is not None:
+            self.tell({attempt.job_id: state})
+
+    def _apply(self, event: Event) -> None:
+        if event.kind is EventKind.STARTED:
+            if event.stage is not Stage.INGEST and (
+                started := self._parts.index.set_running(event.task_id, event.worker)
+            ):
+                self.tell(dict([started]))
+        elif event.kind is EventKind.FINISHED and event.stage is not None:
+            self._deferrals.pop(event.task_id, None)
+            self.finished(event.stage, event.output)
+        elif event.kind is EventKind.FAILED:
+            self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
+        elif event.kind is EventKind.DEFERRED:
+            self._defer(event)
+        elif event.kind in (EventKind.RETURNED, EventKind.CANCELLED):
+            self._wait_again(event, 0.0, None)
+
+    def _defer(self, event: Event) -> None:
+        count = self._deferrals[event.task_id] = self._deferrals.get(event.task_id, 0) + 1
+        wait = backoff(self._parts.settings.retry_backoff_s, count)
+        self._wait_again(event, time.time() + wait, f"waits: {event.message}")
+
+    def _wait_again(self, event: Event, not_before: float, message: str | None) -> None:
+        if event.stage is Stage.INGEST:
+            digest = event.output.partition("/")[2]
+            self._parts.index.set_asset_waiting([digest], queued=False, not_before=not_before)
+        else:
+            self.tell(self._parts.index.set_waiting([event.task_id], not_before=not_before, message=message))

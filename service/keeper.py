@@ -1,0 +1,132 @@
+"""The keeper: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+from service import names
+from service.domain import AssetKind, Lane
+from service.errors import UnavailableError
+from service.index.rebuild import rebuild
+from service.indexer import Indexer
+from service.library import load_check, publish_builtins
+from service.parts import Parts
+from service.pipeline import queue_tasks
+from service.planning import ingest_id, ingest_message
+from service.queue.port import Event
+from service.reaper import Reaper
+
+log = logging.getLogger(__name__)
+PART: Final = "keeper"
+_EVENTS_A_ROUND: Final = 1000
+_FORGET_WORKERS_AFTER: Final = timedelta(hours=1)
+_LONGEST_PAUSE_S: Final = 15.0
+
+
+class Keeper:
+    """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
+
+    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts = parts
+        self._indexer = Indexer(parts)
+        self._reaper = Reaper(parts, self._indexer, clock=clock)
+        self._backlog: deque[tuple[str, Event]] = deque()
+        self._started = False
+
+    def run(self, stop: threading.Event) -> None:
+        """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
+        pause = 0.0
+        while not stop.is_set():
+            try:
+                self.round(wait_s=self._parts.settings.keeper_interval_s)
+                pause = 0.0
+            except UnavailableError as error:
+                pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
+                log.warning("%s; the keeper tries again in %.2g s", error, pause)
+                stop.wait(pause)
+            except Exception:
+                pause = min(_LONGEST_PAUSE_S, max(1.0, 2 * pause))
+                log.exception("a round broke off; the keeper goes on in %.2g s", pause)
+                stop.wait(pause)
+
+    def round(self, *, wait_s: float = 0.0) -> None:
+        """Index what came in, then look after queue, leases and workers.
+
+        Raises:
+            UnavailableError: a part is away; the round can be run again.
+        """
+        if not self._started:
+            self._start()
+        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+        self._index_events(wait_s)
+        self._look_after_queue()
+        forget = datetime.now(UTC) - _FORGET_WORKERS_AFTER
+        self._parts.index.set_workers(
+            self._parts.queue.workers(),
+            forget_before=forget.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+        )
+
+    def _start(self) -> None:
+        publish_builtins(self._parts.store)
+        self._index_assets()
+        if not self._parts.index.has_jobs() and next(self._parts.store.list(names.JOBS), None) is not None:
+            log.warning("the index is empty and the store is not: rebuilding the index")
+            rebuild(self._parts.index, self._parts.store)
+        self._started = True
+
+    def _index_assets(self) -> None:
+        for entry in list(self._parts.store.list(names.ASSETS)):
+            _, kind, digest, leaf = entry.key.split("/")
+            if leaf == "asset.json":
+                self._indexer.checked(AssetKind(kind), digest)
+
+    def _index_events(self, wait_s: float) -> None:
+        if not self._backlog:
+            self._backlog.extend(self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s))
+        if self._backlog:
+            self._indexer.apply([event for _, event in self._backlog])
+            self._parts.queue.acknowledge([event_id for event_id, _ in self._backlog])
+            self._backlog.clear()
+
+    def _look_after_queue(self) -> None:
+        # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
+        waiting = self._parts.queue.waiting()
+        leases = self._parts.queue.leases()
+        lost = self._reaper.reap(leases)
+        present = waiting | {lease.task_id for lease in leases if lease not in lost}
+        if stray := self._parts.index.cancelled(present):
+            self._parts.queue.discard(stray)
+        self._reaper.find_missing(present)
+        self._feed(present)
+
+    def _feed(self, present: set[str]) -> None:
+        depths = self._parts.queue.depths()
+        now = time.time()
+        for lane in Lane:
+            room = self._parts.settings.queue_window - sum(n for (of, _), n in depths.items() if of is lane)
+            ready = self._parts.index.ready_tasks(lane, now=now, limit=room) if room > 0 else []
+            # After a rebuild the index does not know what is in the queue already.
+            self._parts.index.set_queued([task.task.id for task in ready if task.task.id in present])
+            queue_tasks(self._parts, [task for task in ready if task.task.id not in present], again=True)
+        self._feed_checks(present, now)
+
+    def _feed_checks(self, present: set[str], now: float) -> None:
+        for check in self._parts.index.ready_checks(now=now, limit=self._parts.settings.queue_window):
+            self._parts.index.set_asset_waiting([check.digest], queued=True)
+            if load_check(self._parts.store, check.kind, check.digest) is not None:
+                self._indexer.checked(check.kind, check.digest)
+            elif ingest_id(check.kind, check.digest) not in present:
+                message = ingest_message(
+                    check.kind,
+                    check.name,
+                    check.digest,
+                    attempt=check.last_attempt + 1,
+                    max_attempt=self._parts.settings.task_attempts,
+                )
+                self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=True)

@@ -1,0 +1,46 @@
+"""Commands of the engine room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli import load_settings, log_to_stderr, reporting_errors
+from service.domain import Stage
+from service.errors import InputError
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.command(epilog="graspd worker --device cuda:0 --stages synthesize,render")
+@reporting_errors
+def worker(
+    device: Annotated[str | None, typer.Option(help="cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
+    stages: Annotated[str | None, typer.Option(help="Stages to serve, with commas between; default: all.")] = None,
+    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
+    burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
+    max_tasks: Annotated[int | None, typer.Option(min=1, help="End after this many tasks.")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
+) -> None:
+    """One worker on one device: takes tasks from the queue until it is told to stop."""
+    from worker.main import run_worker
+
+    settings = load_settings(device=device, threads=threads, data_dir=data_dir)
+    log_to_stderr(settings)
+    ended_well = run_worker(
+        settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
+    )
+    if not ended_well:
+        raise typer.Exit(1)
+
+
+def _parse_stages(text: str | None) -> tuple[Stage, ...]:
+    if text is None:
+        return tuple(Stage)
+    try:
+        return tuple(Stage(part.strip()) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"unknown stages {text!r}; choose from {', '.join(Stage)}") from None

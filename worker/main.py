@@ -1,0 +1,235 @@
+"""The worker process: RQ's loop with graspd's leases, stop reasons and outcomes.
+
+Everything runs in this one process: a CUDA context does not survive a fork, and a new process for each task would load
+kernels and meshes anew each time.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import signal
+import socket
+import time
+from collections.abc import Collection, Mapping
+from typing import Any, Final
+
+from rq import SimpleWorker
+from rq.serializers import JSONSerializer
+from rq.timeouts import BaseDeathPenalty
+
+from service.clock import timestamp
+from service.domain import Stage
+from service.errors import QueueUnavailable
+from service.queue.allowed import AllowedJob, AllowedQueue
+from service.queue.port import Event, EventKind, WorkerBeat
+from service.queue.rq_queue import RqQueue, open_queue, queue_names
+from service.settings import Settings
+from service.store import Store, open_store
+from service.version import PACKAGE_VERSION
+from worker.context import StopReason, TaskContext
+from worker.devices import Device
+from worker.heartbeat import LEASE_KEPT_S, Heartbeat, Hold
+from worker.runner import Runner, StageFunction
+from worker.stages import stage_table
+
+log = logging.getLogger(__name__)
+#: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.
+_PATIENCE: Final = 60
+#: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
+_WORKER_TTL_S: Final = 20
+
+
+class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
+    """RQ's alarm signal comes only when a launch returns, and may come inside RQ's own bookkeeping."""
+
+    def setup_death_penalty(self) -> None:
+        """The heartbeat watches the time instead."""
+
+    def cancel_death_penalty(self) -> None:
+        """Nothing was set up."""
+
+
+class GraspWorker(SimpleWorker):  # type: ignore[misc]
+    """RQ's in-process worker without RQ's maintenance, command channel, alarm and retries: the keeper does all that."""
+
+    death_penalty_class = _NoAlarm
+    queue_class = AllowedQueue
+    job_class = AllowedJob
+    max_connection_wait_time = 2.0
+    log_result_lifespan = False
+
+    def __init__(self, queue: RqQueue, runner: Runner, heart: Heartbeat, surroundings: Surroundings, **rq: Any) -> None:
+        super().__init__(connection=queue.connection, serializer=JSONSerializer, worker_ttl=_WORKER_TTL_S, **rq)
+        self.log_job_description = False
+        self._queue = queue
+        self._runner = runner
+        self._heart = heart
+        self._surroundings = surroundings
+        self._context: TaskContext | None = None
+        self._outcome: Event | None = None
+        AllowedJob.function = self._run_task
+
+    def get_heartbeat_ttl(self, job: Any) -> int:
+        return LEASE_KEPT_S
+
+    def execute_job(self, job: Any, queue: Any) -> None:
+        """One task under a lease; its outcome is told after RQ has closed its books on it."""
+        self._outcome = None
+        self.prepare_execution(job)
+        self._context = self._surroundings.context(_raw(job), self._queue, self.name)
+        hold = Hold(
+            task_id=job.id.rpartition("-")[0],
+            context=self._context,
+            execution=self.execution,
+            registry=job.started_job_registry,
+            timeout_s=self._surroundings.settings.task_timeout_s,
+            started=time.monotonic(),
+        )
+        self._heart.hold(hold)
+        try:
+            self.perform_job(job, queue)
+        finally:
+            self._heart.hold(None, state="stopping" if self._stop_requested else "idle")
+            self._context = None
+        self._tell_outcome()
+        self.set_state("idle")
+
+    def _tell_outcome(self) -> None:
+        if self._outcome is not None:
+            try:
+                self._queue.publish(self._outcome)
+            except QueueUnavailable as error:
+                log.warning("the end of task %s is for the keeper to find: %s", self._outcome.task_id, error)
+
+    def _run_task(self, message: dict[str, Any]) -> None:
+        assert self._context is not None
+        self._outcome = self._runner.run(message, self._context)
+
+    def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
+        """RQ's way to stop a task: there is no child to kill, so the task is asked."""
+        if self._context is not None:
+            self._context.stop(StopReason.CANCELLED)
+
+    def handle_warm_shutdown_request(self) -> None:
+        """SIGTERM: the task at hand stops at its next launch and goes back to the queue."""
+        self._heart.stopping()
+        if self._context is not None:
+            self._context.stop(StopReason.SHUTDOWN)
+
+    @property
+    def should_run_maintenance_tasks(self) -> bool:
+        """Never: the keeper reaps, and RQ's own maintenance would fail tasks that the keeper queues again."""
+        return False
+
+    @property
+    def was_told_to_stop(self) -> bool:
+        """Whether a signal ended the loop."""
+        return self._shutdown_requested_date is not None
+
+    def subscribe(self) -> None:
+        """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
+
+    def unsubscribe(self) -> None:
+        """There is no channel."""
+
+    def procline(self, message: str) -> None:
+        """The process keeps its name."""
+
+
+def _raw(job: Any) -> Mapping[str, Any]:
+    try:
+        return job.args[0] if isinstance(job.args[0], dict) else {}
+    except Exception:  # forged data may fail anywhere; running the job then says what is wrong with it
+        return {}
+
+
+class Surroundings:
+    """What a task gets besides its message."""
+
+    def __init__(self, settings: Settings, store: Store, device: Device) -> None:
+        self.settings = settings
+        self.store = store
+        self._device = device
+
+    def context(self, raw: Mapping[str, Any], queue: RqQueue, worker: str) -> TaskContext:
+        """The context of a task, which tells its progress to the queue."""
+
+        def tell(done: float, total: float, message: str) -> None:
+            event = Event(
+                kind=EventKind.PROGRESS,
+                at=timestamp(),
+                task_id=raw["task_id"],
+                job_id=raw.get("job_id", ""),
+                stage=raw["stage"],
+                batch=raw.get("batch", 0),
+                attempt=raw["attempt"],
+                worker=worker,
+                done=done,
+                total=total,
+                message=message[:200],
+            )
+            try:
+                queue.publish(event)
+            except QueueUnavailable:
+                log.debug("nobody could be told about the progress of %s", raw["task_id"])
+
+        device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
+        return TaskContext(self.store, device=device, threads=self.settings.threads, tell=tell)
+
+
+def run_worker(
+    settings: Settings,
+    *,
+    stages: Collection[Stage] = tuple(Stage),
+    table: Mapping[Stage, StageFunction] | None = None,
+    burst: bool = False,
+    max_tasks: int | None = None,
+) -> bool:
+    """Do tasks until told to stop; with `burst` until none waits, with `max_tasks` that many.
+
+    Args:
+        table: what each stage does; the real ones by default.
+
+    Returns:
+        False if the worker ended because something broke.
+
+    Raises:
+        InputError: there is no such device.
+        QueueUnavailable, StoreUnavailable: at the start.
+    """
+    queue = open_queue(settings, patience=_PATIENCE)
+    name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+    device = Device(settings.device)
+    store = open_store(settings.resolved_store_url)
+    queue.ping()
+    heart = Heartbeat(queue.connection, _first_beat(name, device, stages), lease_s=settings.lease_s)
+    runner = Runner(table if table is not None else stage_table(), worker=name, publish=queue.publish)
+    surroundings = Surroundings(settings, store, device)
+    worker = GraspWorker(queue, runner, heart, surroundings, queues=queue_names(stages), name=name)
+    heart.start()
+    device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
+    try:
+        worker.work(burst=burst, max_jobs=max_tasks, logging_level="WARNING")
+    finally:
+        heart.stop()
+        queue.close()
+    return burst or max_tasks is not None or worker.was_told_to_stop
+
+
+def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerBeat:
+    now = timestamp()
+    return WorkerBeat(
+        name=name,
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        device=device.wanted,
+        device_name=device.name,
+        stages=tuple(stages),
+        version=PACKAGE_VERSION,
+        state="idle",
+        task_id="",
+        started=now,
+        seen=now,
+    )

@@ -1,0 +1,160 @@
+"""From a message to an outcome: runs a task's stage and sorts what may go wrong."""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from service import names
+from service.clock import timestamp
+from service.domain import IngestMessage, Stage, TaskMessage
+from service.errors import InputError, TaskCancelled, TaskRefused, UnavailableError
+from service.manifests import publish_shard, shard_exists
+from service.queue.port import Event, EventKind, Message
+from service.records import AttemptRecord, put_record
+from service.version import TASK_SCHEMA
+from worker.context import StopReason, TaskContext
+from worker.stages.output import Output, shard_of
+
+log = logging.getLogger(__name__)
+#: What a stage is: it makes the arrays of a shard, or, as ingest does, writes what it found itself.
+StageFunction = Callable[[Any, TaskContext], Output | None]
+Publish = Callable[[Event], None]
+_TRACE_CHARACTERS: Final = 8000
+
+_STOPPED: Final = {
+    StopReason.CANCELLED: EventKind.CANCELLED,
+    StopReason.SHUTDOWN: EventKind.RETURNED,
+}
+
+
+class Runner:
+    """Does tasks one after the other with a table of stages."""
+
+    def __init__(self, stages: Mapping[Stage, StageFunction], *, worker: str, publish: Publish) -> None:
+        self._stages = stages
+        self._worker = worker
+        self._publish = publish
+
+    def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
+        """Do a task.
+
+        Returns:
+            what to tell the keeper; None if the task is no longer this worker's.
+
+        Raises:
+            TaskRefused: the message cannot be read, so there is no task to fail.
+        """
+        started, clock = timestamp(), time.monotonic()
+        message = parse_message(raw)
+        try:
+            if raw.get("schema") != TASK_SCHEMA:
+                raise TaskRefused(
+                    f"the task has schema {raw.get('schema')} and this worker knows {TASK_SCHEMA}; "
+                    "run workers and API of one version"
+                )
+            return self._do(message, context)
+        except TaskCancelled:
+            return self._stopped(message, context, started)
+        except UnavailableError as error:
+            return self._event(EventKind.DEFERRED, message, message=str(error))
+        except Exception as error:
+            return self._failed(message, error, context, started)
+        finally:
+            log.info("task %s (%s) took %.2f s", message.task_id, message.stage, time.monotonic() - clock)
+
+    def _do(self, message: Message, context: TaskContext) -> Event:
+        context.check()
+        output = output_of(message)
+        if self._is_done(message, context):
+            return self._event(EventKind.FINISHED, message, output=output, message="was there already")
+        if message.stage not in self._stages:
+            raise TaskRefused(f"this worker does no {message.stage} tasks")
+        self._publish(self._event(EventKind.STARTED, message))
+        clock = time.perf_counter()
+        made = self._stages[message.stage](message, context)
+        seconds = time.perf_counter() - clock
+        if made is not None and isinstance(message, TaskMessage):
+            context.check()
+            manifest, data = shard_of(message, made, device=context.device, seconds=seconds, worker=self._worker)
+            publish_shard(context.store, manifest, data)
+        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
+
+    def _is_done(self, message: Message, context: TaskContext) -> bool:
+        if isinstance(message, IngestMessage):
+            return context.store.exists(names.asset_check(message.kind, message.digest))
+        return shard_exists(context.store, message.stage, message.output)
+
+    def _stopped(self, message: Message, context: TaskContext, started: str) -> Event | None:
+        reason = context.stop_reason
+        if reason is StopReason.TIMEOUT:
+            error = TimeoutError("the task took longer than GRASPD_TASK_TIMEOUT_S allows")
+            return self._failed(message, error, context, started)
+        kind = _STOPPED.get(reason) if reason is not None else EventKind.CANCELLED
+        return None if kind is None else self._event(kind, message, output=output_of(message))
+
+    def _failed(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
+        log.warning("task %s failed: %s", message.task_id, error, exc_info=not isinstance(error, InputError))
+        # Bad input does not get better by trying again.
+        last = isinstance(error, InputError | TaskRefused) or message.attempt >= message.max_attempt
+        attempt = AttemptRecord(
+            task_id=message.task_id,
+            job_id=message.job_id if isinstance(message, TaskMessage) else "",
+            stage=message.stage,
+            number=message.attempt,
+            kind=type(error).__name__,
+            reason=_one_line(error),
+            trace="".join(traceback.format_exception(error))[-_TRACE_CHARACTERS:],
+            worker=self._worker,
+            started=started,
+            ended=timestamp(),
+            last=last,
+        )
+        return self._recorded(message, attempt, context)
+
+    def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
+        try:
+            put_record(context.store, names.attempt(attempt.task_id, attempt.number), attempt)
+        except UnavailableError as error:
+            return self._event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")
+        return self._event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
+
+    def _event(self, kind: EventKind, task: Message, **more: Any) -> Event:
+        facts: dict[str, Any] = {"output": output_of(task)}
+        if isinstance(task, TaskMessage):
+            facts |= {"job_id": task.job_id, "batch": task.batch}
+        return Event(
+            kind=kind,
+            at=timestamp(),
+            task_id=task.task_id,
+            stage=task.stage,
+            attempt=task.attempt,
+            worker=self._worker,
+            **facts | more,
+        )
+
+
+def parse_message(raw: Mapping[str, Any]) -> Message:
+    """The message in a queue entry; TaskRefused if it is none."""
+    try:
+        model = IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage
+        # A newer schema may have more fields; what names the task must still be there, so that it can be refused.
+        known = {field.alias or name for name, field in model.model_fields.items()}
+        return model.model_validate({key: value for key, value in raw.items() if key in known})
+    except (ValidationError, AttributeError) as error:
+        raise TaskRefused(f"the queue holds something that is no task of graspd: {_one_line(error)}") from None
+
+
+def output_of(message: Message) -> str:
+    """What the task makes: a shard id, or kind and digest of the asset it checks."""
+    return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text[:500] if text else type(error).__name__

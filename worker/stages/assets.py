@@ -1,0 +1,49 @@
+"""Hands and objects of the tasks, loaded from the store once and kept while the worker goes on with the same pair."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Final, TypeVar, cast
+
+from service.domain import AssetKind, TaskMessage
+from service.library import load_asset_files
+from service.store import Store
+from worker.hands.load import load_hand
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import load_object
+
+T = TypeVar("T")
+#: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
+_KEPT: Final = 8
+_cache: OrderedDict[Hashable, object] = OrderedDict()
+
+
+def hand_of(store: Store, message: TaskMessage) -> HandModel:
+    """The hand of a task."""
+    name, digest = message.request.hand, message.hand_digest
+    key = (store.url, AssetKind.HAND, name, digest)
+    return _cached(key, lambda: load_hand(load_asset_files(store, AssetKind.HAND, digest), name=name, digest=digest))
+
+
+def object_of(store: Store, message: TaskMessage) -> ObjectModel:
+    """The object of a task, simplified as far as its fidelity allows."""
+    name, digest = message.request.object, message.object_digest
+    error = message.request.knobs.face_error_m
+    key = (store.url, AssetKind.OBJECT, name, digest, error)
+    return _cached(
+        key,
+        lambda: load_object(
+            load_asset_files(store, AssetKind.OBJECT, digest), name=name, digest=digest, face_error_m=error
+        ),
+    )
+
+
+def _cached(key: Hashable, load: Callable[[], T]) -> T:
+    if key not in _cache:
+        _cache[key] = load()
+        if len(_cache) > _KEPT:
+            _cache.popitem(last=False)
+    _cache.move_to_end(key)
+    return cast("T", _cache[key])

@@ -1,0 +1,27 @@
+"""The geometric gate: which grasps are worth a scene. The referee's verdict comes later and is stricter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Deepest hand-object penetration [mm]: about what a finger pad gives under load, and a fifth of what the protocols of
+#: the field refuse (10 mm).
+MAX_PENETRATION_MM: Final = 2.0
+#: Deepest hand-hand penetration [mm]: collision shapes of neighbouring links overlap by this much in real hand models.
+MAX_SELF_PENETRATION_MM: Final = 3.0
+#: Links in contact: one link cannot hold anything against gravity from every side.
+MIN_CONTACT_LINKS: Final = 2
+
+
+def passes(quality: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """1 for each of the N grasps that passes, else 0; a grasp with a nan does not."""
+    ok = (
+        (quality["quality/penetration_depth_mm"] <= MAX_PENETRATION_MM)
+        & (quality["quality/self_penetration_depth_mm"] <= MAX_SELF_PENETRATION_MM)
+        & (quality["quality/contact_links"] >= MIN_CONTACT_LINKS)
+    )
+    return ok.astype(np.uint8)

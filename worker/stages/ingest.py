@@ -1,0 +1,118 @@
+"""Checks an uploaded hand or object in a child process: hostile files may take the child down, not the worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from service import names
+from service.domain import AssetKind, IngestMessage
+from service.library import load_asset_files
+from worker.context import TaskContext
+
+#: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
+MEMORY_LIMIT_BYTES: Final = 4 * 2**30
+CPU_LIMIT_S: Final = 60
+#: A child that waits instead of computing is ended by the clock [s].
+WALL_LIMIT_S: Final = 120.0
+_FINDING_BYTES: Final = 2**20
+
+
+def run(message: IngestMessage, context: TaskContext) -> None:
+    """Check the asset and write `check.json`, whatever is found; a refusal is a finding too."""
+    files = load_asset_files(context.store, message.kind, message.digest)
+    found = check_in_child(message.kind, message.name, files, context)
+    context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+
+
+def check_in_child(
+    kind: AssetKind,
+    name: str,
+    files: dict[str, bytes],
+    context: TaskContext,
+    *,
+    memory_bytes: int = MEMORY_LIMIT_BYTES,
+    cpu_s: int = CPU_LIMIT_S,
+    wall_s: float = WALL_LIMIT_S,
+) -> dict[str, Any]:
+    """What the check of a hand or object says, or a refusal that says how the check itself ended."""
+    with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
+        source, target = Path(folder) / "files.zip", Path(folder) / "check.json"
+        from service.assets import pack
+
+        source.write_bytes(pack(files))
+        limits = [str(memory_bytes), str(cpu_s)]
+        command = [sys.executable, "-m", "worker.stages.ingest", kind.value, name, str(source), str(target), *limits]
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+        ) as child:
+            code = _wait(child, context, wall_s)
+            complaint = (child.stderr.read() if child.stderr else b"")[-4000:].decode(errors="replace")
+        if code == 0 and target.is_file() and target.stat().st_size <= _FINDING_BYTES:
+            return dict(json.loads(target.read_bytes()))
+        return _refusal(kind, name, code, complaint, memory_bytes, cpu_s)
+
+
+def _wait(child: subprocess.Popen[bytes], context: TaskContext, wall_s: float) -> int | None:
+    """Exit code of the child; None if it was ended by the clock. Raises TaskCancelled when the task is."""
+    deadline = time.monotonic() + wall_s
+    try:
+        while time.monotonic() < deadline:
+            context.check()
+            try:
+                return child.wait(timeout=0.1)
+            except subprocess.TimeoutExpired:
+                continue
+        return None
+    finally:
+        if child.poll() is None:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+
+
+def _refusal(
+    kind: AssetKind, name: str, code: int | None, complaint: str, memory_bytes: int, cpu_s: int
+) -> dict[str, Any]:
+    if code in (None, -signal.SIGXCPU, -signal.SIGKILL):
+        why = f"reading it takes longer than {cpu_s} s; simplify it"
+    elif "MemoryError" in complaint or "bad_alloc" in complaint or "Cannot allocate" in complaint:
+        why = f"reading it needs more than {memory_bytes / 2**30:.3g} GiB of memory; simplify it"
+    else:
+        last = complaint.strip().splitlines()[-1:] or [f"exit code {code}"]
+        why = f"reading it ended the checker ({last[0][:200]}); repair or re-export the file"
+    return {"verdict": "refuse", "message": f"{name}: {why}", "repairs": [], "facts": {"kind": kind.value}}
+
+
+def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
+    for limit, value in (
+        (resource.RLIMIT_AS, int(memory_bytes)),
+        (resource.RLIMIT_CPU, int(cpu_s)),
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_FSIZE, _FINDING_BYTES),
+    ):
+        resource.setrlimit(limit, (value, value))
+    from service.assets import unpack
+    from service.library import UNPACKED_LIMIT_BYTES
+
+    files = unpack(Path(source).read_bytes(), limit_bytes=UNPACKED_LIMIT_BYTES)
+    if AssetKind(kind) is AssetKind.HAND:
+        from worker.hands.check import check_hand
+
+        found = check_hand(files, name)
+    else:
+        from worker.objects.check import check_object
+
+        found = check_object(files, name)
+    Path(target).write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    _child(*sys.argv[1:])

@@ -1,0 +1,63 @@
+"""What a stage hands back, and how that becomes a shard with its manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.digests import digest_json
+from service.domain import TaskMessage
+from service.manifests import ShardManifest, manifest_of
+from service.names import SHARD_KINDS
+from service.shards import Attribute, check_columns, json_attribute, write_shard
+
+
+@dataclass(frozen=True)
+class Output:
+    """The columns of a shard, what is special about it, and what the manifest should keep besides."""
+
+    arrays: Mapping[str, NDArray[np.generic]]
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+
+def shard_of(
+    message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str
+) -> tuple[ShardManifest, bytes]:
+    """The shard that a stage made: its manifest and its HDF5 bytes.
+
+    Raises:
+        InputError: the columns do not fit the schema.
+    """
+    kind = SHARD_KINDS[message.stage]
+    request = message.request
+    attributes: dict[str, Attribute] = {
+        "hand": request.hand,
+        "hand_digest": message.hand_digest,
+        "object": request.object,
+        "object_digest": message.object_digest,
+        "method": request.method,
+        "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "seed": request.seed,
+        "batch": message.batch,
+        "device": device,
+        "seconds": round(seconds, 4),
+        "shard_id": message.output,
+        "inputs": list(message.inputs),
+        **output.attributes,
+    }
+    counts = check_columns(kind, output.arrays)  # type: ignore[arg-type]
+    data = write_shard(kind, output.arrays, attributes)  # type: ignore[arg-type]
+    manifest = manifest_of(
+        message, data, output.arrays, counts, device=device, seconds=seconds, worker=worker, info=output.info
+    )
+    return manifest, data
+
+
+def batch_seed(message: TaskMessage) -> int:
+    """Seed of this stage of this batch: batches of a job must not repeat each other's scenes and pictures."""
+    return int(digest_json([message.request.seed, message.stage, message.batch])[:8], 16) % 2**31

@@ -1,0 +1,34 @@
+"""From a scene shard to pictures of it: a views shard."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.domain import Stage, TaskMessage
+from service.names import shard_file
+from service.shards import read_shard
+from worker.context import TaskContext
+from worker.rendering import render
+from worker.stages.assets import object_of
+from worker.stages.output import Output, batch_seed
+
+
+def run(message: TaskMessage, context: TaskContext) -> Output:
+    """Render `request.views` camera placements of each scene."""
+    scene = read_shard(context.store.get(shard_file(Stage.SCENE, message.inputs[0])), kind="scene")
+    obj = object_of(context.store, message)
+    context.check()
+    request = message.request
+    pictures = render(
+        obj,
+        np.asarray(scene["scene/object_pose"], float),
+        views=request.views,
+        stereo=request.stereo,
+        width=request.width,
+        height=request.height,
+        seed=batch_seed(message),
+        device=context.device,
+        progress=context.part(0.0, 1.0),
+        cancelled=context.cancelled,
+    )
+    return Output(pictures, {"scene_shard": message.inputs[0]})

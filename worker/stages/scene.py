@@ -1,0 +1,31 @@
+"""From a base shard to scenes: the object at rest on a table, and each grasp's clearance there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.domain import Stage, TaskMessage
+from service.names import shard_file
+from service.shards import read_shard
+from worker.context import TaskContext
+from worker.grasps import Posture
+from worker.scenes import drop, transfer
+from worker.stages.assets import hand_of, object_of
+from worker.stages.output import Output, batch_seed
+
+
+def run(message: TaskMessage, context: TaskContext) -> Output:
+    """Drop the object `request.scenes` times and carry the grasps of the base shard over."""
+    base = read_shard(context.store.get(shard_file(Stage.SYNTHESIZE, message.inputs[0])), kind="base")
+    hand, obj = hand_of(context.store, message), object_of(context.store, message)
+    context.check()
+    context.progress(0.0, 1.0, "drops")
+    scenes = drop(obj, count=message.request.scenes, seed=batch_seed(message))
+    context.check()
+    context.progress(0.7, 1.0, "table clearance")
+    grasp, pregrasp = (
+        Posture(np.asarray(base[f"{name}/hand_pose"], float), np.asarray(base[f"{name}/joint_positions"], float))
+        for name in ("grasp", "pregrasp")
+    )
+    placed = transfer(hand, grasp, pregrasp, scenes["scene/object_pose"])
+    return Output({**scenes, **placed}, {"base_shard": message.inputs[0], "root_link": hand.root_link})
