@@ -12,6 +12,10 @@ from typing import Final
 
 import warp as wp
 
+from worker import backend
+
+backend.start()
+
 MODULES: Final = ("kinematics", "surface", "contact", "pieces", "penalties", "optimizers", "projection")
 _lock = threading.Lock()
 
