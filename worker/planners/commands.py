@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from service.cli import JsonFlag, emit, reporting_errors
@@ -59,7 +60,7 @@ def synth(
     began = time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, disable=json, transient=True) as bar:
+    with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("starting", total=grasps, rate="")
 
         def report(first: int, count: int) -> Report:
