@@ -7,8 +7,11 @@ the pixel centres: depth, normals and shape indices come from it alone.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
 
 import newton
@@ -20,12 +23,9 @@ from numpy.typing import NDArray
 from service.errors import TaskCancelled
 from worker.rendering import kernels
 from worker.rendering.cameras import Floats, pixel_rays
+from worker.rendering.passes import LightPass, light_passes
 from worker.transforms import compose, pose_from_matrix, quat_from_axis_angle
 
-#: Radius of the lamp's disc seen from the table [rad].
-LAMP_RADIUS: Final = np.radians(3.5)
-#: Sine of the elevation above which the sky shines.
-SKY_EDGE: Final = 0.35
 #: The camera frame of the tracer (x right, y up, looks down -z) in the camera frame used here.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 NO_SHAPE: Final = 0xFFFFFFFF
@@ -142,6 +142,7 @@ class Stage:
             enable_shadows=True, enable_ambient_lighting=False, enable_particles=False, max_distance=100.0
         )
         self._clear = SensorCamera.ClearData(clear_depth=float("inf"), clear_shape_index=NO_SHAPE)
+        self._traced = False
         self._poses = np.zeros((self.worlds, len(self.solids), 7))
         self._poses[..., 3] = 1.0
 
@@ -158,62 +159,64 @@ class Stage:
         )
 
     def shoot(
-        self, shot: Shot, *, tick: Callable[[float], None] | None = None, cancelled: Callable[[], bool]
+        self,
+        shot: Shot,
+        *,
+        threads: int = 0,
+        tick: Callable[[float], None] | None = None,
+        cancelled: Callable[[], bool],
     ) -> Pictures:
-        """Traces all cameras, `PIXELS_TOGETHER` pixels in a launch.
+        """Traces all cameras, `PIXELS_TOGETHER` pixels at a time.
+
+        Args:
+            shot: cameras and light.
+            threads: CPU threads that share the views; 0: one per core this process may use. A GPU takes all at once.
+            tick: told the share that is done.
+            cancelled: asked before every pass.
 
         Raises:
-            TaskCancelled: `cancelled()` answered True between two passes.
+            TaskCancelled: `cancelled()` answered True.
         """
         self._turn(shot.turn)
-        views = len(shot.extrinsics)
-        together = max(1, PIXELS_TOGETHER // (shot.width * shot.height))
-        parts = []
-        for start in range(0, views, together):
-            done, share = start / views, min(together, views - start) / views
+        parts = self._parts(shot, threads or available_cores())
+        done: list[Pictures] = []
+        for group in parts:
+            exposures = [_Exposure(self, shot, views) for views in group]
+            self._expose(exposures, shot, len(done) / sum(map(len, parts)), 1 / len(parts), tick, cancelled)
+            done += [exposure.pictures(shot.samples) for exposure in exposures]
+        return Pictures(*(np.concatenate([getattr(p, name) for p in done]) for name in ("rgb", "depth", "shape")))
 
-            def inner(fraction: float, done: float = done, share: float = share) -> None:
-                if tick is not None:
-                    tick(done + share * fraction)
-
-            parts.append(self._expose(shot, slice(start, start + together), inner, cancelled))
-        return Pictures(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("rgb", "depth", "shape")))
+    def _parts(self, shot: Shot, threads: int) -> list[list[NDArray[np.intp]]]:
+        """Views of each launch, grouped into those that run at the same time."""
+        together = 1 if wp.get_device(self.device).is_cuda else threads
+        views = np.arange(len(shot.extrinsics))
+        groups = -(-len(views) * shot.width * shot.height // PIXELS_TOGETHER)
+        return [
+            [part for part in np.array_split(group, together) if len(part)] for group in np.array_split(views, groups)
+        ]
 
     def _expose(
-        self, shot: Shot, part: slice, tick: Callable[[float], None], cancelled: Callable[[], bool]
-    ) -> Pictures:
-        """All passes of some of the views."""
-        world = shot.world[part]
-        cameras = self._cameras(shot, part)
-        film = _Film(self._sensor, (len(world), shot.height, shot.width))
-        worlds = wp.array(world, dtype=wp.int32, device=self.device)
-        lights = wp.array([_light(shot.lamps[w]) for w in world], dtype=kernels.Light, device=self.device)
-        first: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None
-        for number, (shift, toward, key, sky) in enumerate(_passes(shot)):
-            if cancelled():
-                raise TaskCancelled(f"cancelled after {number} of {shot.samples} passes")
-            rays = _rays(shot, shift, self.device)
-            self._sensor.create_default_light(enable_shadows=True, direction=wp.vec3f(*-toward))
-            self._sensor.update(
-                self._state, cameras, rays, hdr_color_image=film.irradiance, forward_depth_image=film.depth,
-                shape_index_image=film.shape, normal_image=film.normal, world_indices=worlds,
-                clear_data=self._clear, render_config=self._config,
-            )  # fmt: skip
-            wp.launch(
-                kernels.accumulate,
-                dim=film.total.shape,
-                inputs=[
-                    rays, cameras, film.irradiance, film.depth, film.normal, film.shape, self._model.shape_transform,
-                    self._materials, lights, wp.vec3f(*toward), key, sky, number == 0,
-                ],
-                outputs=[film.seen, film.albedo, film.total],
-                device=self.device,
-            )  # fmt: skip
-            if first is None:
-                first = film.depth.numpy().copy(), self._solid_index(film.shape.numpy())
-            tick((number + 1) / shot.samples)
-        assert first is not None
-        return Pictures(film.develop(shot.samples), *first)
+        self,
+        exposures: list[_Exposure],
+        shot: Shot,
+        done: float,
+        share: float,
+        tick: Callable[[float], None] | None,
+        cancelled: Callable[[], bool],
+    ) -> None:
+        """All passes of some exposures, in step: a pass has one lamp."""
+        with ThreadPoolExecutor(len(exposures)) as pool:
+            for number, one in enumerate(light_passes(shot.samples, shot.toward_lamp)):
+                if cancelled():
+                    raise TaskCancelled(f"cancelled after {number} of {shot.samples} passes")
+                rays = _rays(shot, one.shift, self.device)
+                self._sensor.create_default_light(enable_shadows=True, direction=wp.vec3f(*-one.toward))
+                # The first trace of a stage compiles its kernels: one thread must do that alone.
+                run = partial(_trace, rays=rays, one=one, first=number == 0)
+                list(pool.map(run, exposures) if self._traced else map(run, exposures))
+                self._traced = True
+                if tick is not None:
+                    tick(done + share * (number + 1) / shot.samples)
 
     def _turn(self, turn: Floats) -> None:
         """Turns the worlds under the lamp and refits the tracer's tree."""
@@ -221,40 +224,77 @@ class Stage:
         self._model.shape_transform.assign(poses)
         self._model.bvh_refit_shapes(self._state)
 
-    def _cameras(self, shot: Shot, part: slice) -> Any:
+    def _cameras(self, shot: Shot, part: NDArray[np.intp]) -> Any:
         """Tracer poses of some of the cameras in the turned worlds."""
         inverse = np.asarray(np.linalg.inv(shot.extrinsics[part]) @ _FLIP, np.float64)
         poses = compose(_turns(shot.turn)[shot.world[part]], pose_from_matrix(inverse))
         return wp.array(_xyzw(poses), dtype=wp.transformf, device=self.device)
 
-    def _solid_index(self, shape: NDArray[np.uint32]) -> NDArray[np.int64]:
-        return np.where(shape == NO_SHAPE, -1, shape.astype(np.int64) % len(self.solids))
 
+class _Exposure:
+    """Image buffers of some views, and the passes summed in them so far."""
 
-class _Film:
-    """Image buffers of some views."""
+    def __init__(self, stage: Stage, shot: Shot, views: NDArray[np.intp]) -> None:
+        self._stage = stage
+        sensor, device, world = stage._sensor, stage.device, shot.world[views]
+        shape = (len(views), shot.height, shot.width)
+        self._cameras = stage._cameras(shot, views)
+        self._worlds = wp.array(world, dtype=wp.int32, device=device)
+        self._lights = wp.array([_light(shot.lamps[w]) for w in world], dtype=kernels.Light, device=device)
+        self._irradiance = sensor.allocate_image_color_hdr(len(views), shot.width, shot.height)
+        self._depth = sensor.allocate_image_depth_forward(len(views), shot.width, shot.height)
+        self._shape = sensor.allocate_image_shape_index(len(views), shot.width, shot.height)
+        self._normal = sensor.allocate_image_normal(len(views), shot.width, shot.height)
+        self._total = wp.zeros(shape, dtype=wp.vec3f, device=device)
+        self._albedo = wp.zeros_like(self._total)
+        self._seen = wp.full(shape, NO_SHAPE, dtype=wp.uint32, device=device)
+        self._labels: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None
 
-    def __init__(self, sensor: Any, shape: tuple[int, int, int]) -> None:
-        views, height, width = shape
-        self.irradiance = sensor.allocate_image_color_hdr(views, width, height)
-        self.depth = sensor.allocate_image_depth_forward(views, width, height)
-        self.shape = sensor.allocate_image_shape_index(views, width, height)
-        self.normal = sensor.allocate_image_normal(views, width, height)
-        self.total = wp.zeros(shape, dtype=wp.vec3f, device=sensor.device)
-        self.albedo = wp.zeros_like(self.total)
-        self.seen = wp.full(shape, NO_SHAPE, dtype=wp.uint32, device=sensor.device)
+    def trace(self, rays: Any, one: LightPass, first: bool) -> None:
+        """Adds one pass; the first one leaves the labels."""
+        stage = self._stage
+        stage._sensor.update(
+            stage._state, self._cameras, rays, hdr_color_image=self._irradiance, forward_depth_image=self._depth,
+            shape_index_image=self._shape, normal_image=self._normal, world_indices=self._worlds,
+            clear_data=stage._clear, render_config=stage._config,
+        )  # fmt: skip
+        wp.launch(
+            kernels.accumulate,
+            dim=self._total.shape,
+            inputs=[
+                rays, self._cameras, self._irradiance, self._depth, self._normal, self._shape,
+                stage._model.shape_transform, stage._materials, self._lights, wp.vec3f(*one.toward),
+                one.lamp_weight, one.sky_weight, first,
+            ],
+            outputs=[self._seen, self._albedo, self._total],
+            device=stage.device,
+        )  # fmt: skip
+        if first:
+            shape = self._shape.numpy()
+            index = np.where(shape == NO_SHAPE, -1, shape.astype(np.int64) % len(stage.solids))
+            self._labels = np.array(self._depth.numpy()), index
 
-    def develop(self, samples: int) -> NDArray[np.uint8]:
-        """(V, H, W, 3) sRGB of the mean over the passes."""
-        rgb = wp.empty((*self.total.shape, 3), dtype=wp.uint8, device=self.total.device)
+    def pictures(self, samples: int) -> Pictures:
+        """The mean over the passes, developed."""
+        assert self._labels is not None
+        rgb = wp.empty((*self._total.shape, 3), dtype=wp.uint8, device=self._total.device)
         wp.launch(
             kernels.develop,
-            dim=self.total.shape,
-            inputs=[self.total, 1.0 / samples],
+            dim=self._total.shape,
+            inputs=[self._total, 1.0 / samples],
             outputs=[rgb],
-            device=self.total.device,
+            device=self._total.device,
         )
-        return np.array(rgb.numpy())
+        return Pictures(np.array(rgb.numpy()), *self._labels)
+
+
+def _trace(exposure: _Exposure, *, rays: Any, one: LightPass, first: bool) -> None:
+    exposure.trace(rays, one, first)
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def _turns(angle: Floats) -> Floats:
@@ -291,44 +331,6 @@ def _light(lamp: Lamp) -> Any:
     for name in ("key", "sky", "ground", "backdrop_low", "backdrop_high"):
         setattr(light, name, wp.vec3f(*getattr(lamp, name)))
     return light
-
-
-def _passes(shot: Shot) -> list[tuple[tuple[float, float], Floats, float, float]]:
-    """Shift inside the pixel, direction towards the light, weight of lamp and sky, of each pass.
-
-    Shifts follow the R2 sequence (Roberts 2018), lamp and sky points a sunflower spiral, so few passes spread evenly.
-    """
-    step = np.array([0.7548776662466927, 0.5698402909980532])
-    samples = shot.samples
-    key_passes, sky_passes = (samples + 1) // 2, samples // 2
-    passes = []
-    for k in range(samples):
-        shift = (0.0, 0.0) if k == 0 else tuple((0.5 + k * step) % 1.0 - 0.5)
-        if k % 2 == 0:
-            toward = _on_disc(shot.toward_lamp, k // 2, key_passes)
-            passes.append((shift, toward, samples / key_passes, 0.0))
-        else:
-            # Weighted so that an open horizontal surface receives 1 from the whole sky.
-            passes.append((shift, _on_sky(k // 2, sky_passes), 0.0, 2.0 / (1.0 + SKY_EDGE) * samples / sky_passes))
-    return passes
-
-
-_GOLDEN: Final = np.pi * (3.0 - np.sqrt(5.0))
-
-
-def _on_disc(axis: Floats, k: int, count: int) -> Floats:
-    radius, angle = LAMP_RADIUS * np.sqrt((k + 0.5) / count), _GOLDEN * k
-    side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
-    side /= np.linalg.norm(side)
-    direction = axis + radius * (np.cos(angle) * side + np.sin(angle) * np.cross(axis, side))
-    return np.asarray(direction / np.linalg.norm(direction))
-
-
-def _on_sky(k: int, count: int) -> Floats:
-    # Uniform over the sky above the horizon haze: low lights would draw long streaks.
-    height, angle = 1.0 - (1.0 - SKY_EDGE) * (k + 0.5) / count, _GOLDEN * k
-    level = np.sqrt(1.0 - height**2)
-    return np.array([level * np.cos(angle), level * np.sin(angle), height])
 
 
 def _rays(shot: Shot, shift: tuple[float, float], device: str) -> Any:

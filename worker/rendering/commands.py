@@ -1,0 +1,115 @@
+"""Command line: `graspd render` and `graspd pictures`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from service.cli import JsonFlag, emit, reporting_errors
+from service.errors import InputError
+from service.shards import read_shard, write_shard
+from worker.devices import Device
+from worker.rendering.cameras import BASELINE_M
+from worker.rendering.pictures import THREE_SIDES, grasp_pictures
+from worker.rendering.sheets import best, contact_sheet, figures, three_sides_sheet, views_page
+from worker.rendering.views import render as render_views
+from worker.scenes.commands import INHERITED
+from worker.scenes.sources import hand_of_shard, object_of_shard
+
+app = typer.Typer()
+
+_Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
+_Object = Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")]
+
+
+@app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
+@reporting_errors
+def render(
+    scenes: Annotated[Path, typer.Argument(help="A scene shard, as `graspd scene` writes it.")],
+    views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
+    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    baseline: Annotated[float, typer.Option(help="Distance of the eyes [m].")] = BASELINE_M,
+    width: Annotated[int, typer.Option(min=16, max=4096, help="Picture width [px].")] = 320,
+    height: Annotated[int, typer.Option(min=16, max=4096, help="Picture height [px].")] = 240,
+    object: _Object = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the scenes.")] = None,
+    device: _Device = "auto",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The views shard to write.")] = Path("views.h5"),
+    page: Annotated[Path | None, typer.Option(help="Also write a page that shows the views (PNG).")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take pictures of scenes: colour, depth, segmentation and boxes."""
+    started = perf_counter()
+    scene = read_shard(scenes, kind="scene")
+    obj = object_of_shard(scene, object)
+    number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
+    used = Device(device).resolve()
+    with _progress(json) as bar:
+        task = bar.add_task("rendering", total=None)
+        result = render_views(
+            obj, np.asarray(scene["scene/object_pose"], float), views=views, stereo=stereo, width=width,
+            height=height, seed=number, device=used, baseline_m=baseline,
+            progress=lambda done, total, message: bar.update(task, completed=done, total=total, description=message),
+        )  # fmt: skip
+    seconds = perf_counter() - started
+    kept = {key: scene.attributes[key] for key in INHERITED if key in scene.attributes}
+    output.write_bytes(
+        write_shard("views", result, {**kept, "seed": number, "device": used, "seconds": round(seconds, 4)})
+    )
+    count = len(result["image/rgb"])
+    if page is not None:
+        title = f"Views of {scene.attributes.get('object', 'the object')}"
+        page.write_bytes(views_page(result, title=title, subtitle=f"{count} pictures, {width} x {height} pixels"))
+    if json:
+        emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
+    else:
+        typer.echo(f"{output}: {count} pictures, {seconds:.1f} s on {used}")
+
+
+@app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
+@reporting_errors
+def pictures(
+    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    count: Annotated[int, typer.Option("--count", "-n", min=1, max=400, help="How many of the best grasps.")] = 12,
+    three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
+    size: Annotated[int, typer.Option(min=32, max=2048, help="Edge of one picture [px].")] = 300,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
+    object: _Object = None,
+    device: _Device = "auto",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("grasps.png"),
+    json: JsonFlag = False,
+) -> None:
+    """Draw the best grasps by epsilon with their figures on one sheet."""
+    base = read_shard(grasps, kind="base")
+    if len(base["quality/valid"]) == 0:
+        raise InputError(f"{grasps} holds no grasps; there is nothing to draw")
+    model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
+    rows = best(base.arrays, count)
+    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    sides = THREE_SIDES if three else THREE_SIDES[:1]
+    drawn = grasp_pictures(model, obj, poses, joints, (size, size), sides, device=Device(device).resolve())
+    title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
+    valid = int(np.asarray(base["quality/valid"]).sum())
+    subtitle = f"{len(rows)} of {len(base['quality/valid'])} grasps, {valid} valid, by epsilon at 5 mm"
+    captions = figures(base.arrays, rows)
+    if three:
+        output.write_bytes(three_sides_sheet(drawn, captions, title=title, subtitle=subtitle))
+    else:
+        output.write_bytes(contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle))
+    if json:
+        emit({"file": str(output), "grasps": len(rows), "rows": rows.tolist()})
+    else:
+        typer.echo(f"{output}: the best {len(rows)} grasps")
+
+
+def _progress(quiet: bool) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=Console(stderr=True), disable=quiet, transient=True,
+    )  # fmt: skip
