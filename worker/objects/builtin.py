@@ -17,6 +17,7 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 
 from worker.objects.solid import from_manifold
+from worker.objects.topology import merge_vertices
 
 #: Corners of a full circle: the chord of the mug's outer wall stays within 0.05 mm.
 SEGMENTS: Final = 64
@@ -72,10 +73,15 @@ OBJECTS: Final[dict[str, tuple[Callable[[], Manifold], str, float]]] = {
 def files_of(name: str) -> dict[str, bytes]:
     """The files of a built-in object as they stand in `service/builtin/objects/NAME/`."""
     make, description, density = OBJECTS[name]
-    # Booleans leave slivers along the seams: an edge of a micrometre is none.
-    vertices, faces = from_manifold(make().simplify(2e-6))
+    vertices, faces = tidy(*from_manifold(make()))
     asset: dict[str, Any] = {"file": f"{name}.stl", "units": "m", "description": description, "density": density}
     return {f"{name}.stl": stl_bytes(vertices, faces), "asset.json": (json.dumps(asset, indent=2) + "\n").encode()}
+
+
+def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Without the faces along a seam whose vertices are one once they are written in single precision."""
+    vertices, faces = merge_vertices(vertices.astype(np.float32).astype(float), faces, 2e-6)
+    return vertices, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
 
 def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:

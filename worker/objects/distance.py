@@ -12,6 +12,7 @@ from worker.objects.topology import Floats, Indices
 _PIECES = 10_000
 #: Pieces looked at first; twice as many again where that does not prove the answer.
 _CANDIDATES = 12
+_CHUNK = 256
 
 
 class MeshDistance:
@@ -44,6 +45,21 @@ class MeshDistance:
             todo, k = todo[open_], min(4 * k, len(self._face))
         return found
 
+    def furthest(self, points: Floats) -> float:
+        """Largest distance of any of the points (N, 3) to the surface [m].
+
+        Only points whose first, perhaps too large answer exceeds the largest proven one need a proof of their own.
+        """
+        bounds = self(points, np.inf)
+        order = np.argsort(-bounds)
+        proven = 0.0
+        for start in range(0, len(points), _CHUNK):
+            chunk = order[start : start + _CHUNK]
+            if bounds[chunk[0]] <= proven:
+                break
+            proven = max(proven, float(self(points[chunk]).max()))
+        return proven
+
 
 def cut(corners: Floats, length: float) -> tuple[Floats, NDArray[np.int64]]:
     """Triangles (F, 3, 3) halved across their longest side until none is longer than `length`; and whose each is."""
@@ -69,7 +85,7 @@ def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples:
     furthest = 0.0
     for source, target in ((one, two), (two, one)):
         points = np.concatenate([source[0], sample_faces(*source, samples)[0]])
-        furthest = max(furthest, float(MeshDistance(*target)(points).max()))
+        furthest = max(furthest, MeshDistance(*target).furthest(points))
     return furthest
 
 

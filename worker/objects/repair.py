@@ -244,7 +244,8 @@ def _unite(
         raise MeshError("the mesh has components that are no solids; repair it where it was made, or --keep-largest")
     if turned_parts:
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
-    pieces = united.decompose()
+    # A cavity is a shell of its own, of negative volume.
+    pieces = [piece for piece in united.decompose() if piece.volume() > 0]
     groups = len(pieces) if not touching else max(1, len(pieces) - touching)
     if groups > 1:
         if not options.keep_largest:
@@ -252,7 +253,7 @@ def _unite(
                 f"the mesh has {groups} separate components; keep the largest with --keep-largest, or upload each alone"
             )
         best = max(pieces, key=lambda piece: piece.volume())
-        return mesh.but(*solid.from_manifold(best), f"kept the largest of {groups} components")
+        return mesh.but(*solid.from_manifold(united ^ best), f"kept the largest of {groups} components")
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
     if abs(united.volume() - before) > 1e-6 * before:
         return mesh.but(*solid.from_manifold(united), f"united {len(parts)} intersecting components")
