@@ -14,7 +14,7 @@ from service.version import PACKAGE_VERSION
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     (
         "demo",
-        "demo",
+        "graspd_demo",
         "Start here",
         "The main job on built-in data: grasps, scenes, pictures, and a page that shows them.",
     ),
@@ -33,6 +33,9 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("index", "service.commands", "Parts of the service", "Rebuild the index from the store."),
     ("keys", "api.commands", "Parts of the service", "Make, list and revoke API keys."),
     ("synth", "worker.planners.commands", "Without a server", "Grasps of a hand file on an object file."),
+    ("scene", "worker.scenes.commands", "Without a server", "The object at rest on a table; grasps that fit there."),
+    ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
+    ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
 )
 
 
@@ -63,7 +66,7 @@ def build() -> typer.Typer:
         pretty_exceptions_enable=False,
     )
 
-    @app.callback()
+    @app.callback(invoke_without_command=True)
     def root(
         version: bool = typer.Option(False, "--version", help="Say the version and stop.", is_eager=True),
     ) -> None:

@@ -22,7 +22,7 @@ from worker.rendering.views import render as render_views
 from worker.scenes.commands import INHERITED
 from worker.scenes.sources import hand_of_shard, object_of_shard
 
-app = typer.Typer()
+app = typer.Typer(add_completion=False)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")]

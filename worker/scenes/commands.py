@@ -15,7 +15,7 @@ from worker.scenes.clearance import transfer
 from worker.scenes.simulate import drop
 from worker.scenes.sources import hand_of_shard, object_of_shard
 
-app = typer.Typer()
+app = typer.Typer(add_completion=False)
 
 
 @app.command(epilog="graspd scene grasps.h5 --scenes 4 -o scenes.h5")
