@@ -43,7 +43,7 @@ def plate_hand(size: tuple[float, float, float] = (0.05, 0.05, 0.01)) -> HandMod
             "lower": np.zeros(2),
             "upper": np.full(2, 0.1),
             "effort": np.full(2, 100.0),
-            "stiffness": np.full(2, 500.0),
+            "stiffness": np.full(2, 100.0),
             "pieces": pieces,
             "neighbours": frozenset({(0, 1), (0, 2)}),
             "palm": PalmFrame(np.array([0.0, 0, -0.14]), np.array([0.0, 0, 1])),

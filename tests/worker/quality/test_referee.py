@@ -1,0 +1,235 @@
+"""The referee: what any engine must say of simple grasps, and that its levels say the same."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from service.errors import InputError, MeshError, TaskCancelled
+from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.quality.helpers import plate_hand, posture
+from worker.grasps import GraspSet, Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.quality.postures import pregrasp, squeeze
+from worker.quality.referee.decomposition import ConvexPieces, decompose, union_volume
+from worker.quality.referee.judge import judge, robustness
+from worker.quality.referee.model import OBJECT_MASS, Physics, build
+from worker.quality.referee.protocol import Outcome, Test
+
+BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, "box")
+PLATES = plate_hand()
+CONTACT = posture(((0, 0, 0), (0.065, 0.065)))
+
+
+def grasp_of(hand: HandModel = PLATES, contact: Posture = CONTACT, force: float = 20.0) -> GraspSet:
+    """Open by 10 mm, touch, press."""
+    command = squeeze(hand, BOX, contact, total_normal_force=force)
+    return GraspSet(contact, pregrasp(hand, BOX, contact), command, np.full(len(contact), np.nan))
+
+
+def many_grasps() -> GraspSet:
+    """Plates that hold the box ever nearer to its edge, from firm to none at all."""
+    rows = [((0, 0, z), (0.065, 0.065)) for z in np.linspace(0.0, 0.055, 8)]
+    return grasp_of(contact=posture(*rows))
+
+
+def test_a_box_between_pressing_plates_is_held() -> None:
+    verdict = judge(PLATES, BOX, grasp_of(), level="letter", pieces=WHOLE)
+    assert verdict.reasons == ["held"]
+    assert verdict.success.tolist() == [1]
+    assert (verdict.outcome == Outcome.HELD).all()
+
+
+def test_the_same_box_slips_at_friction_0_04() -> None:
+    # Two plates of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
+    scene = build(PLATES, BOX, WHOLE, Physics(friction=(0.04, 0.001)))
+    trial = Test(scene).letter(grasp_of(), 0)
+    assert trial.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
+
+
+def test_the_same_box_holds_at_friction_0_06() -> None:
+    # 1.2 N of friction against 1 N.
+    scene = build(PLATES, BOX, WHOLE, Physics(friction=(0.06, 0.001)))
+    assert Test(scene).letter(grasp_of(), 0).success
+
+
+def test_a_free_object_falls() -> None:
+    away = posture(((0, 0, -0.5), (0.0, 0.0)))
+    verdict = judge(PLATES, BOX, grasp_of(contact=away), pieces=WHOLE)
+    assert verdict.reasons == ["displaced under +x"]
+
+
+def test_a_free_object_moves_as_newton_says() -> None:
+    test = Test(build(PLATES, BOX, WHOLE, Physics()))
+    away = grasp_of(contact=posture(((0, 0, -0.5), (0.0, 0.0))))
+    test._close(away, 0)
+    test._push(2)
+    test._run(0.1)
+    moved = test._offset()
+    # x = F t^2 / 2m, and the implicit step adds half a step of velocity.
+    assert moved[1] == pytest.approx(0.5 * 10 * 0.1 * (0.1 + 0.004), rel=1e-6)
+    assert moved[[0, 2]] == pytest.approx([0, 0], abs=1e-9)
+
+
+def test_a_deep_start_is_refused_as_penetration() -> None:
+    deep = posture(((0, 0, 0), (0.08, 0.08)))
+    verdict = judge(PLATES, BOX, grasp_of(contact=deep), pieces=WHOLE)
+    assert verdict.reasons == ["penetration"]
+    assert verdict.penetration_depth_mm[0] > 10
+
+
+def test_penetration_depth_is_that_of_the_pressed_plates() -> None:
+    pressed = posture(((0, 0, 0), (0.068, 0.067)))
+    verdict = judge(PLATES, BOX, grasp_of(contact=pressed), pieces=WHOLE)
+    assert verdict.penetration_depth_mm[0] == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize("level", ["certificate", "screen"])
+def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
+    grasps = many_grasps()
+    letter = judge(PLATES, BOX, grasps, level="letter", pieces=WHOLE)
+    cheap = judge(PLATES, BOX, grasps, level=level, pieces=WHOLE)
+    assert 0 < letter.success.sum() < len(grasps), "the set must hold both kinds"
+    assert cheap.success.tolist() == letter.success.tolist()
+    assert cheap.steps < 0.5 * letter.steps
+
+
+def test_hard_holds_no_more_than_normal() -> None:
+    grasps = many_grasps()
+    normal, hard = (judge(PLATES, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
+    assert (hard.success <= normal.success).all()
+    assert normal.key != hard.key
+
+
+def test_verdicts_do_not_depend_on_threads() -> None:
+    one, two = (judge(PLATES, BOX, many_grasps(), threads=n, pieces=WHOLE) for n in (1, 2))
+    assert np.array_equal(one.margin, two.margin)
+    assert one.key == two.key
+
+
+def test_everything_that_moves_a_verdict_is_in_its_key() -> None:
+    grasps = grasp_of()
+    keys = {judge(PLATES, BOX, grasps, pieces=WHOLE).key}
+    keys.add(judge(PLATES, BOX, grasp_of(force=10.0), pieces=WHOLE).key)
+    keys.add(judge(dataclasses.replace(PLATES, stiffness=np.full(2, 90.0)), BOX, grasps, pieces=WHOLE).key)
+    keys.add(judge(PLATES, BOX, grasps, pieces=dataclasses.replace(WHOLE, digest="other")).key)
+    keys.add(judge(PLATES, BOX, grasps, level="letter", pieces=WHOLE).key)
+    assert len(keys) == 5
+
+
+def test_joint_limits_reach_the_engine_in_radians() -> None:
+    hand = two_finger_hand()
+    model = build(hand, BOX, WHOLE, Physics()).model
+    assert model.joint("joint1").range == pytest.approx([hand.lower[0], hand.upper[0]])
+
+
+def test_object_weighs_100_grams_with_its_own_inertia() -> None:
+    model = build(PLATES, BOX, WHOLE, Physics()).model
+    body = model.body("object")
+    assert body.mass[0] == pytest.approx(OBJECT_MASS)
+    assert sorted(body.inertia) == pytest.approx(sorted(OBJECT_MASS * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
+
+
+def test_hand_masses_are_the_model_s() -> None:
+    model = build(PLATES, BOX, WHOLE, Physics()).model
+    assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PLATES.masses)
+
+
+def test_forward_kinematics_agree_with_ours() -> None:
+    hand = two_finger_hand()
+    scene = build(hand, BOX, WHOLE, Physics())
+    data = mujoco.MjData(scene.model)
+    pose, joints = np.array([0.1, 0.2, -0.3, 0.5, -0.5, 0.5, 0.5]), np.array([0.4, -0.2])
+    scene.place(data, pose, joints)
+    mujoco.mj_forward(scene.model, data)
+    ours = body_poses(hand, pose, joints)[0]
+    for b in range(hand.bodies):
+        assert data.body(f"body{b}").xpos == pytest.approx(ours[b, :3], abs=1e-12)
+        assert abs(float(data.body(f"body{b}").xquat @ ours[b, 3:])) == pytest.approx(1.0, abs=1e-12)
+
+
+def coupled_plates() -> HandModel:
+    """One dof closes both plates, the right one at half the pace from an offset of 10 mm."""
+    return dataclasses.replace(
+        PLATES, dof=np.array([-1, 0, 0], np.int32), multiplier=np.array([1.0, 1.0, 0.5]),
+        offset=np.array([0.0, 0.0, 0.01]), dof_names=("grip",), lower=np.zeros(1), upper=np.full(1, 0.1),
+        effort=np.full(1, 100.0), stiffness=np.full(1, 100.0), preshape=np.zeros(1), closing=np.ones(1),
+    )  # fmt: skip
+
+
+def test_coupled_joints_stay_coupled_while_moving() -> None:
+    hand = coupled_plates()
+    scene = build(hand, BOX, WHOLE, Physics())
+    assert scene.model.nu == 1
+    data = mujoco.MjData(scene.model)
+    far = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
+    scene.place(data, far, hand.expand(np.array([0.0])))
+    scene.command(data, far, hand.expand(np.array([0.06])))
+    mujoco.mj_step(scene.model, data, nstep=500)
+    joints = data.qpos[scene.joint_qpos]
+    # Dry friction of 0.01 N in each joint against 100 N/m leaves some 1e-4 m.
+    assert joints[0] == pytest.approx(0.06, abs=3e-4)
+    assert joints[1] == pytest.approx(0.5 * joints[0] + 0.01, abs=1e-4)
+
+
+def test_actuators_never_exceed_the_effort() -> None:
+    weak = dataclasses.replace(PLATES, effort=np.array([2.0, 3.0]))
+    scene = build(weak, BOX, WHOLE, Physics())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0])
+    scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
+    mujoco.mj_step(scene.model, data, nstep=5)
+    assert data.actuator_force == pytest.approx([2.0, 3.0])
+
+
+def test_a_firm_grasp_survives_noise_and_a_grazing_one_does_not_gain() -> None:
+    share = robustness(PLATES, BOX, many_grasps(), repeats=2, pieces=WHOLE)
+    assert share[0] == 1.0
+    assert share[-1] == 0.0
+
+
+def test_unknown_level_is_refused() -> None:
+    with pytest.raises(InputError, match="letter, certificate, screen"):
+        judge(PLATES, BOX, grasp_of(), level="quick", pieces=WHOLE)
+
+
+def test_cancelled_referee_stops() -> None:
+    with pytest.raises(TaskCancelled):
+        judge(PLATES, BOX, grasp_of(), pieces=WHOLE, cancelled=lambda: True)
+
+
+def test_convex_object_is_its_own_single_piece(tmp_path: Path) -> None:
+    pieces = decompose(BOX, cache=tmp_path)
+    assert len(pieces) == 1
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+
+
+def test_l_shape_is_cut_and_kept(tmp_path: Path) -> None:
+    parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
+    parts[1].apply_translation([0.04, 0.04, 0])
+    shape = object_from_mesh(trimesh.boolean.union(parts, engine="manifold"))
+    pieces = decompose(shape, cache=tmp_path)
+    assert 2 <= len(pieces) <= 4
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
+    assert len(list(tmp_path.glob("*.npz"))) == 1
+
+
+@pytest.mark.slow
+def test_thin_shell_is_refused_with_the_reason(tmp_path: Path) -> None:
+    shell = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    inner = trimesh.creation.icosphere(subdivisions=2, radius=0.0495)
+    hollow = object_from_mesh(trimesh.boolean.difference([shell, inner], engine="manifold"), "bubble")
+    with pytest.raises(MeshError, match=r"bubble: its .* convex pieces have"):
+        decompose(hollow, cache=tmp_path)
+
+
+def test_union_counts_overlap_once() -> None:
+    cube = np.asarray(trimesh.creation.box((0.02, 0.02, 0.02)).vertices)
+    assert union_volume((cube, cube + np.array([0.01, 0, 0]))) == pytest.approx(12e-6, rel=1e-5)

@@ -1,0 +1,286 @@
+"""A hand and an object in MuJoCo, as DexGraspBench has them. The object's body frame stands in its centre of mass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.grasps import Posture
+from worker.hands.model import ConvexPiece, HandModel, JointType
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import ConvexPieces
+
+Floats = NDArray[np.float64]
+
+OBJECT_MASS: Final = 0.1
+#: Sliding and torsional friction; `hard` scales them by `HARD`.
+FRICTION: Final = (0.6, 0.02)
+HARD: Final = (0.5, 0.1)
+ARMATURE: Final = 2e-4
+FRICTION_LOSS: Final = 0.01
+#: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
+DAMPING_TIME: Final = 0.02
+HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
+HAND_SOLREF: Final = (0.005, 1.0)
+#: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
+COUPLING_SOLREF: Final = (0.008, 1.0)
+COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
+#: Inertia of a body without geometry: that of a ball of this radius [m].
+_BARE_RADIUS: Final = 0.01
+_MIN_MASS: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What may differ between the levels of a certificate."""
+
+    timestep: float = 0.004
+    noslip_iterations: int = 2
+    root: str = "weld"
+    """weld: free root held to a mocap body (the protocol); fixed: the root itself is the mocap body."""
+    friction: tuple[float, float] = FRICTION
+    """Sliding and torsional coefficient of every contact."""
+
+    def hardened(self) -> Physics:
+        """The same at the friction of the hard protocol."""
+        slide, twist = self.friction
+        return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled model with the places of its parts. The model is read-only: threads share it, each with its data."""
+
+    model: Any
+    hand: HandModel
+    physics: Physics
+    hand_geoms: NDArray[np.bool_]
+    """(G,) geoms of the hand."""
+    object_body: int
+    object_qpos: int
+    root_qpos: int
+    """-1 where the root is fixed."""
+    joint_qpos: NDArray[np.intp]
+    """(J,) in `HandModel.joint_names` order."""
+    dof_gain: Floats
+    """(D,) control of a dof's actuator: its leading joint = gain q + shift."""
+    dof_shift: Floats
+    centre: Floats
+    """(3,) the object's centre of mass in the object frame."""
+
+    def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
+        """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[self.object_qpos : self.object_qpos + 7] = [*self.centre, 1, 0, 0, 0]
+        data.qpos[self.joint_qpos] = joints
+        if self.root_qpos >= 0:
+            data.qpos[self.root_qpos : self.root_qpos + 7] = hand_pose
+        self.command(data, hand_pose, joints)
+
+    def command(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
+        """Target posture of actuators and root."""
+        data.mocap_pos[0] = hand_pose[:3]
+        data.mocap_quat[0] = hand_pose[3:]
+        data.ctrl[:] = self.hand.reduce(joints) * self.dof_gain + self.dof_shift
+
+
+def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Physics) -> Scene:
+    """Compile the scene of a hand and an object."""
+    spec = mujoco.MjSpec()
+    # MJCF angles are degrees by default: radians there freeze every finger silently.
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = physics.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10.0
+    option.noslip_iterations = physics.noslip_iterations
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    friction = [*physics.friction, 1e-4]
+    _add_hand(spec, hand, friction, physics.root)
+    _add_object(spec, obj, pieces, friction)
+    model = spec.compile()
+    gain, shift = _leading(hand)
+    body_of_geom = model.geom_bodyid
+    object_body = model.body("object").id
+    return Scene(
+        model=model,
+        hand=hand,
+        physics=physics,
+        hand_geoms=np.asarray(body_of_geom != object_body),
+        object_body=object_body,
+        object_qpos=int(model.joint("object").qposadr[0]),
+        root_qpos=int(model.joint("root").qposadr[0]) if physics.root == "weld" else -1,
+        joint_qpos=np.array([int(model.joint(f"joint{b}").qposadr[0]) for b in hand.joint_body], np.intp),
+        dof_gain=gain,
+        dof_shift=shift,
+        centre=obj.centre_of_mass,
+    )
+
+
+def _leading(hand: HandModel) -> tuple[Floats, Floats]:
+    """Multiplier and offset of the first body that each dof drives."""
+    first = _leading_bodies(hand)
+    return hand.multiplier[first], hand.offset[first]
+
+
+def _leading_bodies(hand: HandModel) -> NDArray[np.intp]:
+    """(D,) the body whose joint carries each dof's actuator: of the first joint it drives, as `HandModel.reduce`."""
+    drives = hand.dof[hand.joint_body]
+    return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
+
+
+def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> None:
+    if root == "weld":
+        spec.worldbody.add_body(name="mocap", mocap=True)
+        base = spec.worldbody.add_body(name="body0")
+        base.add_freejoint(name="root")
+        spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap", name2="body0",
+            solimp=[0.9, 0.95, 0.001, 0.5, 2.0], data=_equality_data(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1),
+        )  # fmt: skip
+    else:
+        base = spec.worldbody.add_body(name="body0", mocap=True)
+    bodies = [base]
+    for b in range(1, hand.bodies):
+        body = bodies[hand.parent[b]].add_body(name=f"body{b}", pos=hand.origin[b, :3], quat=hand.origin[b, 3:])
+        _add_joint(body, hand, b)
+        bodies.append(body)
+    for b, body in enumerate(bodies):
+        _add_mass_and_geoms(spec, body, hand, b, friction)
+    _add_actuators(spec, hand)
+    for a, b in sorted(_excluded(hand)):
+        spec.add_exclude(bodyname1=f"body{a}", bodyname2=f"body{b}")
+
+
+def _add_joint(body: Any, hand: HandModel, b: int) -> None:
+    revolute = hand.joint_type[b] == JointType.REVOLUTE
+    d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
+    ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
+    body.add_joint(
+        name=f"joint{b}",
+        type=mujoco.mjtJoint.mjJNT_HINGE if revolute else mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=hand.axis[b],
+        range=ends,
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        damping=[DAMPING_TIME * float(hand.stiffness[d]), 0, 0],
+        armature=ARMATURE,
+        frictionloss=FRICTION_LOSS,
+    )
+
+
+def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction: list[float]) -> None:
+    mass = max(float(hand.masses[b]), _MIN_MASS)
+    mine = [(i, p) for i, p in enumerate(hand.pieces) if p.body == b]
+    if not mine:
+        body.mass = mass
+        body.inertia = np.full(3, 0.4 * mass * _BARE_RADIUS**2)
+        body.explicitinertial = True
+        return
+    share = np.array([float(np.prod(np.ptp(p.vertices, axis=0))) for _, p in mine])
+    for (i, p), part in zip(mine, share / share.sum(), strict=True):
+        geom = body.add_geom(
+            condim=4,
+            friction=friction,
+            solimp=HAND_SOLIMP,
+            solref=HAND_SOLREF,
+            mass=mass * float(part),
+            name=f"hand{i}",
+        )
+        _shape(spec, geom, p, f"hand{i}")
+
+
+def _shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
+    kinds = {
+        "box": mujoco.mjtGeom.mjGEOM_BOX,
+        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    }
+    if piece.kind == "hull":
+        _mesh(spec, geom, piece.vertices, name)
+        return
+    geom.type = kinds[piece.kind]
+    geom.pos, geom.quat = piece.pose[:3], piece.pose[3:]
+    if piece.kind == "box":
+        geom.size = np.array(piece.size) / 2
+    elif piece.kind == "sphere":
+        geom.size = [piece.size[0], 0, 0]
+    else:
+        geom.size = [piece.size[0], piece.size[1] / 2, 0]
+
+
+def _mesh(spec: Any, geom: Any, vertices: Floats, name: str) -> None:
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = np.ascontiguousarray(vertices, np.float32).ravel()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    geom.type = mujoco.mjtGeom.mjGEOM_MESH
+    geom.meshname = name
+
+
+def _add_actuators(spec: Any, hand: HandModel) -> None:
+    leading = _leading_bodies(hand)
+    for d, lead in enumerate(leading):
+        # The actuator sits on the joint: a dof's gain and limit are the joint's through its multiplier.
+        m = float(hand.multiplier[lead])
+        actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=float(hand.stiffness[d]) / m**2)
+        limit = float(hand.effort[d]) / abs(m)
+        actuator.forcerange = [-limit, limit]
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        for b in np.flatnonzero(hand.dof == d):
+            if b == lead:
+                continue
+            ratio = float(hand.multiplier[b]) / m
+            start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
+            spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_JOINT,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                name1=f"joint{b}",
+                name2=f"joint{lead}",
+                data=_equality_data(start, ratio),
+                solref=COUPLING_SOLREF,
+                solimp=COUPLING_SOLIMP,
+            )
+
+
+def _equality_data(*values: float) -> Floats:
+    data = np.zeros(mujoco.mjNEQDATA)
+    data[: len(values)] = values
+    return data
+
+
+def _excluded(hand: HandModel) -> set[tuple[int, int]]:
+    """Pairs of bodies whose contact does not count: neighbours, parents and grandparents."""
+    pairs = set(hand.neighbours)
+    for b in range(1, hand.bodies):
+        parent = int(hand.parent[b])
+        pairs.add((parent, b))
+        if parent > 0:
+            pairs.add((int(hand.parent[parent]), b))
+    return {(min(a, b), max(a, b)) for a, b in pairs}
+
+
+def _add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list[float]) -> None:
+    body = spec.worldbody.add_body(name="object", pos=obj.centre_of_mass)
+    body.add_freejoint(name="object")
+    body.mass = OBJECT_MASS
+    inertia = OBJECT_MASS * obj.inertia
+    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    body.explicitinertial = True
+    for i, corners in enumerate(pieces.vertices):
+        geom = body.add_geom(condim=4, friction=friction, name=f"object{i}")
+        _mesh(spec, geom, corners - obj.centre_of_mass, f"object{i}")
+
+
+def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
+    """Posture `share` of the way from a to b: positions and joints linearly, rotation along the shorter arc."""
+    start, end = a.hand_pose[row], b.hand_pose[row]
+    sign = -1.0 if float(start[3:] @ end[3:]) < 0 else 1.0
+    rotation = (1 - share) * start[3:] + share * sign * end[3:]
+    pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], rotation / np.linalg.norm(rotation)])
+    return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
