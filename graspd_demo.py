@@ -24,6 +24,7 @@ from service.errors import TaskError
 from service.index.views import GraspView
 from service.shards import Shard, read_shard
 from service.supervisor import Supervisor
+from worker import backend
 from worker.hands.load import load_hand
 from worker.objects.prepare import load_object
 from worker.rendering.pictures import grasp_pictures
@@ -116,7 +117,7 @@ def run(
 def print_results(console: Console, best: list[GraspView], job: JobDetail, paths: Results) -> None:
     """The quality table and where everything is."""
     table = Table(title="Best grasps by ε", title_justify="left", header_style="bold", box=None)
-    for name in ("rank", "ε", "contact [cm²]", "intersection [cm³]", "penetration [mm]", "shard row"):
+    for name in ("rank", "ε", "contact (cm²)", "intersection (cm³)", "penetration (mm)", "shard:row"):
         table.add_column(name, justify="right")
     for rank, grasp in enumerate(best, start=1):
         values = (
@@ -130,9 +131,13 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
         f"{metric(mean.contact_area_cm2)} cm², intersection {metric(mean.intersection_volume_cm3)} cm³"
     )
     for stage in job.stages:
-        console.print(f"{stage.stage.value:<11} {stage.tasks} tasks in {duration(stage.seconds)} of worker time")
-    for path in (*paths.shards, *paths.pictures, paths.page):
-        console.print(str(path), soft_wrap=True)
+        console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
+    console.print()
+    for what, path in (
+        *(("shard", path) for path in paths.shards), *(("picture", path) for path in paths.pictures),
+        ("page", paths.page),
+    ):  # fmt: skip
+        console.print(f"{what:<8} {path}", soft_wrap=True)
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
@@ -153,6 +158,7 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     """PNG of the best grasps of a shard, ranked by ε."""
+    backend.start()
     hand_files, object_files = (
         builtin_files(kind, name) for kind, name in ((AssetKind.HAND, job.hand), (AssetKind.OBJECT, job.object))
     )
@@ -162,8 +168,9 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     rows = best(base.arrays, _SHOWN_GRASPS)
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints)[:, 0]
-    title = f"{job.hand} × {job.object}"
-    subtitle = f"the best {len(rows)} of {job.grasps} grasps by ε; {job.valid} are valid"
+    # The sheet's typeface has neither Greek letters nor a multiplication sign.
+    title = f"{job.hand} on {job.object}"
+    subtitle = f"the best {len(rows)} of {job.grasps} grasps by epsilon; {job.valid} are valid"
     return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
 
 

@@ -161,7 +161,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     @group.command("show")
     @reporting_errors
     def show(
-        name: Annotated[str, typer.Argument(help=f"Name of the {kind.value}.")],
+        name: Annotated[str, typer.Argument(help="Its name.")],
         url: UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
