@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -19,13 +20,14 @@ from service.library import load_check, publish_builtins
 from service.parts import Parts
 from service.pipeline import queue_tasks
 from service.planning import ingest_id, ingest_message
-from service.queue.port import Event
+from service.queue.port import Event, EventKind
 from service.reaper import Reaper
 
 log = logging.getLogger(__name__)
 PART: Final = "keeper"
 _EVENTS_A_ROUND: Final = 1000
 _FORGET_WORKERS_AFTER: Final = timedelta(hours=1)
+_WORKERS_EVERY_S: Final = 2.0
 _LONGEST_PAUSE_S: Final = 15.0
 
 
@@ -38,6 +40,8 @@ class Keeper:
         self._reaper = Reaper(parts, self._indexer, clock=clock)
         self._backlog: deque[tuple[str, Event]] = deque()
         self._started = False
+        self._clock = clock
+        self._look_again = self._tell_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -63,9 +67,17 @@ class Keeper:
         """
         if not self._started:
             self._start()
+        news = self._index_events(wait_s)
+        now = self._clock()
+        if news or now >= self._look_again:
+            self._look_after_queue()
+            self._look_again = now + self._parts.settings.keeper_interval_s
+        if now >= self._tell_again:
+            self._look_after_workers()
+            self._tell_again = now + _WORKERS_EVERY_S
+
+    def _look_after_workers(self) -> None:
         self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
-        self._index_events(wait_s)
-        self._look_after_queue()
         forget = datetime.now(UTC) - _FORGET_WORKERS_AFTER
         self._parts.index.set_workers(
             self._parts.queue.workers(),
@@ -86,13 +98,17 @@ class Keeper:
             if leaf == "asset.json":
                 self._indexer.checked(AssetKind(kind), digest)
 
-    def _index_events(self, wait_s: float) -> None:
+    def _index_events(self, wait_s: float) -> bool:
+        """Whether anything but progress came in."""
         if not self._backlog:
             self._backlog.extend(self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s))
         if self._backlog:
             self._indexer.apply([event for _, event in self._backlog])
             self._parts.queue.acknowledge([event_id for event_id, _ in self._backlog])
+            news = any(event.kind is not EventKind.PROGRESS for _, event in self._backlog)
             self._backlog.clear()
+            return news
+        return False
 
     def _look_after_queue(self) -> None:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.

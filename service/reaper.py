@@ -31,21 +31,26 @@ class Reaper:
         self._indexer = indexer
         self._clock = clock
         self._beats: dict[str, tuple[str, float]] = {}
+        self._looked = clock()
         self._missing: dict[str, float] = {}
 
     def reap(self, leases: Collection[Lease]) -> list[Lease]:
         """Take the tasks from workers that gave no sign of life for a lease; returns those leases."""
         now = self._clock()
+        lease_s = self._parts.settings.lease_s
+        # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
+        looked, self._looked = min(now - self._looked, lease_s / 3), now
+        beats: dict[str, tuple[str, float]] = {}
         lost = []
         for lease in leases:
-            beat, since = self._beats.get(lease.key, (None, now))
-            if beat != lease.beat:
-                self._beats[lease.key] = (lease.beat, now)
-            elif now - since > self._parts.settings.lease_s:
+            beat, silence = self._beats.get(lease.key, (None, 0.0))
+            silence = silence + looked if beat == lease.beat else 0.0
+            if silence > lease_s:
                 self._lose(lease)
                 lost.append(lease)
-        held = {lease.key for lease in leases} - {lease.key for lease in lost}
-        self._beats = {key: seen for key, seen in self._beats.items() if key in held}
+            else:
+                beats[lease.key] = (lease.beat, silence)
+        self._beats = beats
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:

@@ -42,11 +42,11 @@ class Feed(Database):
     def ready_tasks(self, lane: Lane, *, now: float, limit: int) -> list[ReadyTask]:
         """Tasks to be queued: batch by batch over all jobs, so that no job waits behind all of another."""
         query = (
-            select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest, jobs.c.created)
+            select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest)
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.ready.is_(True), tasks.c.queued.is_(False), tasks.c.lane == lane.value)
             .where(_due(tasks.c.not_before, now))
-            .order_by(tasks.c.batch, jobs.c.created, tasks.c.job_id)
+            .order_by(tasks.c.batch, tasks.c.created, tasks.c.job_id)
             .limit(limit)
         )
         with self.reading() as connection:
@@ -55,7 +55,7 @@ class Feed(Database):
     def ready_of_job(self, job_id: str, *, limit: int) -> list[ReadyTask]:
         """The first tasks of one job that may be queued."""
         query = (
-            select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest, jobs.c.created)
+            select(tasks, jobs.c.request, jobs.c.hand_digest, jobs.c.object_digest)
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.job_id == job_id, tasks.c.ready.is_(True), tasks.c.queued.is_(False))
             .order_by(tasks.c.batch)
@@ -77,7 +77,7 @@ class Feed(Database):
     def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
         """Unfinished tasks, and checks of assets, that were given to the queue."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
-        of_tasks = select(tasks.c.id).where(tasks.c.queued.is_(True), unfinished)
+        of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
         with self.reading() as connection:
             checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}

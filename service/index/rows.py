@@ -55,6 +55,7 @@ def task_rows(record: JobRecord) -> Iterator[Row]:
             "device": None,
             "seconds": None,
             "finished": None,
+            "created": record.created,
             "queued": False,
             "not_before": 0.0,
             "progress_done": 0.0,

@@ -54,6 +54,7 @@ tasks: Final = Table(
     Column("device", String(64)),
     Column("seconds", Float),
     Column("finished", String(32)),
+    Column("created", String(32), nullable=False),
     Column("queued", Boolean, nullable=False, default=False),
     Column("not_before", Float, nullable=False, default=0.0),
     Column("progress_done", Float, nullable=False, default=0.0),
@@ -62,7 +63,7 @@ tasks: Final = Table(
     Index("tasks_of_job", "job_id", "batch", "position"),
     Index("tasks_by_state", "job_id", "state"),
     Index("tasks_by_shard", "shard_id"),
-    Index("tasks_to_queue", "ready", "queued", "lane", "batch"),
+    Index("tasks_to_queue", "ready", "queued", "lane", "batch", "created", "job_id"),
     Index("tasks_finished", "finished"),
 )
 

@@ -150,6 +150,7 @@ def upgrade() -> None:
         sa.Column("device", sa.String(length=64), nullable=True),
         sa.Column("seconds", sa.Float(), nullable=True),
         sa.Column("finished", sa.String(length=32), nullable=True),
+        sa.Column("created", sa.String(length=32), nullable=False),
         sa.Column("queued", sa.Boolean(), nullable=False),
         sa.Column("not_before", sa.Float(), nullable=False),
         sa.Column("progress_done", sa.Float(), nullable=False),
@@ -161,7 +162,7 @@ def upgrade() -> None:
     op.create_index("tasks_by_state", "tasks", ["job_id", "state"], unique=False)
     op.create_index("tasks_finished", "tasks", ["finished"], unique=False)
     op.create_index("tasks_of_job", "tasks", ["job_id", "batch", "position"], unique=False)
-    op.create_index("tasks_to_queue", "tasks", ["ready", "queued", "lane", "batch"], unique=False)
+    op.create_index("tasks_to_queue", "tasks", ["ready", "queued", "lane", "batch", "created", "job_id"], unique=False)
     op.create_table(
         "workers",
         sa.Column("name", sa.String(length=128), nullable=False),

@@ -1,0 +1,126 @@
+"""Stand-ins for the engine: stages that make true shards of random numbers in no time, and a job to run them on."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from service import names
+from service.domain import AssetKind, JobRequest, Stage, TaskMessage
+from service.library import publish_asset
+from service.manifests import ShardManifest, publish_shard
+from service.parts import Parts
+from service.store import Store
+from worker.context import TaskContext
+from worker.stages.output import Output, shard_of
+
+HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
+OBJECT_FILES = {"asset.json": b'{"file": "ball.stl"}', "ball.stl": b"solid ball\nendsolid ball\n"}
+_POSE = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+
+
+def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
+    """A base shard whose numbers follow from seed and batch, as real ones do."""
+    _pretend_to_work(context)
+    n, t = message.count, 3
+    rng = np.random.default_rng([message.request.seed, message.batch])
+    postures: dict[str, Any] = {}
+    for name in ("grasp", "pregrasp", "squeeze"):
+        postures[f"{name}/hand_pose"] = np.repeat(_POSE, n, axis=0)
+        postures[f"{name}/joint_positions"] = rng.random((n, 2))
+    quality = {
+        "quality/thresholds_m": np.array([0.002, 0.005, 0.009]),
+        "quality/contact_area_cm2": rng.random((n, t)),
+        "quality/intersection_volume_cm3": rng.random(n),
+        "quality/epsilon": rng.random((n, t)),
+        "quality/wrench_volume": rng.random((n, t)),
+        "quality/penetration_depth_mm": 3 * rng.random(n),
+        "quality/self_penetration_depth_mm": rng.random(n),
+        "quality/contact_links": rng.integers(0, 5, n),
+        "quality/stability_loss": np.full(n, np.nan),
+        "quality/valid": rng.integers(0, 2, n),
+    }
+    return Output({**postures, **quality}, {"joint_names": ["a", "b"]})
+
+
+def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
+    """A scene shard of as many rows as a real one would have."""
+    _pretend_to_work(context)
+    assert context.store.exists(names.shard_manifest(Stage.SYNTHESIZE, message.inputs[0]))
+    scenes, rows = message.request.scenes, message.request.scenes * message.count
+    return Output(
+        {
+            "scene/object_pose": np.repeat(_POSE, scenes, axis=0),
+            "scene/rest_probability": np.ones(scenes),
+            "scene/drop_seconds": np.ones(scenes),
+            "grasp/base_index": np.arange(rows) % message.count,
+            "grasp/scene_index": np.arange(rows) // message.count,
+            "grasp/hand_pose": np.repeat(_POSE, rows, axis=0),
+            "grasp/table_clearance_m": np.full(rows, 0.01),
+            "grasp/valid": np.ones(rows),
+        }
+    )
+
+
+def fake_stages() -> dict[Stage, Any]:
+    """The stage table of these."""
+    return {Stage.SYNTHESIZE: fake_synthesize, Stage.SCENE: fake_scene}
+
+
+def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> ShardManifest:
+    """Do a task on the spot: its shard and manifest are in the store afterwards."""
+    context = TaskContext(store)
+    made = fake_stages()[message.stage](message, context)
+    manifest, data = shard_of(message, made, device="cpu", seconds=0.5, worker=worker)
+    publish_shard(store, manifest, data)
+    return manifest
+
+
+def add_assets(parts: Parts) -> None:
+    """A hand and an object that were found good, named `gripper` and `ball`."""
+    for kind, name, files in ((AssetKind.HAND, "gripper", HAND_FILES), (AssetKind.OBJECT, "ball", OBJECT_FILES)):
+        asset = publish_asset(parts.store, kind, name, files)
+        check = b'{"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}'
+        parts.store.put(names.asset_check(kind, asset.digest), check)
+        parts.index.add_asset(asset, {"verdict": "accept", "message": "fine"})
+
+
+def request(**changes: Any) -> JobRequest:
+    """A job of one batch on these."""
+    return JobRequest(**{"hand": "gripper", "object": "ball", "grasps": 32, **changes})
+
+
+def _pretend_to_work(context: TaskContext) -> None:
+    seconds = float(os.environ.get("FAKE_SECONDS", "0"))
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        context.check()
+        context.progress(seconds - (end - time.monotonic()), seconds, "pretending")
+        time.sleep(0.01)
+
+
+def main() -> None:
+    """A worker process with these stages: `python -m tests.fakes`. FAKE_POISON names a batch that kills its worker."""
+    from service.cli import log_to_stderr
+    from service.settings import Settings
+    from worker.main import run_worker
+
+    settings = Settings()
+    log_to_stderr(settings)
+    table = fake_stages()
+    poison = os.environ.get("FAKE_POISON")
+
+    def synthesize(message: TaskMessage, context: TaskContext) -> Output:
+        if str(message.batch) == poison:
+            os.kill(os.getpid(), 9)
+        return fake_synthesize(message, context)
+
+    sys.exit(0 if run_worker(settings, table=table | {Stage.SYNTHESIZE: synthesize}) else 1)
+
+
+if __name__ == "__main__":
+    main()

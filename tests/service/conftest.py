@@ -1,0 +1,66 @@
+"""A private Redis, and the parts of a service with and without it."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.embedded import redis_url, server_command
+from service.errors import QueueUnavailable
+from service.index.index import Index
+from service.parts import Parts
+from service.queue.memory import MemoryQueue
+from service.queue.rq_queue import RqQueue, connect
+from service.settings import Settings
+from service.store import open_store
+from tests.fakes import add_assets
+
+
+@pytest.fixture(scope="session")
+def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """URL of a Redis that belongs to this test process."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("redis"))
+    with subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL) as process:
+        url = redis_url(settings)
+        queue = RqQueue(connect(url, patience=0))
+        wait_for_redis(queue)
+        queue.close()
+        yield url
+        process.terminate()
+
+
+def wait_for_redis(queue: RqQueue, seconds: float = 10.0) -> None:
+    """Until it answers."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            queue.ping()
+            return
+        except QueueUnavailable:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def rq_queue(redis_server: str) -> Iterator[RqQueue]:
+    """The Redis adapter on an empty database."""
+    queue = RqQueue(connect(redis_server))
+    queue.connection.flushdb()
+    yield queue
+    queue.close()
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[Parts]:
+    """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`."""
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
+    index = Index(settings.resolved_index_url)
+    made = Parts(settings, open_store("memory://"), index, MemoryQueue())
+    add_assets(made)
+    yield made
+    made.close()
