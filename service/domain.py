@@ -65,7 +65,9 @@ class Fidelity(Model):
     coarse_iterations: int = Field(100, ge=0, le=100_000)
     fine_iterations: int = Field(40, ge=0, le=100_000)
     polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
-    patience: int = Field(10, ge=0, description="fine iterations without improvement after which a grasp is done; 0: never")
+    patience: int = Field(
+        10, ge=0, description="fine iterations without improvement after which a grasp is done; 0: never"
+    )
     velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
     contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
     optimizer: Literal["adam", "gd"] = "adam"

@@ -156,6 +156,8 @@ class Simulation:
         self.gradient = wp.zeros((B, 6 + D), dtype=wp.float32)
         self.first = wp.zeros((B, 6 + D), dtype=wp.float32)
         self.second = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.best = wp.zeros(B, dtype=wp.float32)
+        self.waited = wp.zeros(B, dtype=wp.int32)
         self.point_depth = wp.zeros(B, dtype=wp.float32)
         self.object_depth = wp.zeros(B, dtype=wp.float32)
         self.self_depth = wp.zeros(B, dtype=wp.float32)
@@ -194,6 +196,8 @@ class Simulation:
         self.iteration.zero_()
         self.first.zero_()
         self.second.zero_()
+        self.best.fill_(1e9)
+        self.waited.zero_()
 
     def _assign(self, array: Any, values: Floats) -> None:
         padded = np.zeros((self.capacity, values.shape[1]), dtype=np.float32)
@@ -289,8 +293,11 @@ class Simulation:
             [self.active, self.q, self.hand.lower, self.hand.upper, o.range_weight, o.limit_weight, self.gradient],
         )  # fmt: skip
 
-    def record_iteration(self, optimizer: str, *, betas: tuple[float, float] = (0.9, 0.99)) -> None:
-        """Fix the launches of one iteration for the present schedule."""
+    def record_iteration(self, optimizer: str, *, betas: tuple[float, float] = (0.9, 0.99), patience: int = 0) -> None:
+        """Fix the launches of one iteration for the present schedule.
+
+        With a `patience`, a grasp that has not improved for so many iterations is switched off and costs nothing more.
+        """
         self._commands, self._graph = [], None
         self._record_kinematics()
         self._record_contact()
@@ -305,6 +312,12 @@ class Simulation:
             clamp = int(self.options.limit_weight == 0.0)
             inputs = [self.active, self.iteration, self.rates, clamp, *limits, self.gradient]
             self._launch(optimizers.gradient_descent, self.capacity, [*inputs, *state])
+        if patience:
+            depths = [self.point_depth, self.object_depth, self.self_depth]
+            self._launch(
+                optimizers.converge, self.capacity,
+                [patience, self.loss, *depths, self.best, self.waited, self.active],
+            )  # fmt: skip
         self._launch(optimizers.advance, 1, [self.iteration])
 
     def record_evaluation(self) -> None:

@@ -116,7 +116,7 @@ def _work(pair: Pair, part: _Part, fidelity: Fidelity, seed: int, batch: int, st
     ):
         simulation = pair.simulation(points, n)
         if len(schedule):
-            state = _optimize(simulation, state, schedule, fidelity.optimizer, steps, name, part.curve)
+            state = _optimize(simulation, state, schedule, fidelity, steps, name, part.curve)
     part.loss = simulation.loss.numpy()[:n].mean(axis=1).astype(float)
     if fidelity.polish_iterations:
         state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
@@ -124,13 +124,15 @@ def _work(pair: Pair, part: _Part, fidelity: Fidelity, seed: int, batch: int, st
 
 
 def _optimize(
-    simulation: Simulation, state: HandState, schedule: Schedule, optimizer: str, steps: _Steps, name: str,
+    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, steps: _Steps, name: str,
     curve: list[float],
 ) -> HandState:  # fmt: skip
     n = len(state.pivot)
     simulation.set_schedule(schedule)
     simulation.set_state(state)
-    simulation.record_iteration(optimizer)
+    # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
+    patience = fidelity.patience if name == "fine" else 0
+    simulation.record_iteration(fidelity.optimizer, patience=patience)
     done = 0
     while done < len(schedule):
         chunk = min(CHUNK, len(schedule) - done)

@@ -106,3 +106,36 @@ def gradient_descent(
 def advance(iteration_inout: wp.array(dtype=wp.int32)):
     """Count an iteration on the device: schedules are read there, so a captured graph can be replayed. Over 1."""
     iteration_inout[0] = iteration_inout[0] + 1
+
+
+@wp.kernel
+def converge(
+    patience_in: wp.int32,
+    loss_in: wp.array2d(dtype=wp.float32),
+    point_depth_in: wp.array(dtype=wp.float32),
+    object_depth_in: wp.array(dtype=wp.float32),
+    self_depth_in: wp.array(dtype=wp.float32),
+    best_inout: wp.array(dtype=wp.float32),
+    waited_inout: wp.array(dtype=wp.int32),
+    active_inout: wp.array(dtype=wp.int32),
+):
+    """Switch off a grasp whose merit has not improved by 1 % for `patience` iterations. Launch over B.
+
+    The merit is L_stable plus the penetration depths in millimetres: the weights of a schedule, which change, are not
+    in it.
+    """
+    b = wp.tid()
+    if active_inout[b] == 0:
+        return
+    total = float(0.0)
+    for m in range(loss_in.shape[1]):
+        total += loss_in[b, m]
+    depth = point_depth_in[b] + object_depth_in[b] + self_depth_in[b]
+    merit = total / float(loss_in.shape[1]) + 1.0e3 * depth
+    if merit < 0.99 * best_inout[b]:
+        best_inout[b] = merit
+        waited_inout[b] = 0
+    else:
+        waited_inout[b] = waited_inout[b] + 1
+        if waited_inout[b] >= patience_in:
+            active_inout[b] = 0
