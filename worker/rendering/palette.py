@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from worker.rendering.kernels import GRAIN, PLAIN, SPECKLE, TILES
-from worker.rendering.stage import Lamp, Look
+from worker.rendering.scenery import Lamp, Look
 
 Colour = tuple[float, float, float]
 

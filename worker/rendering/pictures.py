@@ -15,14 +15,15 @@ from worker.objects.normals import corner_normals
 from worker.rendering.cameras import Cameras, intrinsics, look_at
 from worker.rendering.kernels import CATCHER
 from worker.rendering.palette import hexadecimal
-from worker.rendering.stage import Box, Lamp, Look, Shot, Solid, Stage
+from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from worker.rendering.stage import Stage
 from worker.transforms import IDENTITY_POSE, apply, quat_rotate
 
 #: Sides from which `three_sides` looks, measured from the side view of the hand [rad].
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
-SAMPLES: Final = 16
+SAMPLES: Final = 12
 #: Hand parts farther than this from the object's hull do not draw the camera back: a forearm may leave the picture [m].
 _NEAR_M: Final = 0.14
 #: Grasps traced together: bounds the memory.

@@ -14,7 +14,8 @@ from worker.objects.model import Floats, ObjectModel
 from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE, box_corners, in_camera, loose_boxes, tight_boxes
 from worker.rendering.cameras import BASELINE_M, Cameras, intrinsics, sample_hemisphere, stereo_pair
 from worker.rendering.palette import lamp, object_look, table_look
-from worker.rendering.stage import Box, Shot, Solid, Stage
+from worker.rendering.scenery import Box, Shot, Solid
+from worker.rendering.stage import Stage
 from worker.transforms import apply
 
 #: The table: a slab whose top is z = 0 [m].
