@@ -7,9 +7,11 @@ hollow make every grasp of it wrong. Count and volume ratio go with every verdic
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
+import io
+import json
 import os
-from concurrent.futures import ProcessPoolExecutor
+import subprocess
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -43,6 +45,8 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
+#: One run of CoACD may take this long; without its result the coarser one stands [s].
+TIMEOUT_S: Final = 300.0
 #: Pieces thinner than this are splinters that the engine cannot build [m^3].
 _MIN_VOLUME: Final = 1e-9
 
@@ -132,24 +136,28 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
     ratio = union_volume(best) / obj.volume
     if ratio <= HULL_RATIO:
         return best
-    # CoACD holds the interpreter lock: in a process of its own it does not stop this one's heartbeat.
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for threshold in THRESHOLDS:
-            parts = tuple(p for p in pool.submit(_coacd, obj.vertices, obj.faces, threshold).result() if _solid(p))
-            found = union_volume(parts) / obj.volume
-            if parts and found < ratio:
-                best, ratio = parts, found
-            if ratio <= GOOD_RATIO:
-                break
+    for threshold in THRESHOLDS:
+        parts = tuple(part for part in _coacd(obj, threshold) if _solid(part))
+        found = union_volume(parts) / obj.volume
+        if parts and found < ratio:
+            best, ratio = parts, found
+        if ratio <= GOOD_RATIO:
+            break
     return best
 
 
-def _coacd(vertices: Floats, faces: NDArray[np.int32], threshold: float) -> list[Floats]:
-    import coacd
-
-    coacd.set_log_level("off")
-    parts = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=threshold, **_COACD)
-    return [np.asarray(corners, float) for corners, _ in parts]
+def _coacd(obj: ObjectModel, threshold: float) -> tuple[Floats, ...]:
+    """Pieces by CoACD. It holds the interpreter lock, so it runs in a process of its own and stops no heartbeat."""
+    given = io.BytesIO()
+    options = json.dumps({"threshold": threshold, **_COACD})
+    np.savez(given, vertices=obj.vertices, faces=obj.faces, options=np.array(options))
+    command = [sys.executable, "-m", "worker.quality.referee.coacd_child"]
+    try:
+        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=TIMEOUT_S, check=True)
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
+        return ()
+    with np.load(io.BytesIO(done.stdout)) as stored:
+        return tuple(stored[name] for name in stored.files)
 
 
 def union_volume(parts: tuple[Floats, ...]) -> float:

@@ -102,7 +102,7 @@ def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Phys
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     friction = [*physics.friction, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
-    _add_object(spec, obj, pieces, friction)
+    add_object(spec, obj, pieces, friction, OBJECT_MASS)
     model = spec.compile()
     gain, shift = _leading(hand)
     body_of_geom = model.geom_bodyid
@@ -191,10 +191,11 @@ def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction:
             mass=mass * float(part),
             name=f"hand{i}",
         )
-        _shape(spec, geom, p, f"hand{i}")
+        add_shape(spec, geom, p, f"hand{i}")
 
 
-def _shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
+def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
+    """Give a geom the shape of a convex piece, in its body's frame."""
     kinds = {
         "box": mujoco.mjtGeom.mjGEOM_BOX,
         "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -265,11 +266,12 @@ def _excluded(hand: HandModel) -> set[tuple[int, int]]:
     return {(min(a, b), max(a, b)) for a, b in pairs}
 
 
-def _add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list[float]) -> None:
+def add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list[float], mass: float) -> None:
+    """A free body named `object` of a given mass [kg], its frame in the object's centre of mass."""
     body = spec.worldbody.add_body(name="object", pos=obj.centre_of_mass)
     body.add_freejoint(name="object")
-    body.mass = OBJECT_MASS
-    inertia = OBJECT_MASS * obj.inertia
+    body.mass = mass
+    inertia = mass * obj.inertia
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     body.explicitinertial = True
     for i, corners in enumerate(pieces.vertices):

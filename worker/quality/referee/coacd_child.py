@@ -1,0 +1,32 @@
+"""CoACD in a process of its own: `python -m worker.quality.referee.coacd_child` reads an npz and writes one.
+
+In: arrays `vertices`, `faces`, and `options` (JSON). Out: one array of corners per piece.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+
+import numpy as np
+
+
+def main() -> None:
+    """Decompose the mesh on standard input onto standard output."""
+    # The library prints to standard output, which carries the result: send its words elsewhere first.
+    result = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    import coacd
+
+    given = np.load(io.BytesIO(sys.stdin.buffer.read()))
+    coacd.set_log_level("off")
+    mesh = coacd.Mesh(given["vertices"], given["faces"])
+    parts = coacd.run_coacd(mesh, **json.loads(str(given["options"])))
+    with result:
+        np.savez(result, *[np.asarray(corners, float) for corners, _ in parts])
+
+
+if __name__ == "__main__":
+    main()
