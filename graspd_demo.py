@@ -52,6 +52,8 @@ class Results:
 #: A first start on a cold machine compiles Warp kernels before the worker answers.
 _READY_S: Final = 120.0
 _SHOWN_GRASPS: Final = 12
+#: Rays per pixel of a small picture; twice as many cost twice the time and are hard to tell apart.
+_SAMPLES: Final = 8
 
 
 @app.command("demo", epilog="graspd demo --out demo-out --grasps 32 --scenes 2 --views 3")
@@ -167,7 +169,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     obj = load_object(object_files, name=job.object, digest=job.object_digest, face_error_m=error_m)
     rows = best(base.arrays, _SHOWN_GRASPS)
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    pictures = grasp_pictures(hand, obj, poses, joints)[:, 0]
+    pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The sheet's typeface has neither Greek letters nor a multiplication sign.
     title = f"{job.hand} on {job.object}"
     subtitle = f"the best {len(rows)} of {job.grasps} grasps by epsilon; {job.valid} are valid"

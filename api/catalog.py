@@ -35,6 +35,7 @@ from service.store import Store
 
 _HEALTH_S: Final = 2.0
 _PAGE: Final = 200
+_KEPT_HISTOGRAMS: Final = 256
 MEAN_METRICS: Final[tuple[Metric, ...]] = (
     "epsilon",
     "contact_area_cm2",
@@ -50,6 +51,7 @@ class Catalog:
         self._parts = parts
         self._idempotency = Idempotency(parts.settings)
         self._paces = Paces()
+        self._histograms: dict[tuple[str, int], list[Histogram]] = {}
         self._health: tuple[float, Health] | None = None
 
     @property
@@ -172,18 +174,31 @@ class Catalog:
             self._health = (now, Health(ok=all(part.ok for part in parts.values()), parts=parts))
         return self._health[1]
 
-    def histograms(self, job_id: str, *, bins: int = 20, limit: int = 2000) -> list[Histogram]:
-        """Distribution of each metric over a job's valid grasps, of at most `limit` of them."""
-        rows = self._valid_grasps(job_id, limit)
-        found = []
-        for metric in MEAN_METRICS:
-            values = [value for row in rows if (value := getattr(row, metric)) is not None]
-            if values:
-                found.append(_histogram(metric, values, bins))
+    def histograms(self, job_id: str, valid: int, *, bins: int = 20) -> list[Histogram]:
+        """Distribution of each metric over a job's valid grasps.
+
+        Args:
+            valid: how many there are; while that stays, the answer does.
+        """
+        key = (job_id, valid)
+        if (found := self._histograms.get(key)) is None:
+            where = GraspFilter(job=job_id, valid=True)
+            index = self._parts.index
+            found = [
+                Histogram(
+                    metric=metric,
+                    **vars(summary),
+                    counts=index.histogram(where, metric, summary.low, summary.high, bins),
+                )
+                for metric, summary in index.summaries(where, MEAN_METRICS).items()
+            ]
+            if len(self._histograms) >= _KEPT_HISTOGRAMS:
+                self._histograms.clear()
+            self._histograms[key] = found
         return found
 
     def _detail(self, job: JobView) -> JobDetail:
-        mean = {data.metric: data.mean for data in self.histograms(job.id)} if job.valid else {}
+        mean = {data.metric: data.mean for data in self.histograms(job.id, job.valid)} if job.valid else {}
         return JobDetail(
             **self._job(job, self._running(job.id)).model_dump(),
             request=job.request,
@@ -217,18 +232,6 @@ class Catalog:
 
     def _running(self, job_id: str) -> list[TaskView]:
         return self._parts.index.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
-
-    def _valid_grasps(self, job_id: str, limit: int) -> list[GraspView]:
-        rows: list[GraspView] = []
-        where = GraspFilter(job=job_id, valid=True)
-        cursor: str | None = None
-        while len(rows) < limit:
-            page = self._parts.index.grasps(where, limit=_PAGE, cursor=cursor)
-            rows += page.items
-            cursor = page.next
-            if cursor is None:
-                break
-        return rows
 
 
 def grasp_filter(query: GraspQuery) -> GraspFilter:
@@ -270,14 +273,3 @@ def _probe(probe: Callable[[], float]) -> Part:
         return Part(ok=True, latency_ms=round(1000 * probe(), 3))
     except GraspdError as error:
         return Part(ok=False, detail=str(error))
-
-
-def _histogram(metric: Metric, values: list[float], bins: int) -> Histogram:
-    low, high = min(values), max(values)
-    counts = [0] * bins
-    width = (high - low) / bins
-    for value in values:
-        counts[min(bins - 1, int((value - low) / width)) if width > 0 else 0] += 1
-    return Histogram(
-        metric=metric, count=len(values), mean=sum(values) / len(values), low=low, high=high, counts=counts
-    )

@@ -82,7 +82,7 @@ def job_page(request: Request, job_id: str, catalog: CatalogOf) -> HTMLResponse:
         events="" if job.state.is_final else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if job.state.is_final else 3,
         job=job,
-        histograms=[(*shown[data.metric], data) for data in catalog.histograms(job_id)] if job.valid else [],
+        histograms=[(*shown[data.metric], data) for data in catalog.histograms(job_id, job.valid)] if job.valid else [],
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=catalog.grasps(GraspQuery(job=job_id, valid=True), limit=10).items if job.valid else [],

@@ -7,9 +7,10 @@ from service.index.feed import Feed
 from service.index.grasp_queries import GraspQueries
 from service.index.job_queries import JobQueries
 from service.index.service_queries import ServiceQueries
+from service.index.summaries import Summaries
 
 
-class Index(JobQueries, GraspQueries, ServiceQueries, Feed, Changes):
+class Index(JobQueries, GraspQueries, Summaries, ServiceQueries, Feed, Changes):
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
     Reads answer the API; writes come from the API and the keeper only. Every method raises IndexUnavailable when the
