@@ -13,6 +13,7 @@ _PIECES = 10_000
 #: Pieces looked at first; twice as many again where that does not prove the answer.
 _CANDIDATES = 12
 _CHUNK = 256
+_MAX_VERTICES = 30_000
 
 
 class MeshDistance:
@@ -84,9 +85,16 @@ def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples:
     """Largest distance [m] between two surfaces, both ways, over their vertices and even samples."""
     furthest = 0.0
     for source, target in ((one, two), (two, one)):
-        points = np.concatenate([source[0], sample_faces(*source, samples)[0]])
+        points = surface_points(*source, samples)
         furthest = max(furthest, MeshDistance(*target).furthest(points))
     return furthest
+
+
+def surface_points(vertices: Floats, faces: Indices, samples: int) -> Floats:
+    """Vertices, every n-th where there are very many, and even samples: where two surfaces are compared."""
+    return np.concatenate(
+        [vertices[:: max(1, len(vertices) // _MAX_VERTICES)], sample_faces(vertices, faces, samples)[0]]
+    )
 
 
 def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) -> tuple[Floats, NDArray[np.int64]]:

@@ -9,7 +9,7 @@ import fast_simplification
 import numpy as np
 
 from worker.objects import solid, topology
-from worker.objects.distance import MeshDistance, deviation, sample_faces
+from worker.objects.distance import MeshDistance, deviation, surface_points
 from worker.objects.mass import signed_volume
 from worker.objects.topology import Floats, Indices
 
@@ -17,6 +17,8 @@ Mesh = tuple[Floats, Indices]
 
 #: Meshes with no more faces are left as they are: fewer would not make a query faster.
 FEW_FACES: Final = 64
+#: Meshes with more faces are first brought near this number.
+MANY_FACES: Final = 40_000
 #: The search stops when two targets differ by less than this factor.
 STEP: Final = 1.12
 #: Surface samples, besides the vertices, at which trials are held to a little less than the bound ...
@@ -40,19 +42,25 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     """
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
+    limit = MARGIN * error_m
     original = Original(vertices, faces, closed)
+    if len(faces) > MANY_FACES:
+        # A fifth of the error buys a mesh that is quick to compare with; by the triangle inequality the rest remains.
+        start = _trial(original, MANY_FACES, limit / 5)
+        if start is not None:
+            original, limit = Original(*start, closed), limit * 4 / 5
     accepted: list[Mesh] = []
-    low, high = float(FEW_FACES), float(len(faces))
+    low, high = float(FEW_FACES), float(len(original.faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
-        trial = _trial(original, target, MARGIN * error_m)
+        trial = _trial(original, target, limit)
         if trial is None:
             low = target
         else:
             high = target
             accepted.append(trial)
     if not accepted and closed:
-        accepted = _thinned(original, MARGIN * error_m)
+        accepted = _thinned(original, limit)
     for mesh in reversed(accepted):
         error = deviation(mesh, (vertices, faces), DENSE_SAMPLES)
         if error <= error_m:
@@ -92,7 +100,7 @@ class Original:
 
     @staticmethod
     def _points_of(mesh: Mesh) -> Floats:
-        return np.concatenate([mesh[0], sample_faces(*mesh, SAMPLES)[0]])
+        return surface_points(*mesh, SAMPLES)
 
 
 def _trial(original: Original, target: int, error_m: float) -> Mesh | None:

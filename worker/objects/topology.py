@@ -75,8 +75,15 @@ def repeated(faces: Indices) -> Mask:
 
 
 def _edge_counts(faces: Indices) -> dict[tuple[int, int], int]:
-    edges, counts = np.unique(np.sort(directed_edges(faces), axis=1), axis=0, return_counts=True)
-    return {(int(a), int(b)): int(n) for (a, b), n in zip(edges, counts, strict=True)}
+    keys, counts = np.unique(_edge_keys(faces), return_counts=True)
+    return {(int(key) >> 32, int(key) & 0xFFFFFFFF): int(n) for key, n in zip(keys, counts, strict=True)}
+
+
+def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:
+    """(3F,) one number for each edge, in the order of `directed_edges`: far faster to sort than pairs."""
+    edges = directed_edges(faces)
+    edges = edges if directed else np.sort(edges, axis=1)
+    return (edges[:, 0] << 32) | edges[:, 1]
 
 
 def directed_edges(faces: Indices) -> Indices:
@@ -86,17 +93,14 @@ def directed_edges(faces: Indices) -> Indices:
 
 def edge_faces(faces: Indices) -> tuple[Indices, Indices]:
     """(3F,) number of each directed edge's undirected edge, and (E,) how many faces meet there."""
-    _, index, counts = np.unique(
-        np.sort(directed_edges(faces), axis=1), axis=0, return_inverse=True, return_counts=True
-    )
+    _, index, counts = np.unique(_edge_keys(faces), return_inverse=True, return_counts=True)
     return index.reshape(-1), counts
 
 
 def is_closed(faces: Indices) -> bool:
     """Whether every edge has exactly two faces that run along it in opposite directions."""
-    edges = directed_edges(faces)
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    _, both = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    _, counts = np.unique(_edge_keys(faces, directed=True), return_counts=True)
+    _, both = np.unique(_edge_keys(faces), return_counts=True)
     return bool(len(faces) and (counts == 1).all() and (both == 2).all())
 
 

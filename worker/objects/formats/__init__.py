@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import PurePosixPath
 from typing import Final
 
+import numpy as np
+
 from service.errors import GraspdError, MeshError
 from worker.objects.formats import glb, obj, off, ply, stl
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
@@ -36,10 +38,12 @@ def read_mesh(filename: str, data: bytes) -> Soup:
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
     try:
-        return check_soup(reader(data))
+        # Wild numbers are found by the check below, not by NumPy's warnings.
+        with np.errstate(all="ignore"):
+            return check_soup(reader(data))
     except GraspdError as error:
         raise type(error)(f"{filename}: {error}") from None
-    except (ValueError, IndexError, KeyError, TypeError, OverflowError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         # Readers lean on NumPy and json for the odd cases: whatever they choke on is the file's fault.
         raise MeshError(f"{filename}: not a readable {suffix[1:].upper()} file ({_one_line(error)})") from None
 

@@ -102,9 +102,9 @@ class _Ascii:
             words = iter(row.split())
             for item in element.properties:
                 if not item.count_type:
-                    next(words)
+                    next(words, None)
                     continue
-                values = [float(w) for _, w in zip(range(int(next(words))), words, strict=False)]
+                values = [float(w) for _, w in zip(range(int(next(words, b""))), words, strict=False)]
                 counts[item.name].append(len(values))
                 items[item.name] += map(int, values)
         return {}, {n: (np.array(counts[n], dtype=np.int64), np.array(items[n], dtype=np.int64)) for n in counts}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.errors import LimitError, MeshError
 
-MAX_FACES: Final = 2_000_000
+MAX_FACES: Final = 1_000_000
 #: Coordinates beyond this are no length in any unit.
 MAX_COORDINATE: Final = 1e9
 
