@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -29,20 +30,21 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     axes, at_base = _dof_axes(hand)
     spread = at_base & (np.abs(axes @ approach) > 0.8)
     closing = np.where(spread, 0.0, hand.closing)
-    for name, value in options.closing.items():
-        closing[_dof(hand, name)] = np.sign(value)
+    for dof, direction in _by_dof(hand, tree, options.closing):
+        closing[dof] = np.sign(direction)
     hand = replace(hand, closing=closing)
-    hand = replace(hand, preshape=_preshape(hand, options))
+    hand = replace(hand, preshape=_preshape(hand, tree, options))
     return replace(hand, palm=_palm(hand, tree, options, approach))
 
 
 def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
     """Bodies of the stated links, else the leaves of the tree."""
     for name in options.fingertips:
-        if name not in tree.links:
+        if name not in tree.known:
             raise HandError(f"asset.json names the fingertip link {name!r}, which the hand does not have")
-    if options.fingertips:
-        return tuple(dict.fromkeys(tree.links[name][0] for name in options.fingertips))
+    kept = [tree.links[name][0] for name in options.fingertips if name in tree.links]
+    if kept:
+        return tuple(dict.fromkeys(kept))
     return tuple(body for body in range(1, hand.bodies) if body not in set(hand.parent.tolist()))
 
 
@@ -130,20 +132,22 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     return PalmFrame(through + (height - through @ approach) * approach, approach)
 
 
-def _preshape(hand: HandModel, options: HandOptions) -> Floats:
+def _preshape(hand: HandModel, tree: Tree, options: HandOptions) -> Floats:
     q = _posture(hand, PRESHAPE_SHARE)
-    for name, value in options.preshape.items():
-        dof = _dof(hand, name)
+    for dof, value in _by_dof(hand, tree, options.preshape):
         if not hand.lower[dof] - 1e-6 <= value <= hand.upper[dof] + 1e-6:
             raise HandError(
-                f"preshape of {name!r} is {value:g}, outside its limits {hand.lower[dof]:.3g} .. {hand.upper[dof]:.3g}"
+                f"preshape of {hand.dof_names[dof]!r} is {value:g}, outside its limits "
+                f"{hand.lower[dof]:.3g} .. {hand.upper[dof]:.3g}"
             )
         q[dof] = value
     return np.clip(q, hand.lower, hand.upper)
 
 
-def _dof(hand: HandModel, name: str) -> int:
-    if name not in hand.dof_names:
-        known = ", ".join(hand.dof_names[:8])
-        raise HandError(f"asset.json names {name!r}, which is no independent joint of the hand ({known}, ...)")
-    return hand.dof_names.index(name)
+def _by_dof(hand: HandModel, tree: Tree, values: Mapping[str, float]) -> list[tuple[int, float]]:
+    """(dof, value) of named joints; those that were frozen, coupled or dropped have no say any more."""
+    for name in values:
+        if name not in tree.known:
+            known = ", ".join(hand.dof_names[:8])
+            raise HandError(f"asset.json names {name!r}, which is no joint of the hand ({known}, ...)")
+    return [(hand.dof_names.index(name), value) for name, value in values.items() if name in hand.dof_names]

@@ -17,7 +17,7 @@ from worker.transforms import IDENTITY_POSE, apply, invert, quat_rotate
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5
 #: Candidates on the whole hand at least: what the exterior area is measured with.
-MIN_CANDIDATES: Final = 12_000
+MIN_CANDIDATES: Final = 30_000
 #: A point this deep inside another body at rest can never touch an object [m].
 BURIED_M: Final = 5e-4
 #: Two faces of one body this close are the same face [m].

@@ -43,6 +43,8 @@ class Tree:
     """Independent joints in URDF order."""
     lower: Floats
     upper: Floats
+    known: frozenset[str]
+    """Names of all joints and links of the URDF, dropped and frozen ones too."""
 
 
 def build_tree(urdf: Urdf, options: HandOptions) -> Tree:
@@ -68,8 +70,9 @@ def build_tree(urdf: Urdf, options: HandOptions) -> Tree:
     names = tuple(name for name in urdf.joints if name in moving)
     dofs = tuple(name for name in names if moving[name].dof == name)
     lower, upper = np.array([_fold_limits(dof, moving, urdf) for dof in dofs]).T
+    known = frozenset(urdf.joints) | frozenset(urdf.links)
     bodies, parents, joints, origins, links = _walk(urdf, root, kept, frozen)
-    return Tree(bodies, parents, joints, origins, links, moving, names, dofs, lower, upper)
+    return Tree(bodies, parents, joints, origins, links, moving, names, dofs, lower, upper, known)
 
 
 def _check_names(urdf: Urdf, options: HandOptions) -> None:
