@@ -35,6 +35,7 @@ from service.store import Store
 
 _HEALTH_S: Final = 2.0
 _PAGE: Final = 200
+_ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_HISTOGRAMS: Final = 256
 MEAN_METRICS: Final[tuple[Metric, ...]] = (
     "epsilon",
@@ -206,7 +207,9 @@ class Catalog:
             object_digest=job.object_digest,
             attempts=self._parts.index.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
-            shards=self.shards(job=job.id, limit=_PAGE).items,
+            shards=sorted(
+                self.shards(job=job.id, limit=_PAGE).items, key=lambda shard: (shard.batch, _ORDER[shard.stage])
+            ),
         )
 
     def _job(self, job: JobView, running: Sequence[TaskView]) -> Job:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterable
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
@@ -19,9 +20,11 @@ from api.paging import next_address
 from api.problems import ERRORS
 from service.domain import AssetKind, State
 from service.errors import UnavailableError
+from service.index.views import WorkerView
 
 PAGE_SIZE: Final = 50
 _SHOWN_PICTURES: Final = 12
+_LOST_SHOWN: Final = timedelta(minutes=10)
 #: Sort key, label, unit of the columns of a table of grasps.
 COLUMNS: Final = (
     ("epsilon", "ε", ""),
@@ -65,7 +68,7 @@ def home(
         minutes=catalog.valid_per_minute(),
         jobs=catalog.jobs(state=chosen, limit=PAGE_SIZE, cursor=cursor),
         stages=_stage_depths(catalog),
-        workers=catalog.workers(),
+        workers=[worker for worker in catalog.workers() if _is_recent(worker)],
         failures=catalog.failures(limit=5),
     )
 
@@ -163,6 +166,12 @@ _HTTP_PROBLEMS: Final = {
     "range-not-satisfiable": (416, "The range of bytes lies behind the end of the file."),
     "misdirected-request": (421, "The service does not answer to this host name while it is open."),
 }
+
+
+def _is_recent(worker: WorkerView) -> bool:
+    """A worker that is lost stays on the page for a while, so that somebody sees it."""
+    age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
+    return worker.state != "lost" or age < _LOST_SHOWN
 
 
 def _sort_link(request: Request, query: GraspQuery, key: str) -> str:
