@@ -35,6 +35,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("synth", "worker.planners.commands", "Without a server", "Grasps of a hand file on an object file."),
     ("scene", "worker.scenes.commands", "Without a server", "The object at rest on a table; grasps that fit there."),
     ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
+    ("bench", "worker.studies.commands", "Studies", "Grasps per second, and where the time goes."),
     ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
 )
 

@@ -1,0 +1,67 @@
+"""The benchmark's contract, and that it measures what it says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from service.domain import FIDELITIES
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners.fast_graspd.pairs import pair_of
+from worker.studies.commands import app
+from worker.studies.timing import kernel_shares
+
+RUN_KEYS = {
+    "fidelity", "batch", "processes", "hand_points", "faces", "iterations", "ms_per_iteration", "grasps_per_second",
+    "peak_memory_mb",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, object], Path]:
+    out = tmp_path_factory.mktemp("bench")
+    arguments = ["--hand", "barrett", "--object", "block", "--fidelity", "draft", "--batch", "1", "--batch", "4"]
+    done = CliRunner().invoke(app, [*arguments, "--threads", "1", "--repeats", "1", "--out", str(out), "--json"])
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout.strip().splitlines()[-1]), out
+
+
+def test_every_run_has_the_keys_of_the_contract(result: tuple[dict[str, object], Path]) -> None:
+    found, _ = result
+    assert found["device"]
+    runs = found["runs"]
+    assert isinstance(runs, list) and [run["batch"] for run in runs] == [1, 4]
+    assert all(set(run) >= RUN_KEYS for run in runs)
+
+
+def test_the_rate_is_the_batch_over_its_seconds(result: tuple[dict[str, object], Path]) -> None:
+    runs = result[0]["runs"]
+    assert isinstance(runs, list)
+    for run in runs:
+        assert run["grasps_per_second"] == pytest.approx(run["batch"] / run["seconds"], rel=0.01)
+        assert run["ms_per_iteration"] == pytest.approx(1e3 * run["seconds"] / run["iterations"], rel=0.01)
+
+
+def test_json_table_and_plot_are_written(result: tuple[dict[str, object], Path]) -> None:
+    found, out = result
+    assert json.loads((out / "bench.json").read_text())["runs"] == found["runs"]
+    assert "grasps/s" in (out / "bench.md").read_text()
+    assert (out / "bench.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_kernel_shares_add_up_and_the_distance_query_is_among_them() -> None:
+    fidelity = FIDELITIES["draft"]
+    pair = pair_of(hand_from_path("barrett"), object_from_path("block"), fidelity, "cpu")
+    for phase in kernel_shares(pair, fidelity, 4).values():
+        assert sum(phase["share"].values()) == pytest.approx(1.0, abs=2e-3)
+        assert phase["share"]["gather"] > 0
+        assert phase["queries_per_second"] > 0
+
+
+def test_an_unknown_fidelity_is_the_callers_mistake() -> None:
+    done = CliRunner().invoke(app, ["--fidelity", "superb"])
+    assert done.exit_code == 2

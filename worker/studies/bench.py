@@ -1,0 +1,114 @@
+"""Throughput of the planner: grasps per second over fidelities, batches, threads, hand points and object faces."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Callable, Sequence
+from statistics import median
+from typing import Any
+
+import warp as wp
+
+from service.domain import Fidelity
+from service.version import PACKAGE_VERSION
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd import pairs
+from worker.planners.fast_graspd.planner import optimise_batch
+from worker.studies.timing import kernel_shares
+
+Load = Callable[[float], ObjectModel]
+Say = Callable[[str], None]
+
+
+def bench(
+    hand: HandModel, load: Load, *, fidelities: Sequence[Fidelity], batches: Sequence[int], threads: Sequence[int],
+    device: str, repeats: int, say: Say = lambda line: None,
+) -> dict[str, Any]:  # fmt: skip
+    """One run per fidelity x batch x threads.
+
+    Args:
+        hand: the hand.
+        load: the object, given the simplification error bound of a fidelity [m].
+        fidelities: knobs to run.
+        batches: grasps per call.
+        threads: CPU threads per call; a GPU takes the whole batch at once.
+        device: Warp device.
+        repeats: timed calls per run, after one that is not timed; the median is reported.
+        say: told of each run as it ends.
+
+    Returns:
+        `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds, `kernels`.
+    """
+    first = fidelities[0]
+    start = _start_times(hand, load(first.face_error_m), first, device)
+    runs = []
+    for fidelity in fidelities:
+        obj = load(fidelity.face_error_m)
+        for batch in batches:
+            for count in threads:
+                run = _run(hand, obj, fidelity, batch, count, device, repeats)
+                runs.append(run)
+                say(
+                    f"{fidelity.name:9s} batch {batch:5d} threads {count}: {run['grasps_per_second']:8.1f} grasps/s, "
+                    f"{run['ms_per_iteration']:7.2f} ms/iteration"
+                )
+    pair = pairs.pair_of(hand, load(first.face_error_m), first, device)
+    return {
+        "device": _device_name(device),
+        "hand": hand.name,
+        "object": load(first.face_error_m).name,
+        "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
+        "start": start,
+        "kernels": kernel_shares(pair, first, min(32, max(batches))),
+        "runs": runs,
+    }
+
+
+def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> dict[str, float]:
+    """Seconds to the first grasp of a fresh process (kernels from the disk cache, or compiled) and to the next one."""
+    seconds = []
+    for seed in (0, 1):
+        began = time.perf_counter()
+        optimise_batch(hand, obj, count=1, fidelity=fidelity, seed=seed, batch=0, threads=1, device=device)
+        seconds.append(round(time.perf_counter() - began, 3))
+    return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
+
+
+def _run(
+    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, threads: int, device: str, repeats: int
+) -> dict[str, Any]:
+    seconds = []
+    for seed in range(repeats + 1):
+        began = time.perf_counter()
+        optimise_batch(hand, obj, count=batch, fidelity=fidelity, seed=seed, batch=0, threads=threads, device=device)
+        seconds.append(time.perf_counter() - began)
+    typical = median(seconds[1:])
+    iterations = fidelity.coarse_iterations + fidelity.fine_iterations
+    return {
+        "fidelity": fidelity.name,
+        "batch": batch,
+        "processes": threads,
+        "hand_points": fidelity.fine_points,
+        "coarse_points": fidelity.coarse_points,
+        "faces": len(obj.faces),
+        "iterations": iterations,
+        "ms_per_iteration": round(1e3 * typical / iterations, 4),
+        "grasps_per_second": round(batch / typical, 3),
+        "seconds": round(typical, 4),
+        "spread": round((max(seconds[1:]) - min(seconds[1:])) / typical, 3),
+        "peak_memory_mb": round(_peak_memory_mb(device), 1),
+    }
+
+
+def _peak_memory_mb(device: str) -> float:
+    if wp.get_device(device).is_cuda:
+        return float(wp.get_mempool_used_mem_high(device)) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _device_name(device: str) -> str:
+    found = wp.get_device(device)
+    return str(found.name) if found.is_cuda else f"cpu ({os.cpu_count()} cores)"

@@ -1,0 +1,70 @@
+"""Where the time of an iteration goes, launch by launch."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+
+from service.domain import Fidelity
+from worker.planners.fast_graspd.pairs import Pair
+from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.simulation.simulation import HandState, Schedule, Simulation
+
+#: Iterations timed, launch by launch, from the middle of a phase.
+SAMPLED: Final = 12
+
+
+def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) -> dict[str, Any]:
+    """Milliseconds per iteration of both phases, the share of each kernel, and closest-point queries per second.
+
+    Args:
+        pair: hand and object on a device.
+        fidelity: the knobs.
+        count: grasps at a time, on one thread.
+        seed: of the starts.
+    """
+    probe = pair.simulation(pair.coarse, count * len(RETREATS))
+    state = sample_starts(pair.hand.model, pair.obj.model, probe, seed=seed, batch=0, indices=range(count))
+    phases: dict[str, Any] = {}
+    for name, points, schedule in (
+        ("coarse", pair.coarse, coarse_schedule(fidelity)),
+        ("fine", pair.fine, fine_schedule(fidelity)),
+    ):
+        if len(schedule) < 2:
+            continue
+        simulation = pair.simulation(points, count)
+        times, state = _timed(simulation, state, schedule, fidelity)
+        total = sum(times.values())
+        phases[name] = {
+            "ms_per_iteration": round(1e3 * total, 3),
+            "points": len(points),
+            "share": {kernel: round(t / total, 4) for kernel, t in sorted(times.items(), key=lambda item: -item[1])},
+            "queries_per_second": round(count * len(points) / times["gather"]) if times.get("gather") else None,
+        }
+    return phases
+
+
+def _timed(
+    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity
+) -> tuple[dict[str, float], HandState]:
+    """Seconds per iteration of each kernel, medians over `SAMPLED` iterations in the middle of the schedule."""
+    simulation.set_schedule(schedule)
+    simulation.set_state(state)
+    simulation.record_iteration(fidelity.optimizer)
+    sampled = min(SAMPLED, len(schedule))
+    before = (len(schedule) - sampled) // 2
+    simulation.run(before)
+    wp.synchronize_device(simulation.device)
+    found: dict[str, list[float]] = {}
+    for _ in range(sampled):
+        for name, command in simulation.commands():
+            began = time.perf_counter()
+            command.launch()
+            wp.synchronize_device(simulation.device)
+            found.setdefault(name, []).append(time.perf_counter() - began)
+    simulation.run(len(schedule) - before - sampled)
+    return {name: float(np.median(values)) for name, values in found.items()}, simulation.state(len(state.pivot))
