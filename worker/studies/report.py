@@ -52,7 +52,9 @@ def _plot(result: dict[str, Any], path: Path) -> None:
         runs = sorted((r for r in result["runs"] if (r["fidelity"], r["processes"]) == key), key=lambda r: r["batch"])
         label = f"{key[0]}, {key[1]} thread{'s' if key[1] > 1 else ''}"
         axes.plot([r["batch"] for r in runs], [r["grasps_per_second"] for r in runs], marker="o", label=label)
+    batches = sorted({r["batch"] for r in result["runs"]})
     axes.set_xscale("log", base=2)
+    axes.set_xticks(batches, [str(batch) for batch in batches], minor=False)
     axes.set_xlabel("grasps per call")
     axes.set_ylabel("grasps per second")
     axes.set_ylim(bottom=0)
