@@ -13,7 +13,7 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.displacement import GRAVITY, STEPS, TIMESTEP_S, simulated_displacement_cm
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, "box")
+WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
 HAND = plate_hand()
 
 

@@ -23,7 +23,7 @@ from worker.quality.referee.model import OBJECT_MASS, Physics, build
 from worker.quality.referee.protocol import Outcome, Test
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, "box")
+WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
 PLATES = plate_hand()
 CONTACT = posture(((0, 0, 0), (0.065, 0.065)))
 

@@ -1,7 +1,8 @@
 """Convex pieces of an object by CoACD (Wei et al. 2022), measured before use and kept on disk.
 
 The pieces are the object as the referee's engine knows it, so a bad decomposition is a bad referee: pieces that fill a
-hollow make every grasp of it wrong. Count and volume ratio go with every verdict; too large a ratio is refused.
+hollow make every grasp of it wrong. Count, volume ratio and excess go with every verdict; a large excess is refused.
+Excess is what the pieces' union has more of volume, over the object's surface: the mean height of what was filled in.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from numpy.typing import NDArray
 
 from service.digests import digest_json
 from service.errors import MeshError
+from worker.hands.primitives import triangle_areas
 from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
 
-#: An object whose hull has at most this much more volume is its hull: scan noise is not worth pieces.
-HULL_RATIO: Final = 1.15
-#: Concavity thresholds from coarse to fine; the first whose pieces are within `GOOD_RATIO` is taken.
-THRESHOLDS: Final = (0.2, 0.08, 0.04)
-GOOD_RATIO: Final = 1.25
-#: Pieces with more than this times the object's volume are no picture of it.
-MAX_RATIO: Final = 2.5
+#: Pieces whose mean excess is at most this are good [m]: a grasp's verdict does not feel less than that.
+GOOD_EXCESS_M: Final = 8.5e-4
+#: Pieces that stand out more than this from the object are no picture of it [m].
+MAX_EXCESS_M: Final = 2e-3
+#: CoACD's concavity thresholds from coarse to fine; the first with good pieces is taken.
+THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
 #: Preprocessing inflates near-convex scans by 9 to 17 % and takes a minute; our meshes are closed already.
 _COACD: Final = {
@@ -59,6 +60,8 @@ class ConvexPieces:
     """One (V, 3) array of corners per piece, object frame [m]."""
     volume_ratio: float
     """Volume of the union over the object's."""
+    excess_m: float
+    """Mean height of the union above the object's surface [m]."""
     digest: str
     """Of the pieces' corners: part of a verdict's key."""
 
@@ -74,13 +77,13 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
         cache: folder to keep them in; by default `$XDG_CACHE_HOME/graspd/convex`.
 
     Raises:
-        MeshError: the best pieces have more than `MAX_RATIO` times the object's volume, or none was found.
+        MeshError: the best pieces stand out more than `MAX_EXCESS_M` from the object.
     """
     pieces = _load_or_make(_Key(obj), cache or default_cache())
-    if not len(pieces) or pieces.volume_ratio > MAX_RATIO:
+    if pieces.excess_m > MAX_EXCESS_M:
         raise MeshError(
-            f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume "
-            f"(limit {MAX_RATIO}); the referee cannot judge so thin-walled an object"
+            f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume and "
+            f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); the referee cannot judge it"
         )
     return pieces
 
@@ -97,7 +100,7 @@ class _Key:
     def __init__(self, obj: ObjectModel) -> None:
         self.obj = obj
         shape = hashlib.sha256(obj.vertices.tobytes() + obj.faces.tobytes()).hexdigest()
-        settings = [_COACD, THRESHOLDS, HULL_RATIO, GOOD_RATIO, version("coacd")]
+        settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version("coacd")]
         self.digest = digest_json({"shape": shape, "settings": settings})
 
     def __hash__(self) -> int:
@@ -116,7 +119,12 @@ def _load_or_make(key: _Key, cache: Path) -> ConvexPieces:
     else:
         parts = _make(key.obj)
         _store(file, parts)
-    return ConvexPieces(parts, union_volume(parts) / key.obj.volume, _digest(parts))
+    volume = union_volume(parts)
+    return ConvexPieces(parts, volume / key.obj.volume, _excess(volume, key.obj), _digest(parts))
+
+
+def _excess(volume: float, obj: ObjectModel) -> float:
+    return (volume - obj.volume) / float(triangle_areas(obj.vertices, obj.faces).sum())
 
 
 def _store(file: Path, parts: tuple[Floats, ...]) -> None:
@@ -133,16 +141,14 @@ def _store(file: Path, parts: tuple[Floats, ...]) -> None:
 
 def _make(obj: ObjectModel) -> tuple[Floats, ...]:
     best: tuple[Floats, ...] = (obj.hull_vertices,)
-    ratio = union_volume(best) / obj.volume
-    if ratio <= HULL_RATIO:
-        return best
+    excess = _excess(union_volume(best), obj)
     for threshold in THRESHOLDS:
-        parts = tuple(part for part in _coacd(obj, threshold) if _solid(part))
-        found = union_volume(parts) / obj.volume
-        if parts and found < ratio:
-            best, ratio = parts, found
-        if ratio <= GOOD_RATIO:
+        if excess <= GOOD_EXCESS_M:
             break
+        parts = tuple(part for part in _coacd(obj, threshold) if _solid(part))
+        found = _excess(union_volume(parts), obj)
+        if parts and found < excess:
+            best, excess = parts, found
     return best
 
 

@@ -54,6 +54,8 @@ class Verdicts:
     pieces: int
     volume_ratio: float
     """Volume of the object's convex pieces over its own."""
+    excess_m: float
+    """Mean height of the pieces above the object's surface [m]."""
     key: str
     """Digest of everything that moves a verdict: hand, object, pieces, postures, protocol, engine version."""
     seconds: float
@@ -177,6 +179,7 @@ def _verdicts(trials: list[Trial], bench: _Bench, key: str, seconds: float) -> V
         hard=bench.hard,
         pieces=len(bench.pieces),
         volume_ratio=bench.pieces.volume_ratio,
+        excess_m=bench.pieces.excess_m,
         key=key,
         seconds=seconds,
         steps=sum(t.steps for t in trials),
