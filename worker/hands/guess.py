@@ -82,16 +82,27 @@ def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _guess_approach(hand: HandModel) -> Floats:
-    """Mean direction in which the fingertips move as the hand closes, snapped to a root axis within 40 degrees."""
-    motion = _tips(hand, _posture(hand, 0.4)) - _tips(hand, _posture(hand, 0.05))
-    mean = motion.sum(axis=0)
+    """Direction out of the palm, snapped to a root axis within 40 degrees.
+
+    Two witnesses: the mean way of the fingertips as the hand closes, which points out of a human-like palm but sideways
+    where two fingers oppose one; and where the tips of the half-closed hand are, which is ahead of the palm on a
+    gripper but also far along the fingers of a human-like hand. Their sum errs least.
+    """
+    way = (_tips(hand, _posture(hand, 0.4)) - _tips(hand, _posture(hand, 0.05))).sum(axis=0)
+    palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
+    ahead = _tips(hand, _posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else 0.0)
+    mean = _unit(way) + _unit(ahead)
     if np.linalg.norm(mean) < 1e-6:
         return np.array([0.0, 0, 1])
-    mean /= np.linalg.norm(mean)
+    mean = _unit(mean)
     axis = int(np.argmax(np.abs(mean)))
     if abs(mean[axis]) > np.cos(np.deg2rad(40)):
         return np.sign(mean[axis]) * np.eye(3)[axis]
     return mean
+
+
+def _unit(vector: Floats) -> Floats:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def _stated_approach(tree: Tree, options: HandOptions) -> Floats | None:

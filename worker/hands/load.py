@@ -20,7 +20,7 @@ from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
 from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, PLACEHOLDER_EFFORT, HandOptions, parse_options
 from worker.hands.primitives import volume
-from worker.hands.shapes import find_mesh, make_piece
+from worker.hands.shapes import Hulls, find_mesh, make_piece
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.urdf import Urdf, read_urdf
 from worker.transforms import compose
@@ -103,11 +103,11 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
 
 
 def _pieces(urdf: Urdf, tree: Tree, files: Mapping[str, bytes], base: str) -> tuple[ConvexPiece, ...]:
-    pieces = []
+    pieces, hulls = [], Hulls()
     for link, (body, pose) in tree.links.items():
         for shape in urdf.links[link].shapes:
             placed = compose(pose, shape.pose)
-            pieces.append(make_piece(shape, body=body, pose=placed, link=link, files=files, base=base))
+            pieces.append(make_piece(shape, body=body, pose=placed, link=link, files=files, base=base, hulls=hulls))
     return tuple(pieces)
 
 

@@ -152,5 +152,8 @@ def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces:
         case _:
             a, b, c = np.moveaxis(vertices[faces], 1, 0)
             normals = np.cross(b - a, c - a)
-            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            lengths = np.linalg.norm(normals, axis=1)
+            # A sliver of the triangulation has no direction of its own.
+            sound = lengths > 1e-9 * lengths.max()
+            normals, a = normals[sound] / lengths[sound, None], a[sound]
             return (points @ normals.T - np.einsum("ij,ij->i", normals, a)).max(axis=1)

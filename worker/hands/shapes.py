@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import Final
 
@@ -12,7 +11,7 @@ import numpy as np
 from service.assets import check_path
 from service.errors import HandError, InputError, MeshError
 from worker.hands.model import ConvexPiece, Floats, Ints
-from worker.hands.primitives import hull, tessellate, volume
+from worker.hands.primitives import hull, signed_distance, tessellate, volume
 from worker.hands.urdf import Shape
 from worker.objects.formats import read_mesh
 from worker.transforms import IDENTITY_POSE, apply
@@ -23,8 +22,11 @@ MAX_HULL_VERTICES: Final = 50
 MAX_PIECE_M: Final = 2.0
 
 
+Hulls = dict[tuple[str, tuple[float, ...]], tuple[Floats, Ints]]
+
+
 def make_piece(
-    shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str
+    shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
 ) -> ConvexPiece:
     """The convex piece of a collision element.
 
@@ -35,6 +37,7 @@ def make_piece(
         link: URDF link it comes from.
         files: all files of the hand.
         base: folder of the URDF inside `files`.
+        hulls: hulls of this hand's meshes so far, by name and scale: a fingertip is often used for every finger.
 
     Raises:
         HandError: a mesh is missing, outside the upload, unreadable, flat or far too large.
@@ -43,8 +46,16 @@ def make_piece(
         vertices, faces = tessellate(shape.kind, shape.size)
         return ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)
     name = find_mesh(shape.filename, files, base, link)
+    key = (name, shape.size)
+    if key not in hulls:
+        hulls[key] = _mesh_hull(name, shape.size, files[name], link)
+    vertices, faces = hulls[key]
+    return ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
+
+
+def _mesh_hull(name: str, scale: tuple[float, ...], data: bytes, link: str) -> tuple[Floats, Ints]:
     try:
-        points = read_mesh(name, files[name]).vertices * np.asarray(shape.size)
+        points = read_mesh(name, data).vertices * np.asarray(scale)
     except MeshError as error:
         raise HandError(f"collision mesh of link {link!r}: {error}") from None
     if np.ptp(points, axis=0).max() > MAX_PIECE_M:
@@ -52,8 +63,7 @@ def make_piece(
             f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
             'if it is in millimetres give it scale="0.001 0.001 0.001"'
         )
-    vertices, faces = reduce_hull(points)
-    return ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
+    return reduce_hull(points)
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
@@ -101,26 +111,11 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
     vertices, faces = hull(points)
     if len(vertices) <= limit:
         return vertices, faces
-    return _reduced(vertices.tobytes(), limit)
-
-
-@lru_cache(maxsize=64)
-def _reduced(data: bytes, limit: int) -> tuple[Floats, Ints]:
-    """Cached, because a hand often uses one fingertip mesh several times."""
-    vertices = np.frombuffer(data).reshape(-1, 3)
-    full = volume("hull", (), *hull(vertices))
+    full = volume("hull", (), vertices, faces)
     directions = np.concatenate([np.eye(3), -np.eye(3)])
     chosen = list(dict.fromkeys(np.argmax(vertices @ directions.T, axis=0).tolist()))
     while len(chosen) < limit:
-        corners, faces = hull(vertices[chosen]) if len(chosen) >= 4 else (vertices[chosen], None)
-        if faces is None:
-            outside = np.linalg.norm(vertices[:, None] - corners[None], axis=2).min(axis=1)
-        else:
-            a, b, c = np.moveaxis(corners[faces], 1, 0)
-            normal = np.cross(b - a, c - a)
-            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-            outside = (vertices @ normal.T - np.einsum("ij,ij->i", normal, a)).max(axis=1)
-        farthest = int(np.argmax(outside))
+        farthest = int(np.argmax(_outside(vertices, vertices[chosen])))
         if farthest in chosen:
             break
         chosen.append(farthest)
@@ -128,3 +123,11 @@ def _reduced(data: bytes, limit: int) -> tuple[Floats, Ints]:
     centre = corners.mean(axis=0)
     growth = (full / volume("hull", (), corners, faces)) ** (1 / 3)
     return centre + (corners - centre) * growth, faces
+
+
+def _outside(points: Floats, corners: Floats) -> Floats:
+    """(N,) how far points (N, 3) lie outside the hull of a few of them; from the nearest corner while that is flat."""
+    spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
+        return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
+    return signed_distance("hull", (), *hull(corners), points)

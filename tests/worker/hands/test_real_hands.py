@@ -9,7 +9,7 @@ import pytest
 import yourdfpy
 
 from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
+from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.transforms import IDENTITY_POSE, pose_to_matrix
 
@@ -62,6 +62,24 @@ def test_closing_brings_the_fingertips_together(real: tuple[str, Path, HandModel
 def test_hulls_are_small_enough_for_fast_queries(real: tuple[str, Path, HandModel]) -> None:
     _, _, hand = real
     assert max((len(p.faces) for p in hand.pieces if p.kind == "hull"), default=0) <= 100
+
+
+@pytest.mark.parametrize(
+    ("name", "root", "normal"),
+    [
+        ("allegro", None, (1, 0, 0)),
+        ("barrett", None, (0, 0, 1)),
+        ("bh280", None, (0, 0, 1)),
+        ("shadow", "palm", (0, -1, 0)),
+    ],
+)
+def test_the_palm_normal_is_guessed_right(
+    shared_data: Path, name: str, root: str | None, normal: tuple[int, int, int]
+) -> None:
+    path = shared_data / "hands" / URDFS[name]
+    _, files, _ = files_from_path(path)
+    hand = load_hand(files, name=name, digest="0" * 32, options={"root": root} if root else {})
+    np.testing.assert_allclose(hand.palm.approach, normal, atol=1e-9)
 
 
 def load(shared_data: Path, name: str) -> HandModel:
