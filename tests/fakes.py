@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from service import names
-from service.domain import AssetKind, JobRequest, Stage, TaskMessage
+from service.clock import timestamp
+from service.domain import AssetKind, JobRequest, Lane, Stage, TaskMessage
 from service.library import publish_asset
 from service.manifests import ShardManifest, publish_shard
 from service.parts import Parts
+from service.planning import message_of, plan
+from service.records import JobRecord
 from service.store import Store
 from worker.context import TaskContext
 from worker.stages.output import Output, shard_of
@@ -92,6 +95,15 @@ def add_assets(parts: Parts) -> None:
 def request(**changes: Any) -> JobRequest:
     """A job of one batch on these."""
     return JobRequest(**{"hand": "gripper", "object": "ball", "grasps": 32, **changes})
+
+
+def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes: Any) -> TaskMessage:
+    """The message of the first task of that stage of such a job."""
+    wanted = request(**changes)
+    digests = {"hand_digest": "a" * 32, "object_digest": "b" * 32}
+    job = JobRecord(id="c" * 32, request=wanted, lane=Lane.BULK, created=timestamp(), **digests)
+    task = next(task for task in plan(job) if task.stage is stage)
+    return message_of(job, task, attempt=attempt, max_attempt=3)
 
 
 def _pretend_to_work(context: TaskContext) -> None:

@@ -178,7 +178,10 @@ class Changes(Database):
     def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
         upsert(connection, attempts, [attempt_row(attempt)])
         values: dict[str, Any] = {"last_attempt": attempt.number, "exhausted": attempt.last, "reason": attempt.reason}
-        values |= {"finished": attempt.ended, "worker": attempt.worker} if attempt.last else {"worker": None}
+        values |= {
+            "finished": attempt.ended if attempt.last else None,
+            "worker": attempt.worker if attempt.last else None,
+        }
         values |= {"queued": False, "not_before": not_before, "state": State.QUEUED.value}
         values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": None}
         touched = connection.execute(

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from service import names
+from service.assets import pack, unpack
 from service.domain import AssetKind, IngestMessage
-from service.library import load_asset_files
+from service.library import UNPACKED_LIMIT_BYTES, load_asset_files
 from worker.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
@@ -23,6 +24,8 @@ MEMORY_LIMIT_BYTES: Final = 4 * 2**30
 CPU_LIMIT_S: Final = 60
 #: A child that waits instead of computing is ended by the clock [s].
 WALL_LIMIT_S: Final = 120.0
+_PASSED_ON: Final = ("PATH", "HOME", "LANG", "TMPDIR", "PYTHONPATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV")
+_OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed to map")
 _FINDING_BYTES: Final = 2**20
 
 
@@ -46,19 +49,28 @@ def check_in_child(
     """What the check of a hand or object says, or a refusal that says how the check itself ended."""
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target = Path(folder) / "files.zip", Path(folder) / "check.json"
-        from service.assets import pack
-
         source.write_bytes(pack(files))
         limits = [str(memory_bytes), str(cpu_s)]
         command = [sys.executable, "-m", "worker.stages.ingest", kind.value, name, str(source), str(target), *limits]
         with subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+            env=_environment(),
         ) as child:
             code = _wait(child, context, wall_s)
             complaint = (child.stderr.read() if child.stderr else b"")[-4000:].decode(errors="replace")
         if code == 0 and target.is_file() and target.stat().st_size <= _FINDING_BYTES:
             return dict(json.loads(target.read_bytes()))
         return _refusal(kind, name, code, complaint, memory_bytes, cpu_s)
+
+
+def _environment() -> dict[str, str]:
+    """What the child may know: no credentials; and one thread, because each takes address space from the limit."""
+    passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+    return passed_on | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 def _wait(child: subprocess.Popen[bytes], context: TaskContext, wall_s: float) -> int | None:
@@ -83,7 +95,7 @@ def _refusal(
 ) -> dict[str, Any]:
     if code in (None, -signal.SIGXCPU, -signal.SIGKILL):
         why = f"reading it takes longer than {cpu_s} s; simplify it"
-    elif "MemoryError" in complaint or "bad_alloc" in complaint or "Cannot allocate" in complaint:
+    elif any(sign in complaint for sign in _OUT_OF_MEMORY):
         why = f"reading it needs more than {memory_bytes / 2**30:.3g} GiB of memory; simplify it"
     else:
         last = complaint.strip().splitlines()[-1:] or [f"exit code {code}"]
@@ -99,9 +111,6 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
         (resource.RLIMIT_FSIZE, _FINDING_BYTES),
     ):
         resource.setrlimit(limit, (value, value))
-    from service.assets import unpack
-    from service.library import UNPACKED_LIMIT_BYTES
-
     files = unpack(Path(source).read_bytes(), limit_bytes=UNPACKED_LIMIT_BYTES)
     if AssetKind(kind) is AssetKind.HAND:
         from worker.hands.check import check_hand

@@ -1,0 +1,24 @@
+"""What the shared floor may not pull in, so that the image of the API stays small."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import service
+
+MODULES = sorted(
+    "service."
+    + ".".join(path.relative_to(Path(service.__file__).parent).with_suffix("").parts).removesuffix(".__init__")
+    for path in Path(service.__file__).parent.rglob("*.py")
+    if "migrations" not in path.parts and path.name != "__init__.py"
+)
+
+
+@pytest.mark.parametrize("heavy", ["warp", "trimesh", "mujoco", "scipy", "newton", "worker", "api"])
+def test_the_shared_floor_is_light(heavy: str) -> None:
+    code = f"import sys, {', '.join(MODULES)}; sys.exit({heavy!r} in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

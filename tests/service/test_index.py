@@ -1,0 +1,319 @@
+"""The index: what the API asks of it, and that it holds the same rows as a rebuild from the store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import delete, inspect, update
+
+from service import names, pipeline
+from service.clock import timestamp
+from service.domain import AssetKind, Lane, Stage, State
+from service.errors import IndexUnavailable, InputError, NotFoundError
+from service.index import tables
+from service.index.filters import GraspFilter, GraspSort
+from service.index.index import Index
+from service.index.rebuild import differences, rebuild
+from service.index.tables import metadata
+from service.index.views import GraspView
+from service.parts import Parts
+from service.planning import message_of, plan
+from service.records import AttemptRecord, JobRecord, put_record, read_record
+from tests.fakes import make_shard, request
+
+
+@pytest.fixture
+def index(tmp_path: Path) -> Iterator[Index]:
+    made = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    yield made
+    made.close()
+
+
+def run_all(parts: Parts, job: str, *, batches: int | None = None, stages: int | None = None) -> None:
+    """Do the first tasks of a job and index them."""
+    record = read_record(JobRecord, parts.store, names.job_record(job))
+    for task in plan(record):
+        if (batches is None or task.batch < batches) and (stages is None or task.stage is Stage.SYNTHESIZE):
+            parts.index.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
+
+
+def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None:
+    """A failed attempt of the first stage of a batch, in the store and in the index."""
+    task = parts.index.tasks(job=job).items[batch]
+    attempt = AttemptRecord(
+        task_id=task.id,
+        job_id=job,
+        stage=task.stage,
+        number=number,
+        kind="ValueError",
+        reason=f"attempt {number} went wrong",
+        worker="w",
+        ended=timestamp(),
+        last=last,
+    )
+    put_record(parts.store, names.attempt(task.id, number), attempt)
+    parts.index.add_attempt(attempt)
+
+
+def test_the_migrations_make_the_tables_that_the_code_uses(index: Index) -> None:
+    with index.reading() as connection:
+        inspector = inspect(connection)
+        for table in metadata.tables.values():
+            made = {(c["name"], str(c["type"]), c["nullable"]) for c in inspector.get_columns(table.name)}
+            assert made == {(c.name, str(c.type), bool(c.nullable)) for c in table.columns}
+            indexes = {(i["name"], tuple(i["column_names"])) for i in inspector.get_indexes(table.name)}
+            assert indexes == {(i.name, tuple(c.name for c in i.columns)) for i in table.indexes}
+
+
+def test_opening_a_migrated_index_again_changes_nothing(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request())
+    again = Index(parts.settings.resolved_index_url)
+    assert again.job(job.id) == parts.index.job(job.id)
+    again.close()
+
+
+def test_sqlite_lets_readers_read_while_one_writes(parts: Parts) -> None:
+    with parts.index.writing() as connection:
+        connection.execute(update(tables.assets).values(message="half done"))
+        assert {a.message for a in parts.index.assets(AssetKind.HAND).items} == {"fine"}
+
+
+def test_a_write_that_breaks_off_leaves_nothing(parts: Parts) -> None:
+    with pytest.raises(RuntimeError), parts.index.writing() as connection:
+        connection.execute(delete(tables.assets))
+        raise RuntimeError
+    assert parts.index.asset(AssetKind.HAND, "gripper").name == "gripper"
+
+
+def test_a_database_that_cannot_be_opened_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(IndexUnavailable, match="unable to open database file"):
+        Index(f"sqlite:///{tmp_path}")
+    with pytest.raises(InputError, match="index URL"):
+        Index("nonsense://")
+
+
+def test_a_job_shows_progress_by_stage(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=64, scenes=1))
+    task = parts.index.tasks(job=job.id).items[0]
+    parts.index.set_running(task.id, "w")
+    parts.index.set_progress({task.id: (1.0, 4.0, "descending")})
+    shown = parts.index.job(job.id)
+    assert shown.state is State.RUNNING
+    assert [(s.stage, s.tasks, s.running, s.done) for s in shown.stages] == [
+        ("synthesize", 2, 1, 0.25),
+        ("scene", 2, 0, 0),
+    ]
+    run_all(parts, job.id)
+    done = parts.index.job(job.id)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 64)
+    assert done.valid == parts.index.grasp_count(GraspFilter(job=job.id, valid=True))
+    assert done.finished is not None
+
+
+def test_jobs_come_newest_first_page_by_page(parts: Parts) -> None:
+    ids = []
+    for seed in range(5):
+        ids.append(pipeline.submit(parts, request(seed=seed))[0].id)
+        time.sleep(0.002)  # timestamps have milliseconds
+    seen: list[str] = []
+    cursor = None
+    for _ in range(3):
+        page = parts.index.jobs(limit=2, cursor=cursor)
+        seen += [job.id for job in page.items]
+        cursor = page.next
+    assert seen == ids[::-1]
+    assert cursor is None
+
+
+def test_jobs_are_found_by_state_hand_and_object(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request())
+    assert parts.index.jobs(state=State.QUEUED, hand="gripper", object="ball").items[0].id == job.id
+    assert parts.index.jobs(state=State.FAILED).items == []
+    assert parts.index.jobs(hand="other").items == []
+
+
+@pytest.mark.parametrize("descending", [True, False])
+@pytest.mark.parametrize("by", ["epsilon", "penetration_depth_mm", "created", "stability_loss"])
+def test_grasps_page_through_in_the_order_of_any_metric(parts: Parts, by: str, descending: bool) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=70))
+    run_all(parts, job.id)
+    with parts.index.writing() as connection:  # some without the metric
+        if by != "created":
+            connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(**{by: None}))
+    sort = GraspSort(by=by, descending=descending)  # type: ignore[arg-type]
+    seen: list[GraspView] = []
+    cursor = None
+    while True:
+        page = parts.index.grasps(sort=sort, limit=16, cursor=cursor)
+        seen += page.items
+        if (cursor := page.next) is None:
+            break
+    assert len({(g.shard_id, g.row) for g in seen}) == len(seen) == 70
+    values = [getattr(grasp, by) for grasp in seen]
+    known = [value for value in values if value is not None]
+    assert known == sorted(known, reverse=descending)
+    assert values[: len(known)] == known, "those without the metric come last"
+
+
+def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=64))
+    other, _ = pipeline.submit(parts, request(seed=1))
+    run_all(parts, job.id)
+    run_all(parts, other.id)
+    everything = [g for start in (None,) for g in parts.index.grasps(limit=200, cursor=start).items]
+    where = GraspFilter(
+        job=job.id, hand="gripper", valid=True, at_least={"epsilon": 0.3}, at_most={"penetration_depth_mm": 2.0}
+    )
+    found = parts.index.grasps(where, limit=200).items
+    of_job = {shard.id for shard in parts.index.shards(job=job.id).items}
+    expected = [
+        g
+        for g in everything
+        if g.shard_id in of_job and g.valid and (g.epsilon or 0) >= 0.3 and (g.penetration_depth_mm or 9) <= 2.0
+    ]
+    assert found == expected
+    assert 0 < len(found) < 64
+    assert parts.index.grasp_count(where) == len(found)
+
+
+def test_a_cursor_of_another_list_is_refused(parts: Parts) -> None:
+    for cursor in ("rubbish", "eyJ4IjoxfQ", "", "W10"):
+        with pytest.raises(InputError, match="cursor"):
+            parts.index.jobs(cursor=cursor)
+
+
+def test_unknown_ids_are_named(parts: Parts) -> None:
+    for call in (parts.index.job, parts.index.shard, parts.index.task):
+        with pytest.raises(NotFoundError, match="nothing-here"):
+            call("nothing-here")
+    with pytest.raises(NotFoundError, match="there are: gripper"):
+        parts.index.asset(AssetKind.HAND, "nothing-here")
+
+
+def test_a_shard_shows_its_manifest(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request())
+    run_all(parts, job.id)
+    (shard,) = parts.index.shards(job=job.id).items
+    whole = parts.index.shard(shard.id)
+    assert whole.manifest["request"]["hand"] == "gripper"
+    assert whole.count == 32
+    assert len(parts.store.get(whole.key)) == whole.size_bytes
+
+
+def test_failures_are_grouped_by_stage_and_error(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=64))
+    fail(parts, job.id, 0, 1, last=False)
+    fail(parts, job.id, 0, 2, last=False)
+    fail(parts, job.id, 1, 1, last=False)
+    (group,) = parts.index.failures()
+    assert (group.stage, group.kind, group.attempts, group.tasks) == ("synthesize", "ValueError", 3, 2)
+    assert len(parts.index.attempts(job=job.id)) == 3
+
+
+def test_the_service_in_numbers(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=64, scenes=1))
+    before = timestamp()
+    run_all(parts, job.id, batches=1)
+    stats = parts.index.stats()
+    assert (stats.grasps, stats.shards) == (32, 2)
+    assert stats.tasks[State.SUCCEEDED] == 2
+    assert stats.jobs[State.RUNNING] == 1
+    (cell,) = parts.index.matrix()
+    assert (cell.hand, cell.object, cell.jobs, cell.grasps, cell.queued) == ("gripper", "ball", 1, 32, 2)
+    made = parts.index.throughput(since=before)
+    assert sum(bucket.grasps for bucket in made) == 32
+
+
+def test_what_is_ready_is_fed_batch_by_batch_over_all_jobs(parts: Parts) -> None:
+    window = parts.settings.model_copy(update={"queue_window": 1})
+    small = Parts(window, parts.store, parts.index, parts.queue)
+    for seed in range(2):
+        pipeline.submit(small, request(grasps=320, seed=seed), lane=Lane.BULK)
+    ready = parts.index.ready_tasks(Lane.BULK, now=time.time(), limit=100)
+    assert [task.task.batch for task in ready] == sorted(task.task.batch for task in ready)
+    assert {task.job.id for task in ready[:3]} == {task.job.id for task in ready}
+
+
+def test_a_clock_set_back_does_not_strand_a_task(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request())
+    task = parts.index.tasks(job=job.id).items[0]
+    a_year = 365 * 86400
+    parts.index.set_waiting([task.id], not_before=time.time() + 60)
+    assert parts.index.ready_tasks(Lane.INTERACTIVE, now=time.time(), limit=9) == []
+    parts.index.set_waiting([task.id], not_before=time.time() + a_year)
+    assert len(parts.index.ready_tasks(Lane.INTERACTIVE, now=time.time(), limit=9)) == 1
+
+
+def test_two_jobs_that_need_one_shard_both_profit_from_it(parts: Parts) -> None:
+    plain, _ = pipeline.submit(parts, request())
+    with_scenes, _ = pipeline.submit(parts, request(scenes=1))
+    run_all(parts, plain.id)
+    assert parts.index.job(plain.id).state is State.SUCCEEDED
+    stages = parts.index.job(with_scenes.id).stages
+    assert [stage.succeeded for stage in stages] == [1, 0]
+    later, _ = pipeline.submit(parts, request(scenes=2))
+    assert [stage.succeeded for stage in parts.index.job(later.id).stages] == [1, 0]
+    assert parts.index.stats().grasps == 32, "it is one shard"
+
+
+def build_a_history(parts: Parts) -> None:
+    """Jobs in every state: done, failed, failed and retried, cancelled, cancelled and retried, half done."""
+    done, _ = pipeline.submit(parts, request(grasps=70, scenes=1))
+    run_all(parts, done.id)
+    half, _ = pipeline.submit(parts, request(grasps=64, scenes=1, seed=1))
+    run_all(parts, half.id, batches=1, stages=1)
+    failed, _ = pipeline.submit(parts, request(seed=2, scenes=1))
+    fail(parts, failed.id, 0, 1, last=False)
+    fail(parts, failed.id, 0, 2, last=True)
+    retried, _ = pipeline.submit(parts, request(seed=3, scenes=1))
+    fail(parts, retried.id, 0, 1, last=True)
+    pipeline.retry(parts, retried.id)
+    fail(parts, retried.id, 0, 2, last=False)
+    cancelled, _ = pipeline.submit(parts, request(seed=4, grasps=64))
+    run_all(parts, cancelled.id, batches=1)
+    pipeline.cancel(parts, cancelled.id)
+    again, _ = pipeline.submit(parts, request(seed=5))
+    fail(parts, again.id, 0, 1, last=False)
+    pipeline.cancel(parts, again.id)
+    pipeline.retry(parts, again.id)
+    running, _ = pipeline.submit(parts, request(seed=6))
+    parts.index.set_running(parts.index.tasks(job=running.id).items[0].id, "w")
+    shared, _ = pipeline.submit(parts, request(seed=2))
+    run_all(parts, shared.id)
+
+
+def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(parts: Parts) -> None:
+    build_a_history(parts)
+    states = {job.state for job in parts.index.jobs(limit=99).items}
+    assert states == {State.SUCCEEDED, State.RUNNING, State.QUEUED, State.CANCELLED}
+    assert differences(parts.index, parts.store) == []
+    before = parts.index.jobs(limit=99), parts.index.grasps(limit=200), parts.index.shards(limit=200)
+    rebuild(parts.index, parts.store)
+    assert differences(parts.index, parts.store) == []
+    after = parts.index.jobs(limit=99), parts.index.grasps(limit=200), parts.index.shards(limit=200)
+    assert before[1:] == after[1:]
+    assert [job.id for job in before[0].items] == [job.id for job in after[0].items]
+
+
+def test_every_kind_of_damage_to_the_index_is_seen_and_mended(parts: Parts) -> None:
+    build_a_history(parts)
+    with parts.index.writing() as connection:
+        connection.execute(delete(tables.grasps).where(tables.grasps.c.row == 0))
+        connection.execute(update(tables.shards).values(seconds=99.0))
+        connection.execute(update(tables.tasks).where(tables.tasks.c.done.is_(True)).values(state="failed"))
+    found = differences(parts.index, parts.store)
+    assert {line.split()[0] for line in found} >= {"grasps", "shards"}
+    rebuild(parts.index, parts.store)
+    assert differences(parts.index, parts.store) == []
+
+
+def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts) -> None:
+    build_a_history(parts)
+    jobs = len(parts.index.jobs(limit=99).items)
+    parts.store.put("shards/base/damaged.json", b"{")
+    with pytest.raises(Exception, match="damaged"):
+        rebuild(parts.index, parts.store)
+    assert len(parts.index.jobs(limit=99).items) == jobs

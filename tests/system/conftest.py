@@ -1,0 +1,97 @@
+"""A whole service of real processes on a free port, with the workers' engine replaced by `tests.fakes`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service import pipeline
+from service.domain import JobRequest
+from service.index.views import JobView
+from service.parts import Parts
+from service.settings import Settings
+from service.supervisor import Supervisor
+from tests.fakes import add_assets
+
+READY_S = 30.0
+
+
+class System:
+    """A running service and the parts of it that a test looks at."""
+
+    def __init__(self, supervisor: Supervisor) -> None:
+        self.supervisor = supervisor
+        self.parts = Parts.open(supervisor.settings)
+        add_assets(self.parts)
+
+    def submit(self, wanted: JobRequest) -> str:
+        return pipeline.submit(self.parts, wanted)[0].id
+
+    def until(self, met: Callable[[], Any], seconds: float, what: str) -> float:
+        """Seconds until a condition is met; fails when it takes longer than that."""
+        start = time.monotonic()
+        while not met():
+            assert time.monotonic() - start < seconds, f"after {seconds} s still not: {what}\n{self.logs()}"
+            time.sleep(0.02)
+        return time.monotonic() - start
+
+    def finish(self, *jobs: str, seconds: float) -> list[JobView]:
+        """The jobs once all are at their end."""
+        self.until(
+            lambda: all(self.parts.index.job(job).state.is_final for job in jobs), seconds, f"{len(jobs)} jobs done"
+        )
+        return [self.parts.index.job(job) for job in jobs]
+
+    def kill(self, name: str) -> int:
+        """kill -9 a child; returns its pid."""
+        pid = self.supervisor.pids[name]
+        os.kill(pid, signal.SIGKILL)
+        return pid
+
+    def logs(self) -> str:
+        """The last lines of every log."""
+        files = sorted((self.supervisor.settings.data_dir / "logs").glob("*.log"))
+        return "\n".join(f"--- {file.name}\n{file.read_text(errors='replace')[-1500:]}" for file in files)
+
+
+@pytest.fixture
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., System]]:
+    """Starts a service; `environment` is for its workers' fakes. Everything is stopped at the end."""
+    running: list[System] = []
+
+    def make(*, workers: int = 1, environment: dict[str, str] | None = None, **settings: Any) -> System:
+        for name, value in (environment or {}).items():
+            monkeypatch.setenv(name, value)
+        wanted = Settings(data_dir=tmp_path / "data", port=0, device="cpu", keeper_interval_s=0.5, **settings)
+        supervisor = Supervisor(
+            wanted, workers=workers, api=False, worker_command=(sys.executable, "-m", "tests.fakes")
+        )
+        supervisor.start()
+        try:
+            supervisor.wait_ready(READY_S)
+            running.append(System(supervisor))
+        except BaseException:
+            supervisor.stop()
+            raise
+        return running[-1]
+
+    yield make
+    for system in running:
+        system.parts.close()
+        system.supervisor.stop()
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs (a zombie does not)."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"

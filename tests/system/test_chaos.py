@@ -1,0 +1,231 @@
+"""Kills real processes and looks at what is left: every job ends, every result is there once, nothing stays behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rq import Queue
+from rq.serializers import JSONSerializer
+
+from service import names, pipeline
+from service.domain import State
+from service.errors import BusyError
+from service.index.filters import GraspFilter
+from service.index.rebuild import differences, rebuild
+from service.queue.allowed import TASK_FUNCTION
+from service.queue.rq_queue import RqQueue
+from service.settings import Settings
+from service.shards import read_shard
+from service.supervisor import Supervisor
+from tests.fakes import fake_synthesize, message_for, request
+from tests.system.conftest import System, alive
+from worker.context import TaskContext
+
+pytestmark = pytest.mark.chaos
+Start = Callable[..., System]
+
+#: Promised time from the death of a worker to the next attempt of its task [s].
+RECOVERY_S = 10.0
+#: Promised time from a user's cancellation to the end of the task [s].
+CANCEL_S = 2.0
+
+
+def running_on(system: System, job: str) -> str | None:
+    """Name of the worker that runs the job's first unfinished task."""
+    tasks = system.parts.index.tasks(job=job, state=State.RUNNING).items
+    return tasks[0].worker if tasks else None
+
+
+def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "1.5"})
+    reference = system.submit(request(seed=1))
+    (untouched,) = system.finish(reference, seconds=30)
+    job = system.submit(request(seed=2, scenes=1))
+    system.until(lambda: running_on(system, job), 10, "the task runs")
+    killed = system.kill("worker-0")
+    died = time.monotonic()
+    system.until(
+        lambda: system.parts.index.attempts(job=job) and running_on(system, job), RECOVERY_S + 2, "the task runs again"
+    )
+    assert time.monotonic() - died < RECOVERY_S
+    (done,) = system.finish(job, seconds=30)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 32)
+    assert untouched.state is State.SUCCEEDED
+    assert not alive(killed)
+    (attempt,) = system.parts.index.attempts(job=job)
+    assert attempt.kind == "WorkerLost"
+    assert system.parts.index.grasp_count(GraspFilter(job=job)) == 32
+    (base,) = system.parts.index.shards(job=job, kind="base").items
+    kept = read_shard(system.parts.store.get(base.key))["grasp/joint_positions"]
+    undisturbed = fake_synthesize(message_for(seed=2), TaskContext(system.parts.store))
+    np.testing.assert_array_equal(kept, undisturbed.arrays["grasp/joint_positions"])
+    assert differences(system.parts.index, system.parts.store) == []
+
+
+def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> None:
+    system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
+    jobs = [system.submit(request(grasps=96, scenes=1, seed=seed)) for seed in range(3)]
+    system.until(lambda: running_on(system, jobs[0]), 10, "the first task runs")
+    system.kill("redis")
+    done = system.finish(*jobs, seconds=60)
+    assert {job.state for job in done} == {State.SUCCEEDED}
+    assert system.parts.index.grasp_count(GraspFilter()) == 3 * 96
+    assert differences(system.parts.index, system.parts.store) == []
+
+
+def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(start: Start) -> None:
+    system = start(workers=2)
+    jobs = [system.submit(request(grasps=70, scenes=2, seed=seed)) for seed in range(5)]
+    done = system.finish(*jobs, seconds=60)
+    assert {(job.state, job.grasps) for job in done} == {(State.SUCCEEDED, 70)}
+    workers = {shard.worker for shard in system.parts.index.shards(limit=200).items}
+    assert len(workers) == 2, "both took part"
+    assert differences(system.parts.index, system.parts.store) == []
+    before = [system.parts.index.job(job) for job in jobs]
+    rebuild(system.parts.index, system.parts.store)
+    assert [system.parts.index.job(job) for job in jobs] == before
+
+
+def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) -> None:
+    system = start(environment={"FAKE_POISON": "1"}, lease_s=2.0, task_attempts=2, retry_backoff_s=0.1)
+    poisoned = system.submit(request(grasps=64))
+    healthy = system.submit(request(seed=7))
+    bad, good = system.finish(poisoned, healthy, seconds=60)
+    assert good.state is State.SUCCEEDED
+    assert (bad.state, bad.stages[0].succeeded, bad.stages[0].failed) == (State.FAILED, 1, 1)
+    attempts = system.parts.index.attempts(job=poisoned)
+    assert [(a.number, a.kind, a.last) for a in attempts] == [(2, "WorkerLost", True), (1, "WorkerLost", False)]
+    assert differences(system.parts.index, system.parts.store) == []
+
+
+def test_a_running_job_is_cancelled_within_two_seconds(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "60"})
+    job = system.submit(request())
+    system.until(lambda: running_on(system, job), 10, "the task runs")
+    assert pipeline.cancel(system.parts, job).state is State.CANCELLED
+    system.until(lambda: not system.parts.queue.leases(), CANCEL_S, "the worker let go")
+    assert system.parts.index.attempts(job=job) == []
+    again = system.submit(request(grasps=1, seed=3))
+    system.until(lambda: running_on(system, again), 10, "the worker takes the next task")
+
+
+def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "4"})
+    job = system.submit(request())
+    system.until(lambda: running_on(system, job), 10, "the task runs")
+    first = running_on(system, job)
+    os.kill(system.supervisor.pids["worker-0"], signal.SIGTERM)
+    took = system.until(lambda: running_on(system, job) not in (None, first), 10, "another worker runs it")
+    assert took < system.parts.settings.lease_s, "nobody waited for the lease to run out"
+    (done,) = system.finish(job, seconds=30)
+    assert done.state is State.SUCCEEDED
+    assert system.parts.index.attempts(job=job) == [], "it costs no attempt"
+
+
+def test_a_task_that_takes_too_long_is_stopped_with_that_reason(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "60"}, task_timeout_s=0.5, task_attempts=1)
+    (job,) = system.finish(system.submit(request()), seconds=30)
+    assert job.state is State.FAILED
+    assert job.reason is not None
+    assert "GRASPD_TASK_TIMEOUT_S" in job.reason
+
+
+def test_forged_entries_run_nothing_and_stop_nobody(start: Start, tmp_path: Path) -> None:
+    system = start()
+    witness = tmp_path / "witness"
+    assert isinstance(system.parts.queue, RqQueue)
+    plain = Queue("interactive-synthesize", connection=system.parts.queue.connection, serializer=JSONSerializer)
+    plain.enqueue_call("os.system", args=(f"touch {witness}",))
+    plain.enqueue_call("subprocess.check_output", args=(["touch", str(witness)],))
+    plain.enqueue_call(TASK_FUNCTION, args=({"schema": 1, "task_id": "../../x", "stage": "synthesize"},))
+    plain.enqueue_call(TASK_FUNCTION, args=(["not", "a", "message"],))
+    broken = plain.enqueue_call(TASK_FUNCTION, args=({},))
+    system.parts.queue.connection.hset(f"rq:job:{broken.id}", "data", b"\xff\xfe rubbish")
+    worker = system.supervisor.pids["worker-0"]
+    (done,) = system.finish(system.submit(request()), seconds=30)
+    assert done.state is State.SUCCEEDED
+    assert not witness.exists()
+    assert system.supervisor.pids["worker-0"] == worker, "the worker was not even restarted"
+
+
+def test_a_second_up_on_the_same_data_is_refused_and_says_by_whom(start: Start) -> None:
+    system = start()
+    second = Supervisor(Settings(data_dir=system.supervisor.settings.data_dir, port=0), api=False)
+    with pytest.raises(BusyError, match=f"in use by process {os.getpid()}"):
+        second.start()
+    assert system.parts.queue.ping() >= 0, "the first goes on"
+
+
+def test_any_child_that_is_killed_is_started_again(start: Start) -> None:
+    system = start()
+    for name in ("keeper", "worker-0", "redis"):
+        pid = system.kill(name)
+        system.until(lambda n=name, p=pid: system.supervisor.pids.get(n, p) != p, 5, f"{name} is back")
+    system.supervisor.wait_ready(30)
+    (done,) = system.finish(system.submit(request()), seconds=30)
+    assert done.state is State.SUCCEEDED
+
+
+_UP_IN_A_PROCESS = """
+import json, sys, time
+from pathlib import Path
+from service.settings import Settings
+from service.shards import read_shard
+from service.supervisor import Supervisor
+up = Supervisor(Settings(data_dir=Path(sys.argv[1]), port=0, device="cpu"), api=False,
+                worker_command=(sys.executable, "-m", "tests.fakes"))
+up.start()
+up.wait_ready(30)
+print(json.dumps(up.pids), flush=True)
+time.sleep(600)
+"""
+
+
+def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _UP_IN_A_PROCESS, str(tmp_path / "data")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        pids = json.loads(parent.stdout.readline())
+        assert set(pids) == {"redis", "keeper", "worker-0"}
+        parent.kill()
+    deadline = time.monotonic() + 5
+    while any(alive(pid) for pid in pids.values()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not [name for name, pid in pids.items() if alive(pid)]
+    settings = Settings(data_dir=tmp_path / "data", port=0, device="cpu")
+    with Supervisor(settings, api=False, worker_command=(sys.executable, "-m", "tests.fakes")) as again:
+        again.wait_ready(30)
+
+
+@pytest.mark.parametrize(
+    ("batches", "kills"), [(200, 8), pytest.param(2000, 60, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
+)
+def test_random_kills_lose_nothing_and_repeat_nothing(start: Start, batches: int, kills: int) -> None:
+    system = start(workers=2, environment={"FAKE_SECONDS": "0.02"}, lease_s=2.0, task_attempts=20, retry_backoff_s=0.1)
+    rng = random.Random(0)
+    jobs = [system.submit(request(grasps=32 * batches // 10, seed=seed)) for seed in range(10)]
+    everyone: set[int] = set()
+    for _ in range(kills):
+        time.sleep(rng.uniform(0.2, 0.8))
+        everyone |= set(system.supervisor.pids.values())
+        name = rng.choice(sorted(system.supervisor.pids) or ["keeper"])
+        if name in system.supervisor.pids:
+            system.kill(name)
+    done = system.finish(*jobs, seconds=60 + batches / 2)
+    assert {job.state for job in done} == {State.SUCCEEDED}
+    manifests = [e.key for e in system.parts.store.list(names.SHARDS) if e.key.endswith(".json")]
+    assert len(manifests) == batches
+    assert system.parts.index.stats().grasps == 32 * batches
+    system.until(lambda: not differences(system.parts.index, system.parts.store), 10, "index and store agree")
+    system.supervisor.stop()
+    assert not [pid for pid in everyone if alive(pid)]

@@ -1,0 +1,113 @@
+"""Uploads are hostile: what the checking child does must not reach its worker."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from service import names
+from service.domain import AssetKind, IngestMessage
+from service.errors import TaskCancelled
+from service.library import publish_asset
+from service.store import Store, open_store
+from worker.context import StopReason, TaskContext
+from worker.stages import ingest
+
+TETRAHEDRON = """\
+solid t
+facet normal 0 0 -1
+outer loop
+vertex 0 0 0
+vertex 0 0.05 0
+vertex 0.05 0 0
+endloop
+endfacet
+facet normal 0 -1 0
+outer loop
+vertex 0 0 0
+vertex 0.05 0 0
+vertex 0 0 0.05
+endloop
+endfacet
+facet normal -1 0 0
+outer loop
+vertex 0 0 0
+vertex 0 0 0.05
+vertex 0 0.05 0
+endloop
+endfacet
+facet normal 1 1 1
+outer loop
+vertex 0.05 0 0
+vertex 0 0.05 0
+vertex 0 0 0.05
+endloop
+endfacet
+endsolid t
+"""
+OBJECT = {"asset.json": b'{"file": "t.stl", "units": "m"}', "t.stl": TETRAHEDRON.encode()}
+
+
+@pytest.fixture
+def context() -> TaskContext:
+    return TaskContext(open_store("memory://"))
+
+
+def run(store: Store, context: TaskContext, files: dict[str, bytes], kind: AssetKind) -> dict[str, object]:
+    asset = publish_asset(store, kind, "upload", files)
+    message = IngestMessage(schema_=1, task_id="i", kind=kind, name="upload", digest=asset.digest)
+    ingest.run(message, context)
+    found: dict[str, object] = json.loads(store.get(names.asset_check(kind, asset.digest)))
+    return found
+
+
+def test_a_sound_object_is_taken_with_its_facts(context: TaskContext) -> None:
+    found = run(context.store, context, OBJECT, AssetKind.OBJECT)
+    assert found["verdict"] in ("accept", "repair"), found["message"]
+    assert found["facts"]
+
+
+def test_a_broken_object_is_refused_with_a_reason(context: TaskContext) -> None:
+    found = run(context.store, context, OBJECT | {"t.stl": b"not a mesh"}, AssetKind.OBJECT)
+    assert found["verdict"] == "refuse"
+    assert "t.stl" in str(found["message"])
+
+
+def test_a_check_that_wants_too_much_memory_is_a_refusal(context: TaskContext) -> None:
+    found = ingest.check_in_child(AssetKind.OBJECT, "big", OBJECT, context, memory_bytes=64 * 2**20)
+    assert found["verdict"] == "refuse"
+    assert "needs more than 0.0625 GiB of memory" in found["message"]
+
+
+def test_a_check_that_takes_too_long_is_ended(context: TaskContext) -> None:
+    start = time.monotonic()
+    found = ingest.check_in_child(AssetKind.OBJECT, "slow", OBJECT, context, wall_s=0.05)
+    assert found["verdict"] == "refuse"
+    assert "takes longer" in found["message"]
+    assert time.monotonic() - start < 5
+
+
+def test_the_child_knows_no_credentials(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    monkeypatch.setenv("GRASPD_REDIS_URL", "redis://:secret@host")
+    assert "secret" not in " ".join(ingest._environment().values())
+
+
+def test_a_cancelled_check_ends_its_child(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    pids: list[int] = []
+    popen = ingest.subprocess.Popen
+
+    def spy(*args: object, **kwargs: object) -> object:
+        child = popen(*args, **kwargs)  # type: ignore[call-overload]
+        pids.append(child.pid)
+        return child
+
+    monkeypatch.setattr(ingest.subprocess, "Popen", spy)
+    threading.Timer(0.2, context.stop, [StopReason.CANCELLED]).start()
+    with pytest.raises(TaskCancelled):
+        ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
+    assert not Path(f"/proc/{pids[0]}").exists()
