@@ -24,11 +24,6 @@ from service.errors import TaskError
 from service.index.views import GraspView
 from service.shards import Shard, read_shard
 from service.supervisor import Supervisor
-from worker import backend
-from worker.hands.load import load_hand
-from worker.objects.prepare import load_object
-from worker.rendering.pictures import grasp_pictures
-from worker.rendering.sheets import best, contact_sheet, figures, views_page
 
 app = typer.Typer()
 
@@ -144,6 +139,8 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     """The contact sheet of the best grasps, the views of the first batch, and an index.html that shows both."""
+    from worker.rendering.sheets import views_page
+
     pictures = []
     bases = [path for path in shards if path.name.startswith("base")]
     views = [path for path in shards if path.name.startswith("views")]
@@ -160,6 +157,13 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     """PNG of the best grasps of a shard, ranked by ε."""
+    # Warp takes seconds to import; a mistake in an option must not wait for it.
+    from worker import backend
+    from worker.hands.load import load_hand
+    from worker.objects.prepare import load_object
+    from worker.rendering.pictures import grasp_pictures
+    from worker.rendering.sheets import best, contact_sheet, figures
+
     backend.start()
     hand_files, object_files = (
         builtin_files(kind, name) for kind, name in ((AssetKind.HAND, job.hand), (AssetKind.OBJECT, job.object))

@@ -119,12 +119,15 @@ class Client:
     def download(self, shard: Shard, path: Path) -> Path:
         """Fetch a shard's file; the name appears once it is whole."""
         draft = path.with_name(f".{path.name}.part")
-        with _Translated(self.url), self._http.stream("GET", shard.file) as answer:
-            _raise_for(answer)
-            with draft.open("wb") as file:
-                for chunk in answer.iter_bytes():
-                    file.write(chunk)
-        draft.replace(path)
+        try:
+            with _Translated(self.url), self._http.stream("GET", shard.file) as answer:
+                _raise_for(answer)
+                with draft.open("wb") as file:
+                    for chunk in answer.iter_bytes():
+                        file.write(chunk)
+            draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
         return path
 
     def health(self) -> Health:
