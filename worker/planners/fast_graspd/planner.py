@@ -41,7 +41,7 @@ PART: Final = 4
 
 
 @dataclass
-class _Part:
+class Part:
     """Grasps `indices` of a batch, worked on by one thread."""
 
     indices: range
@@ -81,8 +81,20 @@ def plan(
 ) -> GraspSet:
     """See `worker.planners.Planner`."""
     began = time.perf_counter()
+    parts = optimise_batch(
+        hand, obj, count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads, device=device,
+        progress=progress, cancelled=cancelled,
+    )  # fmt: skip
+    return _grasps(hand, obj, parts, time.perf_counter() - began)
+
+
+def optimise_batch(
+    hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int, threads: int,
+    device: str, progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
+) -> list[Part]:  # fmt: skip
+    """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     pair = pair_of(hand, obj, fidelity, device)
-    parts = [_Part(indices) for indices in _cut(count, threads, device)]
+    parts = [Part(indices) for indices in _cut(count, threads, device)]
     iterations = fidelity.coarse_iterations + fidelity.fine_iterations
     steps = _Steps(count * (iterations + 1), progress, cancelled)
     if len(parts) == 1:
@@ -91,7 +103,7 @@ def plan(
         with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
             for future in [pool.submit(_work, pair, part, fidelity, seed, batch, steps) for part in parts]:
                 future.result()
-    return _grasps(hand, obj, parts, time.perf_counter() - began)
+    return parts
 
 
 def _cut(count: int, threads: int, device: str) -> list[range]:
@@ -103,7 +115,7 @@ def _cut(count: int, threads: int, device: str) -> list[range]:
     return [range(int(a), int(b)) for a, b in pairwise(bounds)]
 
 
-def _work(pair: Pair, part: _Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
+def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
     n = len(part.indices)
     hand, obj = pair.hand.model, pair.obj.model
     probe = pair.simulation(pair.coarse, n * len(RETREATS))
@@ -144,7 +156,7 @@ def _optimize(
     return simulation.state(n)
 
 
-def _grasps(hand: HandModel, obj: ObjectModel, parts: list[_Part], seconds: float) -> GraspSet:
+def _grasps(hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float) -> GraspSet:
     states = [part.state for part in parts if part.state is not None]
     pivot, rotation, q = (np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q"))
     root = pivot + obj.centre_of_mass - quat_rotate(rotation, hand.palm.centre)
