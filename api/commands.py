@@ -186,7 +186,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
                 asset = client.wait_checked(kind, asset.name)
         show_asset(asset.model_dump(mode="json"), json=json)
         if asset.verdict == "refuse":
-            raise InputError(f"{file} was refused: {asset.message}")
+            raise InputError(f"refused: {asset.message}")
 
     return group
 
@@ -317,16 +317,16 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
     console = Console(highlight=False)
     for name in ("name", "kind", "filename", "size_bytes", "digest", "created", "verdict", "message"):
         if asset.get(name) is not None:
-            console.print(f"{name:<11} {asset[name]}", markup=False)
+            console.print(f"{name:<18} {asset[name]}", markup=False, soft_wrap=True)
     for line in asset.get("repairs", []):
-        console.print(f"{'repair':<11} {line}", markup=False)
+        console.print(f"{'repair':<18} {line}", markup=False, soft_wrap=True)
     for name, value in asset.get("facts", {}).items():
-        console.print(f"{name:<11} {value}", markup=False)
+        console.print(f"{name:<18} {value}", markup=False, soft_wrap=True)
 
 
 def _print_job(job: JobDetail, url: str) -> None:
     console = Console(highlight=False)
-    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False)
+    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
     if job.reason:
         console.print(f"reason: {job.reason}", markup=False)
     table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
@@ -355,7 +355,7 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
     asset = client.upload(kind, path, name=name_of_upload(path.name))
     if not asset.builtin and (asset := client.wait_checked(kind, asset.name)).verdict == "refuse":
-        raise InputError(f"{value} was refused: {asset.message}")
+        raise InputError(f"refused: {asset.message}")
     return asset.name
 
 

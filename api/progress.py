@@ -63,16 +63,16 @@ def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
 
 
 def _status(stage: StageProgress, running: list[TaskView], paces: Paces) -> StageStatus:
-    rate = _rate(stage, running, paces)
-    left = max(0.0, stage.tasks - stage.done)
     state = stage_state(stage)
+    rate = None if state.is_final else _rate(stage, running, paces)
+    left = max(0.0, stage.tasks - stage.done)
     return StageStatus(
         **stage.model_dump(),
         state=state,
         progress=min(1.0, stage.done / stage.tasks) if stage.tasks else 0.0,
         message=next((task.message for task in running if task.message), ""),
         rate_per_s=rate,
-        eta_s=left / rate if rate and not state.is_final else None,
+        eta_s=left / rate if rate else None,
     )
 
 

@@ -10,8 +10,11 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from service.domain import State
+from service.errors import IndexUnavailable, QueueUnavailable
+from service.index.index import Index
 from service.parts import Parts
 from service.planning import plan
+from service.queue.memory import MemoryQueue
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 
 FORM = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "standard", "seed": "0", "friction": "1.0"}
@@ -153,3 +156,41 @@ def test_no_page_asks_for_anything_from_elsewhere_or_inline(http: TestClient, pa
 @pytest.mark.parametrize("path", ["/static/style.css", "/static/live.js", "/static/mark.svg"])
 def test_what_the_pages_need_is_served(http: TestClient, path: str) -> None:
     assert http.get(path).status_code == 200
+
+
+def test_pages_are_read_on_while_redis_is_away(http: TestClient, parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = add_job(parts)
+    finish_all(parts, record)
+
+    def away(*_: object) -> float:
+        raise QueueUnavailable("Redis does not answer at unix:///redis.sock")
+
+    for method in ("ping", "depths"):
+        monkeypatch.setattr(MemoryQueue, method, away)
+    page = http.get("/")
+    assert page.status_code == 200
+    assert "Redis does not answer at unix:///redis.sock" in page.text
+    assert http.get(f"/jobs/{record.id}").status_code == 200
+    health = http.get("/readyz")
+    assert (health.status_code, health.json()["parts"]["redis"]["ok"]) == (503, False)
+    assert 'graspd_part_up{part="redis"} 0.0' in http.get("/metrics").text
+
+
+def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise IndexUnavailable("the index does not answer")
+
+    for method in ("ping", "stats", "jobs"):
+        monkeypatch.setattr(Index, method, away)
+    answer = http.get("/", headers={"Accept": "text/html"})
+    assert (answer.status_code, answer.headers["content-type"]) == (503, "text/html; charset=utf-8")
+    assert "the index does not answer" in answer.text
+
+
+def test_metrics_count_requests_jobs_and_grasps(http: TestClient, parts: Parts) -> None:
+    finish_all(parts, add_job(parts))
+    http.get("/v1/jobs")
+    text = http.get("/metrics").text
+    assert 'graspd_jobs{state="succeeded"} 1.0' in text
+    assert 'graspd_grasps{verdict="all"} 32.0' in text
+    assert 'graspd_http_requests_total{method="GET",route="/v1/jobs",status="200"} 1.0' in text
