@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: help install demo test test-slow check format browser extras clean
+.PHONY: help install demo test test-slow check format browser extras docs clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
@@ -35,6 +35,9 @@ check: $(STAMP) ## format, lint, types, import contract
 format: $(STAMP) ## rewrite the sources in the house style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
+	$(BIN)/python -m service.docs
 
 clean: ## what the verbs above made
 	rm -rf $(VENV) build dist demo-out *.egg-info
