@@ -60,7 +60,7 @@ def shard_id(
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
     elif stage is Stage.RENDER:
-        inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height")}
+        inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
     return digest_json(inputs_of)
 
 

@@ -11,6 +11,8 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 BATCH_SIZE: Final = 32
+#: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
+EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 
 #: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
@@ -115,6 +117,9 @@ class JobRequest(Model):
     stereo: bool = Field(False, description="a left and a right picture per placement instead of one")
     width: int = Field(320, ge=16, le=4096, description="picture width [px]")
     height: int = Field(240, ge=16, le=4096, description="picture height [px]")
+    channels: tuple[Literal["distance", "normals", "occlusion"], ...] = Field(
+        (), description="what pictures show besides colour, depth and segmentation"
+    )
     friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
 
     @field_validator("fidelity")
@@ -122,6 +127,12 @@ class JobRequest(Model):
     def _known(cls, value: str | Fidelity) -> str | Fidelity:
         resolve_fidelity(value)
         return value
+
+    @field_validator("channels")
+    @classmethod
+    def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        # The same wish in another order is the same job.
+        return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="after")
     def _views_need_scenes(self) -> Self:

@@ -15,7 +15,7 @@ from service import names
 from service.clock import timestamp
 from service.domain import Digest, JobRequest, Stage, TaskMessage
 from service.records import put_record, read_record
-from service.shards import read_shard
+from service.shards import SCHEMAS, read_shard
 from service.store import Store
 from service.version import PACKAGE_VERSION, STAGE_REVISIONS
 
@@ -177,7 +177,8 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def _describing(manifest: ShardManifest, data: bytes) -> ShardManifest:
-    arrays = read_shard(data, without=("image/rgb", "image/depth", "image/segmentation")).arrays
+    pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
+    arrays = read_shard(data, without=pictures).arrays
     valid = arrays.get("quality/valid", arrays.get("grasp/valid"))
     update: dict[str, Any] = {
         "sha256": hashlib.sha256(data).hexdigest(),

@@ -93,7 +93,35 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "grasp/table_clearance_m": Column(
             "K", "f8", "m", "table", "lowest point of the hand above the table at contact and on the way in"
         ),
-        "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear of the table at contact and on approach"),
+        "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear of what is around, at contact and before"),
+        "grasp/rejection": Column(
+            "K",
+            "u1",
+            "enum",
+            "none",
+            "0 kept; too near to: 1 the table at contact, 2 the table on approach, 3 a neighbour at contact, "
+            "4 a neighbour on approach",
+            optional=True,
+        ),
+        "grasp/contact_table_clearance_m": Column(
+            "K", "f8", "m", "table", "lowest point of the hand above the table at contact", optional=True
+        ),
+        "grasp/neighbour_clearance_m": Column(
+            "K",
+            "f8",
+            "m",
+            "table",
+            "signed distance of the hand from the neighbours' convex hulls at contact and on the way in, at most 0.1",
+            optional=True,
+        ),
+        "scene/neighbour_pose": Column(
+            "S M 7",
+            "f8",
+            "m, 1",
+            "table",
+            "frames of the other objects at rest; names in attribute neighbours",
+            optional=True,
+        ),
     },
     "views": {
         "camera/intrinsics": Column("V 3 3", "f8", "px", "image", "pinhole K; pixel centres at +0.5"),
@@ -111,7 +139,9 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         ),
         "image/rgb": Column("V H W 3", "u1", "sRGB", "image", "colour"),
         "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: nothing there"),
-        "image/segmentation": Column("V H W", "u1", "enum", "image", "0 background, 1 table, 2 object"),
+        "image/segmentation": Column(
+            "V H W", "u1", "enum", "image", "0 background, 1 table, 2 object, 3 + m: neighbour m"
+        ),
         "box/bounding_box_2d_tight": Column(
             "V 4",
             "f4",
@@ -123,6 +153,21 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
         ),
         "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
+        "box/occlusion_ratio": Column(
+            "V", "f4", "1", "image", "share of the object's pixels that is hidden; nan: not in view", optional=True
+        ),
+        "image/distance": Column(
+            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: nothing there", optional=True
+        ),
+        "image/normals": Column(
+            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: nothing there", optional=True
+        ),
+        "image/rgb_hand": Column(
+            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for people", optional=True
+        ),
+        "camera/hand_grasp": Column(
+            "V", "i4", "1", "none", "row of the grasp that rgb_hand shows in the scene shard; -1: none", optional=True
+        ),
     },
 }
 

@@ -12,6 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import InputError
+
 Floats = NDArray[np.float64]
 
 FIELD_OF_VIEW: Final = np.radians(40.0)
@@ -66,6 +68,21 @@ def intrinsics(width: int, height: int, field_of_view: float = FIELD_OF_VIEW) ->
     return np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
 
 
+def narrow_field(k: Floats, width: int, height: int) -> float:
+    """Opening angle of the widest cone around the optical axis that lies within the picture [rad].
+
+    Raises:
+        InputError: the principal point lies outside the picture.
+    """
+    slopes = [k[0, 2] / k[0, 0], (width - k[0, 2]) / k[0, 0], k[1, 2] / k[1, 1], (height - k[1, 2]) / k[1, 1]]
+    if min(slopes) <= 0:
+        raise InputError(
+            f"the principal point ({k[0, 2]:g}, {k[1, 2]:g}) lies outside the picture of {width} x {height} px, so no "
+            f"camera can be aimed; give the cameras' places too"
+        )
+    return float(2 * np.arctan(min(slopes)))
+
+
 def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """Directions (H, W, 3) with z = 1 in the camera frame through points `shift` [px] off the pixel centres."""
     columns = (np.arange(width) + 0.5 + shift[0] - k[0, 2]) / k[0, 0]
@@ -94,19 +111,18 @@ def distance_to_fill(radius: float, field_of_view: float, fill: float) -> float:
 
 
 def sample_hemisphere(
-    centre: Floats, radius: float, *, views: int, aspect: float, rng: np.random.Generator
+    centre: Floats, radius: float, *, views: int, field_of_view: float, rng: np.random.Generator
 ) -> list[Floats]:
-    """Extrinsics of cameras on a hemisphere around a ball (centre [m], radius [m]).
+    """Extrinsics of cameras on a hemisphere around a ball (centre [m], radius [m]) that fills the field of view [rad].
 
     Azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in area within `ELEVATION`.
     """
-    narrow = 2 * np.arctan(np.tan(0.5 * FIELD_OF_VIEW) * min(1.0, aspect))
     turn = rng.uniform(0, 2 * np.pi)
     extrinsics = []
     for view in range(views):
         azimuth = turn + 2 * np.pi * (view + rng.uniform(0.1, 0.9)) / views
         elevation = np.arcsin(rng.uniform(np.sin(ELEVATION[0]), np.sin(ELEVATION[1])))
-        distance = max(NEAREST_M + radius, distance_to_fill(radius, narrow, rng.uniform(*FILL)))
+        distance = max(NEAREST_M + radius, distance_to_fill(radius, field_of_view, rng.uniform(*FILL)))
         direction = np.array(
             [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
         )

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
-from worker.objects.normals import corner_normals
 from worker.rendering.cameras import Cameras, intrinsics, look_at
+from worker.rendering.hands import drawn_bodies, hand_solids, look_of
 from worker.rendering.kernels import CATCHER
 from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
@@ -35,9 +35,6 @@ _FILL: Final = 0.86
 _TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
 _FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
 _FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
-_HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
-_PALM: Final = Look(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
-_TIP: Final = Look(hexadecimal("#2fa7a0"), roughness=0.38)
 _OBJECT: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
 _STUDIO: Final = Lamp(
     key=(1.85, 1.8, 1.7), sky=(0.76, 0.79, 0.84), ground=(0.3, 0.29, 0.28),
@@ -82,7 +79,7 @@ def grasp_pictures(
     solids: list[Solid | Box] = [
         Box(_FLOOR_SIZE),
         Solid(obj.vertices, obj.faces, obj.corner_normals),
-        *_hand_solids(hand),
+        *hand_solids(hand),
     ]
     shots = []
     for start in range(0, len(hand_pose), _TOGETHER):
@@ -119,9 +116,9 @@ def _shoot(
     )
     floor = np.tile(IDENTITY_POSE, (worlds, 1))
     floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * _FLOOR_SIZE[2]
-    shown = _drawn_bodies(hand)
+    shown = drawn_bodies(hand)
     poses = np.concatenate([floor[:, None], np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, shown]], axis=1)
-    stage.place(poses, [[_FLOOR, _OBJECT, *(_look_of(hand, body) for body in shown)]] * worlds)
+    stage.place(poses, [[_FLOOR, _OBJECT, *(look_of(hand, body) for body in shown)]] * worlds)
     k = intrinsics(width, height, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
@@ -162,32 +159,6 @@ def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tup
         centre = centre + camera.extrinsics[0, :3, :3].T @ (depth_ray * [1, 1, 0])
         distance *= float(np.max((high - low) / np.asarray(size))) / _FILL
     return look_at(centre + distance * direction, centre)
-
-
-def _drawn_bodies(hand: HandModel) -> list[int]:
-    return sorted({piece.body for piece in hand.pieces})
-
-
-def _hand_solids(hand: HandModel) -> list[Solid]:
-    """One mesh per body that has pieces, in the body frame."""
-    return [_merge(hand, body) for body in _drawn_bodies(hand)]
-
-
-def _merge(hand: HandModel, body: int) -> Solid:
-    vertices, faces, normals, count = [], [], [], 0
-    for piece in hand.pieces:
-        if piece.body == body:
-            vertices.append(piece.vertices)
-            faces.append(piece.faces + count)
-            normals.append(corner_normals(piece.vertices, piece.faces))
-            count += len(piece.vertices)
-    return Solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
-
-
-def _look_of(hand: HandModel, body: int) -> Look:
-    if body in hand.fingertips:
-        return _TIP
-    return _PALM if body == 0 else _HAND
 
 
 def _hand_points(hand: HandModel, bodies: Floats) -> Floats:

@@ -61,6 +61,8 @@ class Pictures:
     """(V, H, W) along the optical axis [m]; inf: nothing."""
     shape: NDArray[np.int64]
     """(V, H, W) index of the solid seen through the pixel's centre; -1: nothing."""
+    normal: NDArray[np.float32] | None = None
+    """(V, H, W, 3) unit shading normal in the world's frame, zero where nothing is; only if the shot asks for it."""
 
 
 @dataclass(frozen=True)
@@ -81,3 +83,7 @@ class Shot:
     """(worlds,) angle about z by which each world is turned under the lamp [rad]."""
     lamps: Sequence[Lamp]
     """One per world."""
+    normals: bool = False
+    """Whether the pictures come with normals."""
+    shaded: bool = True
+    """False: rays are traced but no colour is made of them. What that costs is the price of the bare ray tracer."""

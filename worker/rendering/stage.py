@@ -26,7 +26,7 @@ from worker.rendering import kernels
 from worker.rendering.cameras import Floats, pixel_rays
 from worker.rendering.passes import LightPass, light_passes
 from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
-from worker.transforms import compose, pose_from_matrix, quat_from_axis_angle
+from worker.transforms import compose, pose_from_matrix, quat_from_axis_angle, quat_rotate
 
 #: The camera frame of the tracer (x right, y up, looks down -z) in the camera frame used here.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -116,7 +116,8 @@ class Stage:
             exposures = [_Exposure(self, shot, views) for views in group]
             self._expose(exposures, shot, len(done) / sum(map(len, parts)), 1 / len(parts), tick, cancelled)
             done += [exposure.pictures(shot.samples) for exposure in exposures]
-        return Pictures(*(np.concatenate([getattr(p, name) for p in done]) for name in ("rgb", "depth", "shape")))
+        names = ("rgb", "depth", "shape", "normal") if shot.normals else ("rgb", "depth", "shape")
+        return Pictures(*(np.concatenate([getattr(p, name) for p in done]) for name in names))
 
     def _parts(self, shot: Shot, threads: int) -> list[list[NDArray[np.intp]]]:
         """Views of each launch, grouped into those that run at the same time."""
@@ -167,7 +168,8 @@ class _Exposure:
     """Image buffers of some views, and the passes summed in them so far."""
 
     def __init__(self, stage: Stage, shot: Shot, views: NDArray[np.intp]) -> None:
-        self._stage = stage
+        self._stage, self._shot = stage, shot
+        self._unturn = _turns(-shot.turn)[shot.world[views], 3:]
         sensor, device, world = stage._sensor, stage.device, shot.world[views]
         shape = (len(views), shot.height, shot.width)
         self._cameras = stage._cameras(shot, views)
@@ -180,31 +182,38 @@ class _Exposure:
         self._total = wp.zeros(shape, dtype=wp.vec3f, device=device)
         self._albedo = wp.zeros_like(self._total)
         self._seen = wp.full(shape, NO_SHAPE, dtype=wp.uint32, device=device)
-        self._labels: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None
+        self._labels: tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None] | None = None
 
     def trace(self, rays: Any, one: LightPass, first: bool) -> None:
         """Adds one pass; the first one leaves the labels."""
-        stage = self._stage
+        stage, normal = self._stage, self._normal if self._shot.shaded else None
         stage._sensor.update(
             stage._state, self._cameras, rays, hdr_color_image=self._irradiance, forward_depth_image=self._depth,
-            shape_index_image=self._shape, normal_image=self._normal, world_indices=self._worlds,
+            shape_index_image=self._shape, normal_image=normal, world_indices=self._worlds,
             clear_data=stage._clear, render_config=stage._config,
         )  # fmt: skip
-        wp.launch(
-            kernels.accumulate,
-            dim=self._total.shape,
-            inputs=[
-                rays, self._cameras, self._irradiance, self._depth, self._normal, self._shape,
-                stage._model.shape_transform, stage._materials, self._lights, wp.vec3f(*one.toward),
-                one.lamp_weight, one.sky_weight, first,
-            ],
-            outputs=[self._seen, self._albedo, self._total],
-            device=stage.device,
-        )  # fmt: skip
+        if self._shot.shaded:
+            wp.launch(
+                kernels.accumulate,
+                dim=self._total.shape,
+                inputs=[
+                    rays, self._cameras, self._irradiance, self._depth, self._normal, self._shape,
+                    stage._model.shape_transform, stage._materials, self._lights, wp.vec3f(*one.toward),
+                    one.lamp_weight, one.sky_weight, first,
+                ],
+                outputs=[self._seen, self._albedo, self._total],
+                device=stage.device,
+            )  # fmt: skip
         if first:
             shape = self._shape.numpy()
             index = np.where(shape == NO_SHAPE, -1, shape.astype(np.int64) % len(stage.solids))
-            self._labels = np.array(self._depth.numpy()), index
+            self._labels = np.array(self._depth.numpy()), index, self._normals(index) if self._shot.normals else None
+
+    def _normals(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Normals in the frame of the worlds as they were before they were turned under the lamp."""
+        normals = np.where(index[..., None] >= 0, self._normal.numpy(), 0.0)
+        back = quat_rotate(self._unturn[:, None, None], normals)
+        return np.asarray(back / np.maximum(np.linalg.norm(back, axis=-1, keepdims=True), 1e-12), np.float32)
 
     def pictures(self, samples: int) -> Pictures:
         """The mean over the passes, developed."""

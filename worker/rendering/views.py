@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -11,21 +11,47 @@ from numpy.typing import NDArray
 
 from service.errors import InputError
 from worker.objects.model import Floats, ObjectModel
-from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE, box_corners, in_camera, loose_boxes, tight_boxes
-from worker.rendering.cameras import BASELINE_M, Cameras, intrinsics, sample_hemisphere, stereo_pair
-from worker.rendering.palette import lamp, object_look, table_look
-from worker.rendering.scenery import Box, Shot, Solid
-from worker.rendering.stage import Stage
+from worker.rendering.annotate import box_corners, in_camera, loose_boxes, tight_boxes
+from worker.rendering.cameras import BASELINE_M, Cameras
+from worker.rendering.channels import occlusion_ratio, ray_distance
+from worker.rendering.given import SAMPLED, GivenCameras
+from worker.rendering.hands import DrawnHand
+from worker.rendering.scenery import Pictures
+from worker.rendering.setting import TABLE_SIZE, CameraPlan, Setting
 from worker.transforms import apply
 
-#: The table: a slab whose top is z = 0 [m].
-TABLE_SIZE: Final = (1.2, 0.9, 0.04)
+__all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "Neighbours", "render"]
+
 #: Passes per picture; half of them light the scene with the lamp, half with the sky.
 SAMPLES: Final = 12
-_KEPT_STAGES: Final = 4
-_stages: OrderedDict[tuple[str, int, int, int, str], Stage] = OrderedDict()
 
 Progress = Callable[[float, float, str], None]
+Arrays = dict[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The M other objects on the table."""
+
+    objects: Sequence[ObjectModel]
+    poses: Floats
+    """(S, M, 7) in the table frame."""
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What a render shows beyond an object alone from sampled cameras, in colour, depth and segmentation."""
+
+    channels: Sequence[str] = ()
+    """Of `service.domain.EXTRA_CHANNELS`."""
+    cameras: GivenCameras = SAMPLED
+    """Intrinsics and places that are given instead of sampled."""
+    neighbours: Neighbours | None = None
+    drawn: DrawnHand | None = None
+    """The hand of `image/rgb_hand`; it is in no other picture."""
+
+
+NO_EXTRAS: Final = Extras()
 
 
 def render(
@@ -42,13 +68,15 @@ def render(
     cancelled: Callable[[], bool] = lambda: False,
     baseline_m: float = BASELINE_M,
     samples: int = SAMPLES,
-) -> dict[str, NDArray[np.generic]]:
-    """Pictures of every scene from sampled cameras, all in one launch per pass.
+    threads: int = 0,
+    extras: Extras = NO_EXTRAS,
+) -> Arrays:
+    """Pictures of every scene from sampled or given cameras, all in one launch per pass.
 
     Args:
         obj: the object.
         object_pose: (S, 7) rest poses in the table frame.
-        views: camera placements per scene.
+        views: camera placements per scene; given places stand instead.
         stereo: a rectified left and right picture per placement.
         width, height: picture size [px].
         seed: of cameras, materials and lights; same seed, same pixels. Scene s depends on (seed, s) alone.
@@ -57,6 +85,8 @@ def render(
         cancelled: asked before each pass.
         baseline_m: distance of the eyes.
         samples: rays per pixel.
+        threads: CPU threads; 0: one per core this process may use. Pixels do not depend on it.
+        extras: further channels, given cameras, other objects, a hand.
 
     Returns:
         The datasets of a views shard, V = S * views * (2 if stereo else 1) pictures: scene by scene, placement by
@@ -68,86 +98,57 @@ def render(
         TaskCancelled: `cancelled()` answered True.
     """
     poses = np.asarray(object_pose, float).reshape(-1, 7)
-    if views < 1 or width < 1 or height < 1 or samples < 2 or len(poses) == 0:
+    plan = CameraPlan(views, width, height, baseline_m if stereo else None, extras.cameras)
+    if plan.placements < 1 or width < 1 or height < 1 or samples < 2 or len(poses) == 0:
         raise InputError(
             f"rendering needs at least one scene, view and pixel and two samples; "
             f"got {len(poses)} scenes, {views} views, {width} x {height} px, {samples} samples"
         )
-    scenes = [
-        _Scene(obj, pose, views, width / height, np.random.default_rng([seed, s])) for s, pose in enumerate(poses)
-    ]
-    eyes = 2 if stereo else 1
-    extrinsics = np.concatenate([_eyes(scene.extrinsics, baseline_m if stereo else None) for scene in scenes])
-    cameras = Cameras(width, height, intrinsics(width, height), extrinsics)
-    world = np.repeat(np.arange(len(poses), dtype=np.int32), views * eyes)
-    stage = _stage(obj, len(poses), device)
-    stage.place(np.stack([scene.poses for scene in scenes]), [scene.looks for scene in scenes])
-    shot = Shot(
-        world=world, extrinsics=extrinsics, intrinsics=cameras.intrinsics, width=width, height=height,
-        samples=samples, toward_lamp=_toward_lamp(np.random.default_rng([seed, 2**31])),
-        turn=np.array([scene.turn for scene in scenes]), lamps=[scene.lamp for scene in scenes],
+    beside = extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))
+    placed = np.concatenate([poses[:, None], beside.poses], axis=1)
+    setting = Setting([obj, *beside.objects], placed, plan, seed=seed, samples=samples)
+    pictures = setting.shoot(
+        device, threads=threads, normals="normals" in extras.channels,
+        tick=_ticker(progress, len(setting.shot.world)), cancelled=cancelled,
     )  # fmt: skip
-    pictures = stage.shoot(shot, tick=_ticker(progress, len(world)), cancelled=cancelled)
-    eye = np.tile(np.array([1, 2] if stereo else [0], np.uint8), len(poses) * views)
-    segmentation = np.array([BACKGROUND, TABLE, OBJECT], np.uint8)[pictures.shape + 1]
-    return {
-        "camera/intrinsics": np.repeat(cameras.intrinsics[None], len(world), axis=0),
-        "camera/extrinsics": extrinsics,
-        "camera/scene_index": world,
-        "camera/eye": eye,
-        "camera/stereo_baseline_m": np.full(len(world), baseline_m if stereo else 0.0),
+    result = annotate(setting, pictures, obj, extras.channels)
+    if "occlusion" in extras.channels:
+        alone = setting.shoot_alone(device, threads=threads, cancelled=cancelled).shape == 1
+        result["box/occlusion_ratio"] = occlusion_ratio(np.asarray(result["image/segmentation"], np.uint8), alone)
+    if extras.drawn is not None:
+        seen = setting.shoot_with(extras.drawn, device, threads=threads, cancelled=cancelled)
+        result["image/rgb_hand"] = seen.rgb
+        result["camera/hand_grasp"] = extras.drawn.grasp[setting.shot.world].astype(np.int32)
+    return result
+
+
+def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: Sequence[str] = ()) -> Arrays:
+    """The datasets of a views shard that follow from the cameras and what they saw."""
+    shot, plan = setting.shot, setting.plan
+    cameras = Cameras(plan.width, plan.height, shot.intrinsics, shot.extrinsics)
+    count, poses = len(shot.world), setting.poses[shot.world, 1][:, None]
+    segmentation = (pictures.shape + 1).astype(np.uint8)
+    result: Arrays = {
+        "camera/intrinsics": np.repeat(shot.intrinsics[None], count, axis=0),
+        "camera/extrinsics": shot.extrinsics,
+        "camera/scene_index": shot.world,
+        "camera/eye": np.tile(np.array([0] if plan.eyes == 1 else [1, 2], np.uint8), count // plan.eyes),
+        "camera/stereo_baseline_m": np.full(count, plan.baseline_m or 0.0),
         "image/rgb": pictures.rgb,
         "image/depth": pictures.depth,
         "image/segmentation": segmentation,
         "box/bounding_box_2d_tight": tight_boxes(segmentation),
-        "box/bounding_box_2d_loose": loose_boxes(cameras, apply(poses[world][:, None], obj.vertices)),
-        "box/bounding_box_3d": in_camera(cameras, apply(poses[world][:, None], box_corners(obj.vertices))).astype(
-            np.float32
-        ),
+        "box/bounding_box_2d_loose": loose_boxes(cameras, apply(poses, obj.vertices)),
+        "box/bounding_box_3d": in_camera(cameras, apply(poses, box_corners(obj.vertices))).astype(np.float32),
     }
-
-
-class _Scene:
-    """What the seed decides about one scene."""
-
-    def __init__(self, obj: ObjectModel, pose: Floats, views: int, aspect: float, rng: np.random.Generator) -> None:
-        points = apply(pose, obj.hull_vertices)
-        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        radius = float(np.linalg.norm(points - centre, axis=1).max())
-        self.extrinsics = sample_hemisphere(centre, radius, views=views, aspect=aspect, rng=rng)
-        self.looks = [table_look(rng), object_look(rng)]
-        self.lamp = lamp(rng)
-        self.turn = float(rng.uniform(0, 2 * np.pi))
-        yaw = rng.uniform(0, 2 * np.pi)
-        table = np.array([0, 0, -0.5 * TABLE_SIZE[2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-        self.poses = np.stack([table, pose])
-
-
-def _eyes(extrinsics: list[Floats], baseline: float | None) -> Floats:
-    if baseline is None:
-        return np.stack(extrinsics)
-    return np.stack([eye for middle in extrinsics for eye in stereo_pair(middle, baseline)])
-
-
-def _toward_lamp(rng: np.random.Generator) -> Floats:
-    # One height for all scenes of a call; each scene turns under the lamp, so azimuths differ.
-    elevation = np.radians(rng.uniform(40.0, 65.0))
-    return np.array([np.cos(elevation), 0.0, np.sin(elevation)])
+    if "distance" in channels:
+        result["image/distance"] = ray_distance(pictures.depth, shot.intrinsics)
+    if pictures.normal is not None:
+        result["image/normals"] = pictures.normal.astype(np.float16)
+    return result
 
 
 def _ticker(progress: Progress | None, pictures: int) -> Callable[[float], None] | None:
     if progress is None:
         return None
     return lambda share: progress(share * pictures, pictures, f"rendering {pictures} pictures")
-
-
-def _stage(obj: ObjectModel, worlds: int, device: str) -> Stage:
-    """Stage of the object on a table, kept for the next call with the same object."""
-    key = (obj.digest, len(obj.faces), len(obj.vertices), worlds, device)
-    if key in _stages:
-        _stages.move_to_end(key)
-        return _stages[key]
-    _stages[key] = Stage([Box(TABLE_SIZE), Solid(obj.vertices, obj.faces, obj.corner_normals)], worlds, device)
-    while len(_stages) > _KEPT_STAGES:
-        _stages.popitem(last=False)
-    return _stages[key]

@@ -8,7 +8,7 @@ from service.domain import Stage, TaskMessage
 from service.names import shard_file
 from service.shards import read_shard
 from worker.context import TaskContext
-from worker.rendering import render
+from worker.rendering import Extras, render
 from worker.stages.assets import object_of
 from worker.stages.output import Output, batch_seed
 
@@ -30,5 +30,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         device=context.device,
         progress=context.part(0.0, 1.0),
         cancelled=context.cancelled,
+        threads=context.threads,
+        extras=Extras(channels=request.channels),
     )
     return Output(pictures, {"scene_shard": message.inputs[0]})

@@ -21,7 +21,8 @@ CENTRE, RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
 
 
 def sampled(seed: int, views: int = 12) -> Cameras:
-    extrinsics = sample_hemisphere(CENTRE, RADIUS, views=views, aspect=4 / 3, rng=np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    extrinsics = sample_hemisphere(CENTRE, RADIUS, views=views, field_of_view=FIELD_OF_VIEW, rng=rng)
     return Cameras(320, 240, intrinsics(320, 240), np.stack(extrinsics))
 
 
