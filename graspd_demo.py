@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from api.client import Client
-from api.commands import job_request, job_summary
 from api.dashboard.filters import count, duration, metric
 from api.models import GraspQuery, JobDetail
+from api.reports import job_request, job_summary
 from api.watching import JobDisplay
 from service.assets import builtin_files
 from service.cli import JsonFlag, emit, load_settings, reporting_errors

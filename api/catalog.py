@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
@@ -254,17 +254,6 @@ def grasp_filter(query: GraspQuery) -> GraspFilter:
         at_least=bounds["min"],
         at_most=bounds["max"],
     )
-
-
-def all_pages(fetch: Callable[[str | None], Page[AssetView]]) -> Iterator[AssetView]:
-    """Items of every page of a list of assets."""
-    cursor: str | None = None
-    while True:
-        page = fetch(cursor)
-        yield from page.items
-        cursor = page.next
-        if cursor is None:
-            return
 
 
 def _shard(shard: ShardView) -> Shard:

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 from rich.console import Console
 from rich.table import Table
 
-from api.auth import KeyFile, Scope
+from api import key_commands
 from api.client import Client
-from api.dashboard.filters import count, duration, metric, percent, size
-from api.models import Job, JobDetail
+from api.dashboard.filters import count, percent, size
+from api.models import Job
+from api.reports import UrlOption, job_request, open_client, show_asset, show_job, watch
 from api.uploads import MAIN_SUFFIXES, name_of_upload
-from api.watching import JobDisplay
 from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
-from service.domain import AssetKind, JobRequest, State
-from service.errors import InputError, TaskError
+from service.domain import AssetKind, State
+from service.errors import InputError
 
 app = typer.Typer(no_args_is_help=True)
 
-UrlOption = Annotated[str | None, typer.Option("--url", help="Where the API answers; default GRASPD_API_URL.")]
 JobArgument = Annotated[str, typer.Argument(help="Job id, or the beginning of one.")]
 
 
@@ -193,6 +191,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
 
 app.add_typer(asset_commands(AssetKind.HAND), name="hands")
 app.add_typer(asset_commands(AssetKind.OBJECT), name="objects")
+app.add_typer(key_commands.app, name="keys")
 
 
 @app.command(epilog="graspd api --port 8000")
@@ -207,142 +206,6 @@ def api(
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings)
     serve(settings)
-
-
-keys = typer.Typer(no_args_is_help=True, help="Make, list and revoke API keys.")
-app.add_typer(keys, name="keys")
-
-
-@keys.command("add")
-@reporting_errors
-def add_key(
-    name: Annotated[str, typer.Argument(help="Whose key it is.")],
-    scope: Annotated[Scope, typer.Option(help="What it may do.")] = Scope.SUBMIT,
-    json: JsonFlag = False,
-) -> None:
-    """Make a key and show it, this once."""
-    token = _key_file().add(name, scope)
-    if json:
-        emit({"name": name, "scope": scope, "key": token})
-        return
-    typer.echo(token)
-    typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
-
-
-@keys.command("list")
-@reporting_errors
-def list_keys(json: JsonFlag = False) -> None:
-    """All keys, without their secrets."""
-    found = _key_file().list()
-    if json:
-        emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
-        return
-    table = Table("name", "scope", "created", "revoked", box=None, header_style="bold")
-    for key in found:
-        table.add_row(key.name, key.scope, key.created, key.revoked or "")
-    Console().print(table if found else "no key; the service is open and answers on this machine only")
-
-
-@keys.command("revoke")
-@reporting_errors
-def revoke_key(name: Annotated[str, typer.Argument(help="Whose key it is.")], json: JsonFlag = False) -> None:
-    """End a key's life; it is refused from the next request on."""
-    _key_file().revoke(name)
-    if json:
-        emit({"name": name, "revoked": True})
-        return
-    typer.echo(f"the key {name} is revoked")
-
-
-def open_client(url: str | None) -> Client:
-    """A client of the API that the settings or the option name."""
-    settings = load_settings()
-    key = settings.api_key.get_secret_value() if settings.api_key else None
-    return Client(url or settings.api_url, key=key)
-
-
-def job_request(values: dict[str, Any]) -> JobRequest:
-    """A job request; InputError names the first option that cannot be used."""
-    try:
-        return JobRequest.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        option = f"--{first['loc'][0]}: " if first["loc"] else ""
-        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
-
-
-def watch(client: Client, job_id: str) -> JobDetail:
-    """The job in its final state, with progress on standard error meanwhile."""
-    with JobDisplay(Console(stderr=True)) as display:
-        return client.wait(job_id, display.update)
-
-
-def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
-    """Say what became of a job; TaskError if it failed or was cancelled and should not have been."""
-    if json:
-        emit(job_summary(job))
-    else:
-        _print_job(job, url)
-    if must_succeed and job.state in (State.FAILED, State.CANCELLED):
-        why = f": {job.reason}" if job.reason else ""
-        raise TaskError(f"job {job.id[:12]} is {job.state}{why}; `graspd retry {job.id[:12]}` runs it again")
-
-
-def job_summary(job: JobDetail) -> dict[str, Any]:
-    """The keys that scripts rely on (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
-    return {
-        "job": job.id,
-        "state": job.state.value,
-        "hand": job.hand,
-        "object": job.object,
-        "grasps": job.grasps,
-        "valid": job.valid,
-        "progress": job.progress,
-        "reason": job.reason,
-        "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
-        "mean": {
-            name: value
-            for name, value in job.mean.model_dump().items()
-            if name in ("epsilon", "contact_area_cm2", "intersection_volume_cm3")
-        },
-        "shards": [shard.id for shard in job.shards],
-    }
-
-
-def show_asset(asset: dict[str, Any], *, json: bool) -> None:
-    """Say what is known of a hand or object."""
-    if json:
-        emit(asset)
-        return
-    console = Console(highlight=False)
-    for name in ("name", "kind", "filename", "size_bytes", "digest", "created", "verdict", "message"):
-        if asset.get(name) is not None:
-            console.print(f"{name:<18} {asset[name]}", markup=False, soft_wrap=True)
-    for line in asset.get("repairs", []):
-        console.print(f"{'repair':<18} {line}", markup=False, soft_wrap=True)
-    for name, value in asset.get("facts", {}).items():
-        console.print(f"{name:<18} {value}", markup=False, soft_wrap=True)
-
-
-def _print_job(job: JobDetail, url: str) -> None:
-    console = Console(highlight=False)
-    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
-    if job.reason:
-        console.print(f"reason: {job.reason}", markup=False)
-    table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
-    for stage in job.stages:
-        done = f"{stage.succeeded} of {stage.tasks}"
-        table.add_row(
-            stage.stage, stage.state, done, percent(stage.progress), duration(stage.seconds), duration(stage.eta_s)
-        )
-    console.print(table)
-    if job.grasps:
-        mean = job.mean
-        console.print(
-            f"{count(job.valid)} of {count(job.grasps)} grasps valid; mean ε {metric(mean.epsilon)}, "
-            f"contact {metric(mean.contact_area_cm2)} cm², intersection {metric(mean.intersection_volume_cm3)} cm³",
-            markup=False,
-        )
 
 
 def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
@@ -367,7 +230,3 @@ def _full_id(client: Client, prefix: str) -> str:
     if len(found) > 1:
         raise InputError(f"{len(found)} jobs begin with {prefix!r}; give more letters")
     return found[0].id if found else prefix
-
-
-def _key_file() -> KeyFile:
-    return KeyFile(load_settings().data_dir / "keys.json")

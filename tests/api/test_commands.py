@@ -15,8 +15,8 @@ from typing import Any
 import httpx
 import pytest
 
-from api.commands import job_summary
 from api.models import JobDetail, MeanMetrics
+from api.reports import job_summary
 from service.domain import JobRequest, State
 from service.settings import Settings
 from service.supervisor import Supervisor
