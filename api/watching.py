@@ -14,7 +14,7 @@ from api.dashboard.filters import duration, metric
 from api.models import Job, StageStatus
 from service.domain import Stage, State
 
-_LINE_EVERY_S: Final = 5.0
+_LINE_EVERY_S: Final = 2.0
 
 
 class _Rate(ProgressColumn):
@@ -89,13 +89,16 @@ class JobDisplay:
         elapsed = now - self._started.get(stage.stage, now)
         words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
         if stage.state is State.SUCCEEDED:
-            return f"{words}  in {duration(stage.seconds or elapsed)}"
+            seconds = stage.seconds or elapsed
+            return f"{words}  {_rate_words(stage, job, 1 / seconds)}  in {duration(seconds)}" if seconds else words
         if stage.state is State.RUNNING and elapsed > 1 and 0 < stage.progress < 1:
             pace = stage.progress / elapsed
-            rate = (
-                f"{metric(job.requested * pace)} grasps/s"
-                if stage.stage is Stage.SYNTHESIZE
-                else f"{metric(stage.tasks * pace)} batches/s"
-            )
-            return f"{words}  {rate}  {duration((1 - stage.progress) / pace)} left"
+            return f"{words}  {_rate_words(stage, job, pace)}  {duration((1 - stage.progress) / pace)} left"
         return words
+
+
+def _rate_words(stage: StageStatus, job: Job, pace: float) -> str:
+    """Speed in the unit of the stage; `pace` is the share of the stage per second."""
+    if stage.stage is Stage.SYNTHESIZE:
+        return f"{metric(job.requested * pace)} grasps/s"
+    return f"{metric(stage.tasks * pace)} batches/s"
