@@ -12,7 +12,7 @@ from service.clock import timestamp
 from service.domain import AssetKind, Stage, State
 from service.errors import UnavailableError
 from service.library import load_asset, load_check
-from service.manifests import load_manifest
+from service.manifests import ShardManifest, load_manifest
 from service.names import attempt as attempt_key
 from service.parts import Parts
 from service.planning import backoff
@@ -38,18 +38,25 @@ class Indexer:
             UnavailableError: a part is away; apply the same events again later.
         """
         progress: dict[str, tuple[float, float, str]] = {}
+        made: list[ShardManifest] = []
         for event in events:
             if event.kind is EventKind.PROGRESS:
                 progress[event.task_id] = (event.done, event.total, event.message)
                 continue
             progress.pop(event.task_id, None)
             try:
-                self._apply(event)
+                if event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
+                    made.append(load_manifest(self._parts.store, event.stage, event.output))
+                    self._deferrals.pop(event.task_id, None)
+                else:
+                    self._apply(event)
             except UnavailableError:
                 raise
             except Exception:
                 # Anybody who can write to Redis can put an event there: a bad one must not stop those behind it.
                 log.exception("event %s of task %s is left out", event.kind, event.task_id)
+        if made:
+            self.tell(self._parts.index.add_manifests(made))
         if progress:
             self._parts.index.set_progress(progress)
 
@@ -90,9 +97,8 @@ class Indexer:
                 started := self._parts.index.set_running(event.task_id, event.worker)
             ):
                 self.tell(dict([started]))
-        elif event.kind is EventKind.FINISHED and event.stage is not None:
-            self._deferrals.pop(event.task_id, None)
-            self.finished(event.stage, event.output)
+        elif event.kind is EventKind.FINISHED:
+            self.finished(Stage.INGEST, event.output)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
         elif event.kind is EventKind.DEFERRED:

@@ -77,6 +77,7 @@ class Keeper:
             self._tell_again = now + _WORKERS_EVERY_S
 
     def _look_after_workers(self) -> None:
+        self._parts.queue.tidy()
         self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
         forget = datetime.now(UTC) - _FORGET_WORKERS_AFTER
         self._parts.index.set_workers(

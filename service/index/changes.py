@@ -25,14 +25,23 @@ class Changes(Database):
         with self.writing(within) as connection:
             return self._add_job(connection, record)
 
-    def add_manifest(self, manifest: ShardManifest, *, within: Connection | None = None) -> dict[str, State]:
-        """A shard, its grasps, and the success of every task, of whatever job, that was to make it.
+    def add_manifests(
+        self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
+    ) -> dict[str, State]:
+        """Shards, their grasps, and the success of every task, of whatever job, that was to make one of them.
 
         Returns:
             the states of the jobs concerned.
         """
+        states: dict[str, State] = {}
         with self.writing(within) as connection:
-            return self._add_manifest(connection, manifest)
+            for manifest in manifests:
+                states |= self._add_manifest(connection, manifest)
+        return states
+
+    def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
+        """One shard."""
+        return self.add_manifests([manifest])
 
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None

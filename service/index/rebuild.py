@@ -58,7 +58,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
             if events := job_events(store, record.id):
                 index.set_job_events(record.id, events, within=connection)
         for manifest in _records(ShardManifest, store, names.SHARDS, ".json"):
-            index.add_manifest(manifest, within=connection)
+            index.add_manifests([manifest], within=connection)
             count("shards")
     return counts
 

@@ -104,6 +104,9 @@ class MemoryQueue:
     def announced(self, part: str) -> bool:
         return self._announced.get(part, 0.0) > time.monotonic()
 
+    def tidy(self) -> None:
+        """Nothing is left behind."""
+
     def close(self) -> None:
         """Nothing to give back."""
 

@@ -140,5 +140,8 @@ class TaskQueue(Protocol):
     def announced(self, part: str) -> bool:
         """Whether a part said so."""
 
+    def tidy(self) -> None:
+        """Throw away what dead workers and refused entries left behind."""
+
     def close(self) -> None:
         """Give the connections back."""

@@ -142,8 +142,6 @@ class RqQueue:
         with _mapped():
             names = sorted(name.decode() for name in self.connection.smembers(WORKERS))
             found = self.connection.mget([worker_key(name) for name in names]) if names else []
-            if gone := [name for name, data in zip(names, found, strict=True) if data is None]:
-                self.connection.srem(WORKERS, *gone)
         beats = [json.loads(data) for data in found if data is not None]
         return [WorkerBeat(**beat | {"stages": tuple(map(Stage, beat["stages"]))}) for beat in beats]
 
@@ -192,6 +190,21 @@ class RqQueue:
     def announced(self, part: str) -> bool:
         with _mapped():
             return bool(self.connection.exists(f"graspd:part:{part}"))
+
+    def tidy(self) -> None:
+        # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
+        lists = [queue_name(lane, stage) for lane, stage in product(Lane, Stage)]
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for name in self.connection.smembers(WORKERS):
+                if not self.connection.exists(worker_key(name.decode())):
+                    key = f"rq:worker:{name.decode()}"
+                    pipe.delete(key)
+                    for registry in ("rq:workers", *(f"rq:workers:{queue}" for queue in lists)):
+                        pipe.srem(registry, key)
+                    pipe.srem(WORKERS, name)
+            for queue in lists:
+                pipe.zremrangebyscore(f"rq:failed:{queue}", 0, time.time())
+            pipe.execute()
 
     def close(self) -> None:
         self.connection.close()

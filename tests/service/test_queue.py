@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
+from rq import SimpleWorker
 from rq.executions import prepare_execution
 
 from service.clock import timestamp
@@ -15,7 +16,7 @@ from service.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.memory import MemoryQueue
 from service.queue.port import Event, EventKind, TaskQueue, WorkerBeat
-from service.queue.rq_queue import RqQueue, queue_names
+from service.queue.rq_queue import RqQueue, queue_names, worker_key
 from tests.fakes import request
 from worker.context import StopReason, TaskContext
 from worker.heartbeat import Heartbeat, Hold
@@ -300,6 +301,24 @@ def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
     side.finish()
     after = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}
     assert after == before
+
+
+def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
+    worker = SimpleWorker(
+        [AllowedQueue.open(name, rq_queue.connection) for name in queue_names(tuple(Stage))],
+        connection=rq_queue.connection,
+        name="dead",
+        queue_class=AllowedQueue,
+        job_class=AllowedJob,
+    )
+    worker.register_birth()
+    heart = Heartbeat(rq_queue.connection, beat_of("dead"), lease_s=6)
+    heart._tick(None)
+    rq_queue.tidy()
+    assert [beat.name for beat in rq_queue.workers()] == ["dead"], "it lives"
+    rq_queue.connection.delete(worker_key("dead"))  # as its time to live does
+    rq_queue.tidy()
+    assert [key for key in rq_queue.connection.keys("*") if b"worker" in key] == []
 
 
 def test_a_lost_consumer_group_is_made_again(rq_queue: RqQueue) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -138,3 +139,16 @@ def test_a_url_that_names_no_store_is_refused(url: str) -> None:
 def test_only_a_remote_store_signs(store: Store) -> None:
     store.put("a", b"1")
     assert store.sign("a") is None
+
+
+def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    store = open_store(tmp_path.as_uri())
+    with monkeypatch.context() as patch:
+        patch.setattr("service.store.os.fsync", full)
+        with pytest.raises(StoreUnavailable, match=r"No space left on device$"):
+            store.put("shards/base/a.h5", b"data")
+    assert list((tmp_path / "shards" / "base").iterdir()) == []
+    assert store.put("shards/base/a.h5", b"data"), "there is room again"
