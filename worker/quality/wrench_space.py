@@ -25,8 +25,8 @@ Norm = Literal["l1", "linf"]
 EDGES: Final = 8
 #: Least over largest singular value below which a set of wrenches is flat.
 FLATNESS: Final = 1e-7
-#: Largest number of points in a Minkowski sum before its hull is taken.
-MAX_SUM: Final = 40_000
+#: Most contacts of an L-infinity space: its points grow ninefold with each.
+MAX_LINF_CONTACTS: Final = 4
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
@@ -84,7 +84,7 @@ def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, f
         norm: l1 or linf.
 
     Raises:
-        InputError: linf with more contacts than its Minkowski sum can be built for.
+        InputError: linf with more than `MAX_LINF_CONTACTS` contacts.
     """
     dimension = edge_wrenches.shape[-1]
     points = edge_wrenches.reshape(-1, dimension) if norm == "l1" else _minkowski(edge_wrenches)
@@ -110,17 +110,17 @@ def _hull(points: Floats) -> ConvexHull | None:
 
 
 def _minkowski(edge_wrenches: Floats) -> Floats:
-    """Corners of the Minkowski sum of the contacts' pyramids, each with its apex at the origin."""
-    dimension = edge_wrenches.shape[-1]
+    """Points whose hull is the Minkowski sum of the contacts' pyramids, each with its apex at the origin."""
+    contacts, _, dimension = edge_wrenches.shape
+    if contacts > MAX_LINF_CONTACTS:
+        raise InputError(
+            f"the L-infinity wrench space of {contacts} contacts is too large: take at most {MAX_LINF_CONTACTS}, or L1"
+        )
     total = np.zeros((1, dimension))
     for edges in edge_wrenches:
-        pyramid = np.vstack([np.zeros((1, dimension)), edges])
-        if len(total) * len(pyramid) > MAX_SUM:
-            raise InputError(
-                f"the L-infinity space of {len(edge_wrenches)} contacts is too large; use at most 4 contacts, or L1"
-            )
-        total = (total[:, None] + pyramid[None]).reshape(-1, dimension)
+        # Only corners of the sum so far can become corners of the whole.
         hull = _hull(total)
-        if hull is not None:
-            total = total[hull.vertices]
+        total = total if hull is None else total[hull.vertices]
+        pyramid = np.vstack([np.zeros((1, dimension)), edges])
+        total = (total[:, None] + pyramid[None]).reshape(-1, dimension)
     return total

@@ -130,7 +130,7 @@ def test_l_infinity_space_is_the_minkowski_sum() -> None:
 
 def test_l_infinity_space_of_many_contacts_is_refused() -> None:
     contacts = np.random.default_rng(0).normal(size=(12, 8, 6))
-    with pytest.raises(InputError, match="at most 4 contacts"):
+    with pytest.raises(InputError, match="take at most 4, or L1"):
         measure_space(contacts, norm="linf")
 
 

@@ -1,0 +1,156 @@
+"""The numbers of a set of grasps in one row: success by the referee, and medians of every metric."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import MeshError
+from worker.quality.contact import contact_distance_consistency_mm
+from worker.quality.diversity import explained_variance
+from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.judge import Level, Verdicts, judge
+from worker.quality.sources import Case
+from worker.quality.table import DEFAULT_FRICTION, measure
+
+Protocol = Literal["dexgraspbench", "displacement"]
+Progress = Callable[[float, float, str], None]
+
+#: Contact threshold of the row's area, epsilon and volume: the paper's [m].
+THRESHOLD_M: Final = 0.005
+
+
+def evaluate(
+    case: Case,
+    *,
+    protocol: Protocol = "dexgraspbench",
+    level: Level = "certificate",
+    hard: bool = False,
+    friction: float | None = None,
+    threads: int = 0,
+    cache: Path | None = None,
+    progress: Progress = lambda done, total, message: None,
+) -> dict[str, Any]:
+    """One row of numbers, None where a number does not exist: too thin an object has no verdict.
+
+    Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
+    making and judging them), pd_mm and spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume,
+    cdc_mm, sd_cm: medians; diversity: variance explained by the first principal component.
+    """
+    mu = friction or case.friction or DEFAULT_FRICTION
+    table = measure(
+        case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], threads=threads, progress=progress
+    )
+    row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}
+    row |= _success(case, None, 0.0)
+    try:
+        pieces = decompose(case.obj, cache=cache)
+    except MeshError as error:
+        row["note"] = str(error)
+        sd = None
+    else:
+        if protocol == "dexgraspbench":
+            verdicts = judge(
+                case.hand, case.obj, case.grasps, level=level, hard=hard, threads=threads, pieces=pieces,
+                progress=progress,
+            )  # fmt: skip
+            row |= _success(case, verdicts, verdicts.seconds)
+        sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, threads=threads)
+        row |= _decomposition(pieces)
+    return row | _medians(case, table, sd)
+
+
+def _decomposition(pieces: ConvexPieces) -> dict[str, Any]:
+    return {
+        "pieces": len(pieces),
+        "volume_ratio": _plain(pieces.volume_ratio),
+        "excess_mm": _plain(pieces.excess_m * 1e3),
+    }
+
+
+def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:
+    if verdicts is None or not len(case.grasps):
+        return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_referee", "agreement_published"))
+    held = int(verdicts.success.sum())
+    made = case.seconds
+    row: dict[str, Any] = {
+        "level": verdicts.level,
+        "gsr": _plain(held / len(case.grasps)),
+        "osr": float(held > 0),
+        "sgs": _plain(held / (made + seconds)) if made else None,
+        "sgs_without_referee": _plain(held / made) if made else None,
+        "referee_seconds": _plain(seconds),
+        "reasons": dict(Counter(verdicts.reasons).most_common()),
+        "verdict_key": verdicts.key,
+        "agreement_published": None,
+    }
+    if case.published is not None and (known := case.published >= 0).any():
+        row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
+    return row
+
+
+def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64] | None) -> dict[str, Any]:
+    probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+    cdc = contact_distance_consistency_mm(case.hand, probe.body_distance(probe.measure(case.grasps.grasp)))
+    columns = {
+        "pd_mm": "penetration_depth_mm",
+        "spd_mm": "self_penetration_depth_mm",
+        "ca_cm2": "contact_area_cm2",
+        "iv_cm3": "intersection_volume_cm3",
+        "epsilon": "epsilon",
+        "wrench_volume": "wrench_volume",
+    }
+    row = {key: _median(table[f"quality/{name}"]) for key, name in columns.items()}
+    shares = explained_variance(case.grasps.grasp)
+    return row | {
+        "cdc_mm": _median(cdc),
+        "sd_cm": None if sd is None else _median(sd),
+        "diversity": _plain(float(shares[0])) if len(shares) else None,
+    }
+
+
+def _median(values: NDArray[Any]) -> float | None:
+    return _plain(float(np.median(values))) if values.size else None
+
+
+def _plain(value: float) -> float:
+    return round(float(value), 6)
+
+
+def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """One row for several objects: rates over all grasps, osr over objects, medians of the objects' medians."""
+    if len(rows) == 1:
+        return dict(rows[0])
+    total = sum(row["n"] for row in rows)
+    out: dict[str, Any] = {
+        "n": total,
+        "protocol": rows[0]["protocol"],
+        "level": rows[0]["level"],
+        "hard": rows[0]["hard"],
+    }
+    judged = [row for row in rows if row["gsr"] is not None]
+    share = sum(row["gsr"] * row["n"] for row in judged) / max(1, sum(row["n"] for row in judged))
+    out["gsr"] = _plain(share) if judged else None
+    out["osr"] = _plain(sum(row["osr"] for row in judged) / len(judged)) if judged else None
+    for key in (
+        "sgs",
+        "pd_mm",
+        "spd_mm",
+        "ca_cm2",
+        "iv_cm3",
+        "epsilon",
+        "wrench_volume",
+        "cdc_mm",
+        "sd_cm",
+        "diversity",
+    ):
+        known = [row[key] for row in rows if row[key] is not None]
+        out[key] = _plain(float(np.median(known))) if known else None
+    return out
