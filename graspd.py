@@ -33,6 +33,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("index", "service.commands", "Parts of the service", "Rebuild the index from the store."),
     ("keys", "api.commands", "Parts of the service", "Make, list and revoke API keys."),
     ("synth", "worker.planners.commands", "Without a server", "Grasps of a hand file on an object file."),
+    ("evaluate", "worker.quality.commands", "Without a server", "Quality of grasps, judged by an independent engine."),
     ("scene", "worker.scenes.commands", "Without a server", "The object at rest on a table; grasps that fit there."),
     ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
     ("bench", "worker.studies.commands", "Studies", "Grasps per second, and where the time goes."),
