@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 
 from service.domain import Fidelity
 from service.errors import TaskCancelled
-from worker.grasps import GraspSet, Posture
+from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners import Cancelled, Progress
+from worker.planners.fast_graspd.merit import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import RETREATS, sample_starts
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule, Simulation
-from worker.transforms import quat_rotate
 
 Floats = NDArray[np.float64]
 
@@ -95,8 +95,7 @@ def optimise_batch(
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     pair = pair_of(hand, obj, fidelity, device)
     parts = [Part(indices) for indices in _cut(count, threads, device)]
-    iterations = fidelity.coarse_iterations + fidelity.fine_iterations
-    steps = _Steps(count * (iterations + 1), progress, cancelled)
+    steps = _Steps(count * (_hands(fidelity) + 1), progress, cancelled)
     if len(parts) == 1:
         _work(pair, parts[0], fidelity, seed, batch, steps)
     else:
@@ -104,6 +103,11 @@ def optimise_batch(
             for future in [pool.submit(_work, pair, part, fidelity, seed, batch, steps) for part in parts]:
                 future.result()
     return parts
+
+
+def _hands(fidelity: Fidelity) -> int:
+    """Hand iterations that one grasp costs."""
+    return fidelity.starts * fidelity.coarse_iterations + fidelity.finalists * fidelity.fine_iterations
 
 
 def _cut(count: int, threads: int, device: str) -> list[range]:
@@ -116,23 +120,30 @@ def _cut(count: int, threads: int, device: str) -> list[range]:
 
 
 def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
-    n = len(part.indices)
-    hand, obj = pair.hand.model, pair.obj.model
-    probe = pair.simulation(pair.coarse, n * len(RETREATS))
-    state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices)
+    n, hand, obj = len(part.indices), pair.hand.model, pair.obj.model
+    finalists = min(fidelity.finalists, fidelity.starts)
+    probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
+    state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices, each=fidelity.starts)
     steps(n, "starts")
     part.curve = []
-    for points, schedule, name in (
-        (pair.coarse, coarse_schedule(fidelity), "coarse"),
-        (pair.fine, fine_schedule(fidelity), "fine"),
-    ):
-        simulation = pair.simulation(points, n)
-        if len(schedule):
-            state = _optimize(simulation, state, schedule, fidelity, steps, name, part.curve)
-    part.loss = simulation.loss.numpy()[:n].mean(axis=1).astype(float)
+    simulation = pair.simulation(pair.coarse, n * fidelity.starts)
+    state = _optimize(simulation, state, coarse_schedule(fidelity), fidelity, steps, "coarse", part.curve)
+    if finalists < fidelity.starts:
+        state = state[best_of_each(merits(hand, obj, state, _losses(simulation, state)), n, finalists)]
+    simulation = pair.simulation(pair.fine, n * finalists)
+    state = _optimize(simulation, state, fine_schedule(fidelity), fidelity, steps, "fine", part.curve)
+    losses = _losses(simulation, state)
     if fidelity.polish_iterations:
         state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
-    part.state = state
+    if finalists > 1:
+        winners = best_of_each(merits(hand, obj, state, losses), n, 1)
+        state, losses = state[winners], losses[winners]
+    part.state, part.loss = state, losses
+
+
+def _losses(simulation: Simulation, state: HandState) -> Floats:
+    """L_stable (n,) of the last iteration."""
+    return simulation.loss.numpy()[: len(state.pivot)].mean(axis=1).astype(float)
 
 
 def _optimize(
@@ -159,8 +170,7 @@ def _optimize(
 def _grasps(hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float) -> GraspSet:
     states = [part.state for part in parts if part.state is not None]
     pivot, rotation, q = (np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q"))
-    root = pivot + obj.centre_of_mass - quat_rotate(rotation, hand.palm.centre)
-    grasp = Posture(np.concatenate([root, rotation], axis=1), hand.expand(q))
+    grasp = posture_of(hand, obj, HandState(pivot, rotation, q))
     curves = [part.curve for part in parts if part.curve]
     curve = np.mean(curves, axis=0).round(5).tolist() if curves else []
     return GraspSet(

@@ -38,9 +38,9 @@ class _Draw:
     approach: Floats
 
 
-def grasp_generator(seed: int, batch: int, index: int) -> np.random.Generator:
-    """Random numbers of one grasp, independent of every other grasp."""
-    return np.random.default_rng(np.random.SeedSequence([seed, batch, index]))
+def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.Generator:
+    """Random numbers of one start of one grasp, independent of every other."""
+    return np.random.default_rng(np.random.SeedSequence([seed, batch, index, start]))
 
 
 def _frame(z: Floats) -> Floats:
@@ -97,18 +97,18 @@ def placement_schedule() -> Schedule:
 
 
 def sample_starts(
-    hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range
+    hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range, each: int
 ) -> HandState:
-    """Collision-free starts of the grasps `indices` of a batch.
+    """Collision-free starts of the grasps `indices` of a batch, `each` per grasp, those of one grasp side by side.
 
-    `probe` is a simulation whose capacity is at least len(indices) * len(RETREATS).
+    `probe` is a simulation whose capacity is at least len(indices) * each * len(RETREATS).
 
     Raises:
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
     probe.set_schedule(placement_schedule())
     probe.record_placement()
-    generators = [grasp_generator(seed, batch, i) for i in indices]
+    generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     best: list[tuple[float, HandState] | None] = [None] * len(generators)
     open_ = list(range(len(generators)))
     for _ in range(DRAWS):
