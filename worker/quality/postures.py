@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.grasps import Posture
+from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
@@ -21,8 +22,14 @@ from worker.transforms import quat_rotate
 
 #: Fingers open until this far from the object [m] (BODex).
 CLEARANCE_M: Final = 0.010
-#: The root retreats until the whole hand is this far away [m]: a palm left in touch kicks the object.
-PALM_CLEARANCE_M: Final = 0.005
+#: A finger that cannot get this far along its contact normals opens plainly [m].
+STUCK_M: Final = 0.003
+#: The root retreats only where the open hand is nearer than this [m]: a palm left in touch kicks the object, but so
+#: does one that comes back from afar while the fingers close.
+PALM_CLEARANCE_M: Final = 0.0005
+#: Share of plain opening, against `HandModel.closing`, in the way a finger leaves; the rest is along the contact
+#: normals, so that the finger comes back without dragging the object along.
+PLAIN_OPENING: Final = 0.3
 #: Opening steps of each finger [rad, or m for prismatic dofs], and their number.
 OPENING_STEP: Final = 0.05
 OPENING_STEPS: Final = 24
@@ -40,9 +47,11 @@ _CHUNK: Final = 32
 
 
 def pregrasp(hand: HandModel, obj: ObjectModel, grasp: Posture) -> Posture:
-    """N postures from which the hand closes: every finger opened, against its closing direction, until its points are
-    `CLEARANCE_M` away or its clearance is greatest; then the root moved back along the palm's approach, if the hand
-    still is within `PALM_CLEARANCE_M`."""
+    """N postures from which the hand closes.
+
+    Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away, or as far as it
+    can get; then the root moves back along the palm's approach if the hand is still in touch.
+    """
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     parts = [_pregrasp(probe, _rows(grasp, i)) for i in range(0, len(grasp), _CHUNK)]
     return _join(hand, parts)
@@ -97,31 +106,63 @@ def _pressing(probe: Probe, found: Distances, b: int) -> Contacts:
 def _pregrasp(probe: Probe, grasp: Posture) -> Posture:
     hand = probe.hand
     q = hand.reduce(grasp.joint_positions)
-    finger = finger_of_body(hand)
-    paths = _openings(hand, q)
-    clearance = _finger_clearance(probe, grasp.hand_pose, paths, finger)
+    finger = _finger_of_dof(hand)
+    paths = _openings(hand, q, _leaving(probe, probe.measure(grasp), finger))
+    clearance = _finger_clearance(probe, grasp.hand_pose, paths)
+    stuck = np.flatnonzero((clearance.max(axis=1) < STUCK_M).any(axis=1))
+    if len(stuck):
+        # Deep or enclosed fingers have no sensible normals: plain opening, where that gets them farther.
+        plain = _openings(hand, q[stuck], np.tile(-hand.closing.astype(float), (len(stuck), 1)))
+        other = _finger_clearance(probe, grasp.hand_pose[stuck], plain)
+        better = other.max(axis=1) > np.minimum(clearance[stuck].max(axis=1), STUCK_M)
+        clearance[stuck] = np.where(better[:, None], other, clearance[stuck])
+        paths[stuck] = np.where(better[:, np.maximum(finger, 0)][:, None], plain, paths[stuck])
     chosen = _first_clear(clearance, CLEARANCE_M)
     opened = q.copy()
-    for d in range(hand.dofs):
-        # A dof opens with the first finger that it drives; one that drives no finger stays.
-        driven = finger[np.flatnonzero(hand.dof == d)]
-        if (driven >= 0).any():
-            steps = chosen[:, driven[driven >= 0][0]]
-            opened[:, d] = paths[np.arange(len(q)), steps, d]
+    for d in np.flatnonzero(finger >= 0):
+        opened[:, d] = paths[np.arange(len(q)), chosen[:, finger[d]], d]
     return _retreat(probe, grasp.hand_pose, opened)
 
 
-def _openings(hand: HandModel, q: Floats) -> Floats:
-    """(B, K, D) dof values on the way open, the grasp first, all within the limits."""
+def _finger_of_dof(hand: HandModel) -> NDArray[np.int32]:
+    """(D,) the first finger that each dof drives; -1: none, so it stays when fingers open."""
+    finger = finger_of_body(hand)
+    driven = [finger[np.flatnonzero((hand.dof == d) & (finger >= 0))] for d in range(hand.dofs)]
+    return np.array([f[0] if len(f) else -1 for f in driven], np.int32)
+
+
+def _leaving(probe: Probe, found: Distances, finger: NDArray[np.int32]) -> Floats:
+    """(B, D) directions in which fingers leave the object; the fastest dof of each finger has about 1."""
+    hand = probe.hand
+    out = np.tile(-np.asarray(hand.closing, float), (len(found.bodies), 1))
+    weight = np.clip(CLEARANCE_M - found.distance, 0.0, None)
+    for b in range(len(out)):
+        near = np.flatnonzero(weight[b] > 0)
+        force = (weight[b, near, None] * found.normal[b, near])[:, None]
+        body, points = probe.points.body[near], found.hand_points[b, near]
+        away = generalized_forces(hand, found.bodies[b], body, points, force).sum(axis=(0, 1))
+        for f in np.unique(finger[finger >= 0]):
+            mine = np.flatnonzero(finger == f)
+            # A finger that hooks around an edge would leave by closing further: it must open all the same.
+            away[mine] = np.where(away[mine] * hand.closing[mine] > 0, 0.0, away[mine])
+            fastest = float(np.abs(away[mine]).max())
+            if fastest > 0:
+                out[b, mine] = PLAIN_OPENING * out[b, mine] + (1 - PLAIN_OPENING) * away[mine] / fastest
+    return out
+
+
+def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
+    """(B, K, D) dof values on the way along `direction` (B, D), the grasp first, all within the limits."""
     step = OPENING_STEP * np.arange(OPENING_STEPS + 1)
-    path = q[:, None] - step[None, :, None] * hand.closing
+    path = q[:, None] + step[None, :, None] * direction[:, None]
     # A grasp may stand a hair outside its limits: opening must not make a jump of that.
     return np.clip(path, np.minimum(hand.lower, q)[:, None], np.maximum(hand.upper, q)[:, None])
 
 
-def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats, finger: NDArray[np.int32]) -> Floats:
+def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     """(B, K, fingers) least distance of each finger's points to the object; inf where a finger has none."""
     count, steps, _ = paths.shape
+    finger = finger_of_body(probe.hand)
     joints = probe.hand.expand(paths).reshape(count * steps, -1)
     distance = _distances(probe, np.repeat(hand_pose, steps, axis=0), joints)
     out = np.full((count * steps, max(1, len(probe.hand.fingertips))), np.inf)
