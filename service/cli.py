@@ -71,8 +71,8 @@ def log_to_stderr(settings: Settings) -> None:
         format="%(asctime)s %(levelname)s %(name)s %(message)s",
         force=True,
     )
-    # Alembic tells of every migration check, RQ of every idle poll.
-    for name in ("alembic", "rq.worker", "rq.job", "rq.queue"):
+    # Alembic tells of every migration check, RQ of every idle poll, httpx of every request.
+    for name in ("alembic", "rq.worker", "rq.job", "rq.queue", "httpx"):
         logging.getLogger(name).setLevel(logging.WARNING)
 
 

@@ -42,7 +42,8 @@ def up(
     supervisor.start()
     try:
         supervisor.wait_ready(_READY_S)
-        console.print(f"graspd is up: {supervisor.api_url} (data in {supervisor.settings.data_dir}); Ctrl-C stops it")
+        where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
+        console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
         if json:
             emit({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
         stop.wait()

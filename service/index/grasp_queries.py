@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
 
+from service.domain import Stage
 from service.errors import NotFoundError
 from service.index import cursors
 from service.index.database import Database
@@ -15,6 +16,7 @@ from service.index.tables import grasps, shards, tasks
 from service.index.views import GraspView, Page, ShardView
 
 _BEST_FIRST = GraspSort()
+_SORTED_AT_ONCE = 20_000
 
 
 class GraspQueries(Database):
@@ -32,7 +34,8 @@ class GraspQueries(Database):
         size = cursors.page_size(limit)
         start = None if cursor is None else cursors.decode(cursor, (float, int, str, type(None)), str, int)
         with self.reading() as connection:
-            rows = _grasp_rows(connection, _conditions(where), sort, size + 1, start)
+            by_pair = sort.by == "epsilon" or _are_few(connection, where)
+            rows = _grasp_rows(connection, _conditions(where, by_pair=by_pair), sort, size + 1, start)
         views = [GraspView(**{name: row[name] for name in GraspView.model_fields}) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
@@ -107,17 +110,35 @@ def _slice(
     return query.order_by(*(part.desc() if sort.descending else part for part in key)).limit(size)
 
 
-def _conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
+def _are_few(connection: Connection, where: GraspFilter | None) -> bool:
+    """Whether the grasps of the filter's hand and object are so few that sorting all of them is the quickest way."""
+    if where is None or (where.hand is None and where.object is None):
+        return False
+    pair = [shards.c[name] == v for name, v in {"hand": where.hand, "object": where.object}.items() if v is not None]
+    count = connection.scalar(select(func.sum(shards.c.count)).where(shards.c.kind == "base", *pair))
+    return int(count or 0) <= _SORTED_AT_ONCE
+
+
+def _conditions(where: GraspFilter | None, *, by_pair: bool = True) -> list[ColumnElement[bool]]:
+    """The filter in SQL; without `by_pair` the database cannot use its indexes of hand and object.
+
+    SQLite would take such an index for any sort, and then sort a million rows to show fifty.
+    """
     if where is None:
         return []
-    exact = {"hand": where.hand, "object": where.object, "shard_id": where.shard}
-    conditions: list[ColumnElement[bool]] = [grasps.c[name] == v for name, v in exact.items() if v is not None]
+    pair: list[tuple[ColumnElement[str], str | None]] = [(grasps.c.hand, where.hand), (grasps.c.object, where.object)]
+    conditions: list[ColumnElement[bool]] = [
+        (column if by_pair else func.coalesce(column, "")) == value for column, value in pair if value is not None
+    ]
+    if where.shard is not None:
+        conditions.append(grasps.c.shard_id == where.shard)
     flags = {"valid": where.valid, "success": where.success}
     conditions += [grasps.c[name].is_(v) for name, v in flags.items() if v is not None]
     conditions += [grasps.c[name] >= bound for name, bound in where.at_least.items()]
     conditions += [grasps.c[name] <= bound for name, bound in where.at_most.items()]
     if where.job is not None:
-        conditions.append(grasps.c.shard_id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == where.job)))
+        made = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
+        conditions.append(grasps.c.shard_id.in_(select(tasks.c.shard_id).where(*made)))
     return conditions
 
 

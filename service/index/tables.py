@@ -136,7 +136,9 @@ grasps: Final = Table(
     Column("success", Boolean),
     Column("created", String(32), nullable=False),
     *(Index(f"grasps_{name}", name, "shard_id", "row") for name in (*METRICS, "created")),
-    Index("grasps_by_pair", "hand", "object", "epsilon"),
+    Index("grasps_by_pair", "hand", "object", "epsilon", "shard_id", "row"),
+    Index("grasps_by_hand", "hand", "epsilon", "shard_id", "row"),
+    Index("grasps_by_object", "object", "epsilon", "shard_id", "row"),
     sqlite_with_rowid=False,
 )
 

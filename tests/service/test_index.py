@@ -317,3 +317,15 @@ def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts) -> None:
     with pytest.raises(Exception, match="damaged"):
         rebuild(parts.index, parts.store)
     assert len(parts.index.jobs(limit=99).items) == jobs
+
+
+@pytest.mark.parametrize("sorted_at_once", [0, 20_000])
+def test_a_pair_is_found_whichever_way_the_database_goes(
+    parts: Parts, monkeypatch: pytest.MonkeyPatch, sorted_at_once: int
+) -> None:
+    monkeypatch.setattr("service.index.grasp_queries._SORTED_AT_ONCE", sorted_at_once)
+    job, _ = pipeline.submit(parts, request())
+    run_all(parts, job.id)
+    sort = GraspSort(by="penetration_depth_mm", descending=False)
+    assert len(parts.index.grasps(GraspFilter(hand="gripper", object="ball"), sort=sort).items) == 32
+    assert parts.index.grasps(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []

@@ -69,7 +69,9 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("shard_id", "row"),
         sqlite_with_rowid=False,
     )
-    op.create_index("grasps_by_pair", "grasps", ["hand", "object", "epsilon"], unique=False)
+    op.create_index("grasps_by_hand", "grasps", ["hand", "epsilon", "shard_id", "row"], unique=False)
+    op.create_index("grasps_by_object", "grasps", ["object", "epsilon", "shard_id", "row"], unique=False)
+    op.create_index("grasps_by_pair", "grasps", ["hand", "object", "epsilon", "shard_id", "row"], unique=False)
     op.create_index("grasps_contact_area_cm2", "grasps", ["contact_area_cm2", "shard_id", "row"], unique=False)
     op.create_index("grasps_created", "grasps", ["created", "shard_id", "row"], unique=False)
     op.create_index("grasps_epsilon", "grasps", ["epsilon", "shard_id", "row"], unique=False)
@@ -205,6 +207,8 @@ def downgrade() -> None:
     op.drop_index("grasps_created", table_name="grasps")
     op.drop_index("grasps_contact_area_cm2", table_name="grasps")
     op.drop_index("grasps_by_pair", table_name="grasps")
+    op.drop_index("grasps_by_object", table_name="grasps")
+    op.drop_index("grasps_by_hand", table_name="grasps")
     op.drop_table("grasps")
     op.drop_index("attempts_of_job", table_name="attempts")
     op.drop_index("attempts_by_kind", table_name="attempts")
