@@ -38,6 +38,9 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
     ("bench", "worker.studies.commands", "Studies", "Grasps per second, and where the time goes."),
     ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
+    ("export", "worker.rendering.commands", "Without a server", "Pictures as PNG, OpenEXR and JSON files."),
+    ("gallery", "worker.rendering.studies", "Studies", "Hands and objects at rest, as a camera sees them."),
+    ("bench-render", "worker.rendering.studies", "Studies", "Images per second, and where the time goes."),
 )
 
 

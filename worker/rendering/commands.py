@@ -1,4 +1,4 @@
-"""Command line: `graspd render` and `graspd pictures`."""
+"""Command line: `graspd render`, `graspd pictures` and `graspd export`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
-from service.shards import read_shard, write_shard
+from service.shards import Shard, read_shard, write_shard
 from worker.devices import Device
 from worker.rendering.cameras import BASELINE_M
+from worker.rendering.channels import parse_channels
+from worker.rendering.given import SAMPLED, read_cameras
+from worker.rendering.hands import DrawnHand
 from worker.rendering.pictures import THREE_SIDES, grasp_pictures
-from worker.rendering.sheets import best, contact_sheet, figures, three_sides_sheet, views_page
+from worker.rendering.sheets import best, best_kept, contact_sheet, figures, three_sides_sheet, views_page
+from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
 from worker.scenes.commands import INHERITED
-from worker.scenes.sources import hand_of_shard, object_of_shard
+from worker.scenes.sources import hand_of_shard, neighbours_of_shard, object_of_shard
 
 app = typer.Typer(add_completion=False)
 
@@ -35,8 +39,21 @@ def render(
     views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
     stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
     baseline: Annotated[float, typer.Option(help="Distance of the eyes [m].")] = BASELINE_M,
-    width: Annotated[int, typer.Option(min=16, max=4096, help="Picture width [px].")] = 320,
-    height: Annotated[int, typer.Option(min=16, max=4096, help="Picture height [px].")] = 240,
+    width: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture width [px]; 320.")] = None,
+    height: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture height [px]; 240.")] = None,
+    channels: Annotated[
+        str, typer.Option(help="Besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
+    ] = "",
+    cameras: Annotated[
+        Path | None, typer.Option(help="JSON with intrinsics, places, or both, instead of sampled cameras.")
+    ] = None,
+    with_hand: Annotated[
+        Path | None, typer.Option(help="The base shard: also pictures with each scene's best grasp.")
+    ] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
+    with_: Annotated[
+        list[str] | None, typer.Option("--with", help="A neighbour's file; default: the built-in of that name.")
+    ] = None,
     object: _Object = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the scenes.")] = None,
     device: _Device = "auto",
@@ -44,28 +61,37 @@ def render(
     page: Annotated[Path | None, typer.Option(help="Also write a page that shows the views (PNG).")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Take pictures of scenes: colour, depth, segmentation and boxes."""
+    """Take pictures of scenes: colour, depth, segmentation, boxes, and what `--channels` asks for."""
     started = perf_counter()
     scene = read_shard(scenes, kind="scene")
     obj = object_of_shard(scene, object)
     number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
     used = Device(device).resolve()
+    given = read_cameras(cameras) if cameras is not None else SAMPLED
+    size = (width or given.width or 320, height or given.height or 240)
+    extras = Extras(
+        channels=parse_channels(channels.split(",")),
+        cameras=given,
+        neighbours=neighbours_of_shard(scene, with_ or []),
+        drawn=None if with_hand is None else _drawn(scene, with_hand, hand),
+    )
     with _progress(json) as bar:
         task = bar.add_task("rendering", total=None)
         result = render_views(
-            obj, np.asarray(scene["scene/object_pose"], float), views=views, stereo=stereo, width=width,
-            height=height, seed=number, device=used, baseline_m=baseline,
+            obj, np.asarray(scene["scene/object_pose"], float), views=views, stereo=stereo, width=size[0],
+            height=size[1], seed=number, device=used, baseline_m=baseline, extras=extras,
             progress=lambda done, total, message: bar.update(task, completed=done, total=total, description=message),
         )  # fmt: skip
     seconds = perf_counter() - started
-    kept = {key: scene.attributes[key] for key in INHERITED if key in scene.attributes}
+    inherited = (*INHERITED, "neighbours", "neighbour_digests")
+    kept = {key: scene.attributes[key] for key in inherited if key in scene.attributes}
     output.write_bytes(
         write_shard("views", result, {**kept, "seed": number, "device": used, "seconds": round(seconds, 4)})
     )
     count = len(result["image/rgb"])
     if page is not None:
         title = f"Views of {scene.attributes.get('object', 'the object')}"
-        page.write_bytes(views_page(result, title=title, subtitle=f"{count} pictures, {width} x {height} pixels"))
+        page.write_bytes(views_page(result, title=title, subtitle=f"{count} pictures, {size[0]} x {size[1]} pixels"))
     if json:
         emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
     else:
@@ -106,6 +132,45 @@ def pictures(
         emit({"file": str(output), "grasps": len(rows), "rows": rows.tolist()})
     else:
         typer.echo(f"{output}: the best {len(rows)} grasps")
+
+
+@app.command(epilog="graspd export views.h5 --format images -o images")
+@reporting_errors
+def export(
+    shard: Annotated[Path, typer.Argument(help="A views shard, as `graspd render` writes it.")],
+    format_: Annotated[str, typer.Option("--format", help="images: PNG, OpenEXR and JSON files.")] = "images",
+    depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("images"),
+    json: JsonFlag = False,
+) -> None:
+    """Write the pictures of a shard as image files, named as Replicator's writer names them."""
+    if format_ != "images":
+        raise InputError(f"there is no export format {format_!r}; use images")
+    if depth not in ("exr", "png"):
+        raise InputError(f"there is no depth format {depth!r}; use exr or png")
+    from worker.rendering.export import export_images
+
+    views = read_shard(shard, kind="views")
+    written = export_images(views, output, depth="exr" if depth == "exr" else "png")
+    if json:
+        emit({"folder": str(output), "pictures": len(views["camera/eye"]), "files": len(written)})
+    else:
+        typer.echo(f"{output}: {len(views['camera/eye'])} pictures, {len(written)} files")
+
+
+def _drawn(scene: Shard, base_file: Path, hand: str | None) -> DrawnHand:
+    """The best grasp that each scene kept, by epsilon, for `--with-hand`."""
+    base = read_shard(base_file, kind="base")
+    model = hand_of_shard(scene, hand)
+    hand_of_shard(base, hand)
+    rows = best_kept(scene.arrays, base.arrays)
+    source = np.asarray(scene["grasp/base_index"])[rows]
+    if len(source) and source.max() >= len(base["grasp/joint_positions"]):
+        raise InputError(
+            f"{base_file} has fewer grasps than the scenes were made of; give the base shard they come from"
+        )
+    joints = np.asarray(base["grasp/joint_positions"], float)[source]
+    return DrawnHand(model, rows, np.asarray(scene["grasp/hand_pose"], float)[rows], joints)
 
 
 def _progress(quiet: bool) -> Progress:

@@ -17,9 +17,12 @@ MARGIN: Final = 40
 GAP: Final = 18
 _HEAD: Final = 74
 _CAPTION: Final = 44
+_NAME: Final = 22
 #: Contact threshold at which a sheet quotes epsilon and contact area [m].
 _QUOTED_THRESHOLD_M: Final = 0.005
-_SEGMENT: Final = np.array([[214, 216, 219], [150, 168, 178], [224, 129, 63]], np.uint8)
+_SEGMENT: Final = np.array(
+    [[214, 216, 219], [150, 168, 178], [224, 129, 63], [96, 122, 158], [122, 158, 112], [168, 118, 150]], np.uint8
+)
 _TIGHT: Final = (0, 214, 190)
 _LOOSE: Final = (255, 255, 255)
 _BOX_3D: Final = (255, 205, 60)
@@ -32,6 +35,18 @@ def best(quality: Arrays, count: int) -> NDArray[np.intp]:
     """Rows of the `count` best grasps: valid ones first, then by epsilon."""
     valid, epsilon = np.asarray(quality["quality/valid"], bool), _quoted(quality, "quality/epsilon")
     return np.lexsort((-epsilon, ~valid))[:count]
+
+
+def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
+    """(S,) for each scene the row of its kept grasp with the largest epsilon; -1 where none was kept."""
+    epsilon = _quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
+    score = np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf)
+    rows = np.full(len(scene["scene/object_pose"]), -1, np.int32)
+    for s in range(len(rows)):
+        mine = np.flatnonzero(np.asarray(scene["grasp/scene_index"]) == s)
+        if len(mine) and np.isfinite(score[mine]).any():
+            rows[s] = mine[np.argmax(score[mine])]
+    return rows
 
 
 def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
@@ -102,6 +117,31 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
     return type_.png(page)
 
 
+def scene_cells(views: Arrays) -> list[Image.Image]:
+    """Pictures of a shard's first stereo pair: left, right, depth, normals, segmentation, boxes."""
+    left, right = np.asarray(views["image/rgb"][:2], np.uint8)
+    normals = np.asarray(views["image/normals"][0], float)
+    coloured = np.where(normals.any(axis=-1, keepdims=True), 127.5 + 127.5 * normals, 214).round().astype(np.uint8)
+    cells = [Image.fromarray(left), Image.fromarray(right), _depth(views, 0), Image.fromarray(coloured)]
+    return [*cells, _segments(views, 0), _boxes(views, 0)]
+
+
+def label_page(
+    rows: Sequence[Sequence[Image.Image]], heads: Sequence[str], names: Sequence[str], *, title: str, subtitle: str = ""
+) -> bytes:
+    """PNG of a table of pictures with a head above each column and a name below each row's first picture."""
+    width, height = rows[0][0].size
+    page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
+    for column, head in enumerate(heads):
+        type_.text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, type_.QUIET)
+    for row, (cells, name) in enumerate(zip(rows, names, strict=True)):
+        y = top + row * (height + _NAME + GAP)
+        for column, cell in enumerate(cells):
+            page.paste(cell, (MARGIN + column * (width + GAP), y))
+        type_.text(draw, (MARGIN, y + height + _NAME - 4), name, 14, type_.INK)
+    return type_.png(page)
+
+
 def _page(
     columns: int, rows: int, width: int, height: int, title: str, subtitle: str, head: int = _HEAD
 ) -> tuple[Image.Image, ImageDraw.ImageDraw, int]:
@@ -156,7 +196,13 @@ def _scale_bar(image: Image.Image, near: float, far: float) -> None:
 
 
 def _segments(views: Arrays, view: int) -> Image.Image:
-    return Image.fromarray(_SEGMENT[np.asarray(views["image/segmentation"][view])])
+    return Image.fromarray(_SEGMENT[_segment_rows(views, view)])
+
+
+def _segment_rows(views: Arrays, view: int) -> NDArray[np.intp]:
+    """Rows of `_SEGMENT`: neighbours take turns with the colours after the object's."""
+    labels = np.asarray(views["image/segmentation"][view], np.intp)
+    return np.where(labels > OBJECT, OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1), labels)
 
 
 def _boxes(views: Arrays, view: int) -> Image.Image:

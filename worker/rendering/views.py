@@ -18,24 +18,16 @@ from worker.rendering.given import SAMPLED, GivenCameras
 from worker.rendering.hands import DrawnHand
 from worker.rendering.scenery import Pictures
 from worker.rendering.setting import TABLE_SIZE, CameraPlan, Setting
+from worker.scenes.neighbours import Neighbours
 from worker.transforms import apply
 
-__all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "Neighbours", "render"]
+__all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
 
 #: Passes per picture; half of them light the scene with the lamp, half with the sky.
 SAMPLES: Final = 12
 
 Progress = Callable[[float, float, str], None]
 Arrays = dict[str, NDArray[np.generic]]
-
-
-@dataclass(frozen=True)
-class Neighbours:
-    """The M other objects on the table."""
-
-    objects: Sequence[ObjectModel]
-    poses: Floats
-    """(S, M, 7) in the table frame."""
 
 
 @dataclass(frozen=True)

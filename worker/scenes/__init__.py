@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from worker.scenes.clearance import transfer
+from worker.scenes.neighbours import Neighbours, drop_together
 from worker.scenes.simulate import drop
 
-__all__ = ["drop", "transfer"]
+__all__ = ["Neighbours", "drop", "drop_together", "transfer"]

@@ -6,6 +6,7 @@ The lowest point of a convex piece is exact: corners for boxes and hulls, closed
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from service.errors import InputError
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.scenes.neighbours import Neighbours, neighbour_clearance
 from worker.transforms import compose, quat_rotate, quat_to_matrix
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
@@ -22,6 +24,16 @@ MARGIN_M: Final = 0.002
 #: Postures checked on the straight way from pregrasp to grasp, both ends included.
 PATH_POSTURES: Final = 9
 _CHUNK: Final = 64
+
+
+class Rejection(IntEnum):
+    """Why a grasp is no grasp of a scene; of several reasons the first in this order."""
+
+    NONE = 0
+    TABLE_AT_CONTACT = 1
+    TABLE_ON_APPROACH = 2
+    NEIGHBOUR_AT_CONTACT = 3
+    NEIGHBOUR_ON_APPROACH = 4
 
 
 @dataclass(frozen=True)
@@ -42,7 +54,13 @@ class _Cylinders:
     radius: Floats
 
 
-def transfer(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> dict[str, NDArray[np.generic]]:
+def transfer(
+    hand: HandModel,
+    grasp: Posture,
+    pregrasp: Posture,
+    object_pose: Floats,
+    neighbours: Neighbours | None = None,
+) -> dict[str, NDArray[np.generic]]:
     """Every grasp in every scene, with the hand's clearance above the table.
 
     Args:
@@ -50,11 +68,14 @@ def transfer(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Fl
         grasp: N postures at contact, object frame.
         pregrasp: N postures before contact, object frame; the hand moves straight from it to the grasp.
         object_pose: (S, 7) rest poses in the table frame.
+        neighbours: other objects on the table that the hand must stay clear of, too.
 
     Returns:
         Datasets of the scene shard with K = S N rows, scene-major: `grasp/base_index`, `grasp/scene_index`,
         `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): lowest point of the hand at the grasp, the pregrasp
-        and between them; `grasp/valid` (K,): 1 where that is at least `MARGIN_M`.
+        and between them; `grasp/contact_table_clearance_m` (K,): the same at the grasp alone; `grasp/valid` (K,): 1
+        where both are at least `MARGIN_M`; `grasp/rejection` (K,): a `Rejection`. With neighbours
+        also `grasp/neighbour_clearance_m` (K,).
 
     Raises:
         InputError: grasps and pregrasps differ in number.
@@ -63,7 +84,7 @@ def transfer(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Fl
         raise InputError(f"{len(grasp)} grasps come with {len(pregrasp)} pregrasps; each grasp needs its own")
     poses = np.asarray(object_pose, float).reshape(-1, 7)
     clearance = np.concatenate(
-        [np.empty((len(poses), 0))]
+        [np.empty((len(poses), 0, 2))]
         + [
             _clearance(hand, _rows(grasp, part), _rows(pregrasp, part), poses)
             for part in np.array_split(np.arange(len(grasp)), max(1, -(-len(grasp) // _CHUNK)))
@@ -72,13 +93,31 @@ def transfer(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Fl
         axis=1,
     )
     scenes, grasps = len(poses), len(grasp)
-    return {
+    at_contact, on_the_way = clearance.reshape(-1, 2).T
+    rejection = np.where(on_the_way < MARGIN_M, Rejection.TABLE_ON_APPROACH, Rejection.NONE)
+    rejection[at_contact < MARGIN_M] = Rejection.TABLE_AT_CONTACT
+    result: dict[str, NDArray[np.generic]] = {}
+    if neighbours is not None:
+        beside = _beside(hand, grasp, pregrasp, poses, neighbours).reshape(-1, 2)
+        rejection[(rejection == Rejection.NONE) & (beside[:, 1] < MARGIN_M)] = Rejection.NEIGHBOUR_ON_APPROACH
+        rejection[(rejection >= Rejection.NEIGHBOUR_AT_CONTACT) & (beside[:, 0] < MARGIN_M)] = (
+            Rejection.NEIGHBOUR_AT_CONTACT
+        )
+        result["grasp/neighbour_clearance_m"] = beside[:, 1]
+    return result | {
         "grasp/base_index": np.tile(np.arange(grasps, dtype=np.int32), scenes),
         "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), grasps),
         "grasp/hand_pose": compose(poses[:, None], grasp.hand_pose[None]).reshape(-1, 7),
-        "grasp/table_clearance_m": clearance.reshape(-1),
-        "grasp/valid": (clearance >= MARGIN_M).astype(np.uint8).reshape(-1),
+        "grasp/table_clearance_m": on_the_way,
+        "grasp/contact_table_clearance_m": at_contact,
+        "grasp/rejection": rejection.astype(np.uint8),
+        "grasp/valid": (rejection == Rejection.NONE).astype(np.uint8),
     }
+
+
+def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
+    """How many grasps each reason refused."""
+    return {r.name.lower(): int((rejection == r).sum()) for r in Rejection if r is not Rejection.NONE}
 
 
 def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
@@ -96,12 +135,19 @@ def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -
     return Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
 
 
+def _beside(hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, neighbours: Neighbours) -> Floats:
+    """(S, N, 2) distance from the neighbours at contact, and the smallest on the way."""
+    path = approach(grasp, pregrasp)
+    distance = neighbour_clearance(hand, path, poses, neighbours).reshape(len(poses), len(grasp), -1)
+    return np.stack([distance[..., -1], distance.min(axis=2)], axis=-1)
+
+
 def _rows(posture: Posture, rows: NDArray[np.intp]) -> Posture:
     return Posture(np.asarray(posture.hand_pose, float)[rows], np.asarray(posture.joint_positions, float)[rows])
 
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
-    """(S, N) lowest point of the hand on its way, in the table frame [m]."""
+    """(S, N, 2) lowest point of the hand at contact, and anywhere on its way, in the table frame [m]."""
     path = approach(grasp, pregrasp)
     bodies = body_poses(hand, path.hand_pose, path.joint_positions)
     balls, cylinders = _solids(hand.pieces)
@@ -117,7 +163,8 @@ def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: 
             slope = axes @ up
             reach = cylinders.half_length * np.abs(slope) + cylinders.radius * np.sqrt(np.maximum(0.0, 1 - slope**2))
             lowest[s] = np.minimum(lowest[s], (middles @ up - reach).min(axis=1) + pose[2])
-    return lowest.reshape(len(object_pose), len(grasp), -1).min(axis=2)
+    on_path = lowest.reshape(len(object_pose), len(grasp), -1)
+    return np.stack([on_path[..., -1], on_path.min(axis=2)], axis=-1)
 
 
 def _solids(pieces: tuple[ConvexPiece, ...]) -> tuple[_Balls, _Cylinders]:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.shards import Shard, read_shard, write_shard
+from service.shards import Attribute, Shard, read_shard, write_shard
 from worker.grasps import Posture
-from worker.scenes.clearance import transfer
+from worker.objects.prepare import object_from_path
+from worker.scenes.clearance import count_rejections, transfer
+from worker.scenes.neighbours import Neighbours, drop_together
 from worker.scenes.simulate import drop
-from worker.scenes.sources import hand_of_shard, object_of_shard
+from worker.scenes.sources import NEIGHBOUR_FACE_ERROR_M, hand_of_shard, object_of_shard
 
 app = typer.Typer(add_completion=False)
 
@@ -25,6 +27,9 @@ def scene(
     scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,
     hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
     object: Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")] = None,
+    with_: Annotated[
+        list[str] | None, typer.Option("--with", help="Another object on the table: file or built-in; several times.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the grasps.")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="The scene shard to write.")] = Path("scenes.h5"),
     json: JsonFlag = False,
@@ -34,22 +39,34 @@ def scene(
     base = read_shard(grasps, kind="base")
     model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
     number = int(base.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
-    result: dict[str, Any] = dict(drop(obj, count=scenes, seed=number))
-    result |= transfer(model, _posture(base, "grasp"), _posture(base, "pregrasp"), result["scene/object_pose"])
+    others = [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in with_ or []]
+    result: dict[str, Any] = dict(
+        drop_together(obj, others, count=scenes, seed=number) if others else drop(obj, count=scenes, seed=number)
+    )
+    poses = result["scene/object_pose"]
+    beside = Neighbours(others, result["scene/neighbour_pose"]) if others else None
+    result |= transfer(model, _posture(base, "grasp"), _posture(base, "pregrasp"), poses, beside)
     seconds = perf_counter() - started
-    kept = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
-    data = write_shard("scene", result, {**kept, "seed": number, "device": "cpu", "seconds": round(seconds, 4)})
-    output.write_bytes(data)
+    attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
+    attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
+    if others:
+        attributes |= {"neighbours": [o.name for o in others], "neighbour_digests": [o.digest for o in others]}
+    output.write_bytes(write_shard("scene", result, attributes))
     valid, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
-    summary = {"file": str(output), "scenes": scenes, "grasps": total, "valid": valid, "seconds": round(seconds, 2)}
+    reasons = count_rejections(result["grasp/rejection"])
     if json:
-        emit(summary)
-    else:
-        typer.echo(f"{output}: {scenes} scenes, {valid} of {total} grasps clear of the table, {seconds:.1f} s")
+        emit(
+            {"file": str(output), "scenes": scenes, "grasps": total, "valid": valid, "rejected": reasons}
+            | {"seconds": round(seconds, 2)}
+        )
+        return
+    typer.echo(f"{output}: {scenes} scenes, {valid} of {total} grasps stay clear, {seconds:.1f} s")
+    if any(reasons.values()):
+        typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
 
 
 #: What every later shard says about the job it comes from.
-INHERITED = ("hand", "hand_digest", "object", "object_digest", "method", "fidelity", "batch", "root_link")
+INHERITED: Final = ("hand", "hand_digest", "object", "object_digest", "method", "fidelity", "batch", "root_link")
 
 
 def _posture(base: Shard, name: str) -> Posture:

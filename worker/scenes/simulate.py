@@ -5,6 +5,7 @@ Only the hull can touch a plane, so the hull is the whole collision model; mass 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -96,13 +97,19 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
         raise InputError(f"scenes and seed must not be negative; got {count} scenes, seed {seed}")
     table = _build(obj)
     rests = [_redo_until_rest(table, obj.name, (seed, scene)) for scene in range(count)]
-    reference = _reference_faces(_ByDigest(obj))
-    known = np.array([same_face(table.faces, rest.face, np.array(reference)).sum() for rest in rests])
     return {
         "scene/object_pose": np.array([rest.pose for rest in rests]).reshape(count, 7),
-        "scene/rest_probability": (known + 1.0) / (REFERENCE_DROPS + 1.0) if count else np.zeros(0),
+        "scene/rest_probability": rest_probability(obj, [rest.face for rest in rests]),
         "scene/drop_seconds": np.array([rest.seconds for rest in rests]),
     }
+
+
+def rest_probability(obj: ObjectModel, faces: Sequence[int]) -> Floats:
+    """(S,) share of `REFERENCE_DROPS` drops of the object alone, and the scene's own, that rest on each face."""
+    if not faces:
+        return np.zeros(0)
+    known, reference = resting_faces(obj), np.array(_reference_faces(_ByDigest(obj)))
+    return np.array([same_face(known, face, reference).sum() + 1.0 for face in faces]) / (REFERENCE_DROPS + 1.0)
 
 
 class _ByDigest:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
 
 from service.errors import ConflictError
 from service.shards import Shard
@@ -10,6 +14,10 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
+from worker.scenes.neighbours import Neighbours
+
+#: Neighbours are looked at and kept clear of, not grasped.
+NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
 
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
@@ -31,6 +39,28 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     obj = object_from_path(given or str(shard.attributes.get("object", "")), face_error_m=error)
     _check(shard, "object", obj.digest, given)
     return obj
+
+
+def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
+    """The other objects of a scene shard with their poses; None if the object is alone.
+
+    Raises:
+        NotFoundError: there is no such file or built-in.
+        ConflictError: they are not the objects the shard was made with.
+    """
+    names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
+    if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
+        return None
+    if given and len(given) != len(names):
+        raise ConflictError(f"the scene shard has {len(names)} neighbours; give each of them as --with, in their order")
+    objects = [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in given or names]
+    for obj, name, digest in zip(objects, names, digests, strict=True):
+        if obj.digest != digest:
+            raise ConflictError(
+                f"the scene shard's neighbour {name!r} has digest {digest[:12]}, but {obj.name!r} has "
+                f"{obj.digest[:12]}; give the files it was made with as --with"
+            )
+    return Neighbours(objects, np.asarray(shard["scene/neighbour_pose"], float))
 
 
 def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:

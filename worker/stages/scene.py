@@ -6,10 +6,11 @@ import numpy as np
 
 from service.domain import Stage, TaskMessage
 from service.names import shard_file
-from service.shards import read_shard
+from service.shards import Attribute, read_shard
 from worker.context import TaskContext
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
+from worker.scenes.clearance import count_rejections
 from worker.stages.assets import hand_of, object_of
 from worker.stages.output import Output, batch_seed
 
@@ -28,4 +29,6 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         for name in ("grasp", "pregrasp")
     )
     placed = transfer(hand, grasp, pregrasp, scenes["scene/object_pose"])
-    return Output({**scenes, **placed}, {"base_shard": message.inputs[0], "root_link": hand.root_link})
+    attributes: dict[str, Attribute] = {"base_shard": message.inputs[0], "root_link": hand.root_link}
+    rejected = count_rejections(np.asarray(placed["grasp/rejection"], np.uint8))
+    return Output({**scenes, **placed}, attributes, {"rejected": rejected})

@@ -17,7 +17,7 @@ from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.channels import parse_channels
 from worker.rendering.given import GivenCameras, read_cameras
 from worker.rendering.hands import DrawnHand
-from worker.rendering.views import Neighbours
+from worker.scenes import Neighbours
 
 SIZE = (96, 72)
 RADIUS = 0.04

@@ -109,3 +109,45 @@ def test_a_shard_of_another_kind_is_refused(base):
     result = CliRunner().invoke(rendering, ["render", str(base), "-o", str(base.with_name("none.h5"))])
     assert result.exit_code == 2
     assert "a scene shard is needed here" in result.output
+
+
+def test_render_writes_the_channels_cameras_and_hand_that_are_asked_for(base, scene_shard):
+    cameras, output = base.with_name("cameras.json"), base.with_name("more.h5")
+    cameras.write_text(
+        '{"width": 48, "height": 36, "intrinsics": {"fx": 50, "fy": 50, "cx": 24, "cy": 18},'
+        ' "cameras": [{"eye": [0.5, 0, 0.4], "target": [0, 0, 0.05]}]}'
+    )
+    arguments = ["render", str(scene_shard), "--channels", "all", "--cameras", str(cameras), "--with-hand", str(base)]
+    result = CliRunner().invoke(rendering, [*arguments, "--device", "cpu", "-o", str(output), "--json"])
+    assert result.exit_code == 0, result.output
+    views = read_shard(output, kind="views")
+    assert views["image/distance"].shape == (2, 36, 48)
+    assert views["image/rgb_hand"].shape == views["image/normals"].shape == (2, 36, 48, 3)
+    assert views["box/occlusion_ratio"].tolist() == [0, 0]
+    assert views["camera/intrinsics"][0, 0].tolist() == [50, 0, 24]
+    # The hand of the base shard is high above the table: its best grasp by epsilon is the last.
+    kept = read_shard(scene_shard, kind="scene")["grasp/base_index"][views["camera/hand_grasp"]]
+    assert kept.tolist() == [2, 2]
+
+
+def test_neighbours_travel_from_the_scene_to_the_labels_of_the_exported_pictures(base):
+    scene, views, folder = (base.with_name(name) for name in ("crowd.h5", "crowd_views.h5", "crowd"))
+    result = CliRunner().invoke(scenes, [str(base), "--scenes", "1", "--with", "mug", "-o", str(scene)])
+    assert result.exit_code == 0, result.output
+    arguments = ["render", str(scene), "--views", "1", "--width", "32", "--height", "24", "--device", "cpu"]
+    result = CliRunner().invoke(rendering, [*arguments, "-o", str(views)])
+    assert result.exit_code == 0, result.output
+    result = CliRunner().invoke(rendering, ["export", str(views), "--depth", "png", "-o", str(folder), "--json"])
+    assert result.exit_code == 0, result.output
+    # Labels, and per picture colour, depth, segmentation and what is known about it.
+    assert last_line(result)["files"] == 5
+    assert json.loads((folder / "labels.json").read_text())["3"] == {"class": "mug"}
+
+
+def test_another_neighbour_than_the_shards_is_refused(base):
+    scene = base.with_name("crowd_of_mugs.h5")
+    assert CliRunner().invoke(scenes, [str(base), "--scenes", "1", "--with", "mug", "-o", str(scene)]).exit_code == 0
+    arguments = ["render", str(scene), "--with", "bottle", "-o", str(base.with_name("none.h5"))]
+    result = CliRunner().invoke(rendering, arguments)
+    assert result.exit_code == 2
+    assert "neighbour 'mug' has digest" in result.output

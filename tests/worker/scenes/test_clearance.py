@@ -10,7 +10,7 @@ from tests.worker.models import two_finger_hand
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.scenes import transfer
-from worker.scenes.clearance import MARGIN_M, approach
+from worker.scenes.clearance import MARGIN_M, Rejection, approach
 from worker.transforms import apply, compose, invert, quat_from_axis_angle
 
 HAND = two_finger_hand()
@@ -83,6 +83,10 @@ def test_a_hand_that_sweeps_through_the_table_between_its_two_postures_is_caught
     # Pointing straight down the tips reach 0.079 below the root.
     assert result["grasp/table_clearance_m"][0] <= 0.075 - 0.079
     assert result["grasp/valid"][0] == 0
+    assert result["grasp/contact_table_clearance_m"][0] == pytest.approx(lowest_vertex(grasp, IDENTITY[0])[0], abs=1e-4)
+    assert result["grasp/rejection"][0] == Rejection.TABLE_ON_APPROACH
+    on_table = Posture(np.array([[0, 0, 0.0, 1, 0, 0, 0]]), np.zeros((1, 2)))
+    assert transfer(HAND, on_table, pregrasp, IDENTITY)["grasp/rejection"][0] == Rejection.TABLE_AT_CONTACT
 
 
 def test_many_grasps_give_what_each_gives_alone():

@@ -1,0 +1,111 @@
+"""Image files of views, read back by other readers than the writers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from service.errors import InputError
+from service.shards import Shard
+from worker.rendering.export import PNG_STEP_M, export_images
+
+H, W = 6, 8
+
+
+@pytest.fixture
+def views() -> Shard:
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.2, 0.9, (2, H, W)).astype(np.float32)
+    depth[0, 0, 0], depth[1, 0, 0] = np.inf, 9.0
+    eye = np.eye(4)
+    eye[:3, 3] = [0, 0, 0.5]
+    arrays = {
+        "camera/intrinsics": np.tile(np.array([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), (2, 1, 1)),
+        "camera/extrinsics": np.tile(eye, (2, 1, 1)),
+        "camera/scene_index": np.array([0, 1], np.int32),
+        "camera/eye": np.array([1, 2], np.uint8),
+        "camera/stereo_baseline_m": np.full(2, 0.06),
+        "image/rgb": rng.integers(0, 256, (2, H, W, 3), np.uint8),
+        "image/depth": depth,
+        "image/segmentation": rng.integers(0, 4, (2, H, W), np.uint8),
+        "image/distance": (depth * np.float32(1.1)),
+        "image/normals": rng.normal(size=(2, H, W, 3)).astype(np.float16),
+        "box/bounding_box_2d_tight": np.array([[1, 2, 3, 4], [np.nan] * 4], np.float32),
+        "box/bounding_box_2d_loose": np.ones((2, 4), np.float32),
+        "box/bounding_box_3d": np.ones((2, 8, 3), np.float32),
+        "box/occlusion_ratio": np.array([0.25, np.nan], np.float32),
+    }
+    return Shard("views", {"object": "mug", "neighbours": ["block"]}, arrays)
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.array(image)
+
+
+def plane(path: Path, channel: str) -> np.ndarray:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return np.array(file.channels()[channel].pixels)
+
+
+def test_colours_and_labels_come_back_exactly(views, tmp_path):
+    export_images(views, tmp_path)
+    for view in range(2):
+        np.testing.assert_array_equal(pixels(tmp_path / f"rgb_{view:04}.png"), views["image/rgb"][view])
+        labels = pixels(tmp_path / f"semantic_segmentation_{view:04}.png")
+        np.testing.assert_array_equal(labels, views["image/segmentation"][view])
+
+
+def test_exr_depth_and_normals_come_back_bit_for_bit(views, tmp_path):
+    export_images(views, tmp_path)
+    for view in range(2):
+        depth = plane(tmp_path / f"distance_to_image_plane_{view:04}.exr", "Z")
+        np.testing.assert_array_equal(depth, views["image/depth"][view])
+        np.testing.assert_array_equal(
+            plane(tmp_path / f"distance_to_camera_{view:04}.exr", "Z"), views["image/distance"][view]
+        )
+        for k, axis in enumerate("XYZ"):
+            half = plane(tmp_path / f"normals_{view:04}.exr", axis)
+            assert half.dtype == np.float16
+            np.testing.assert_array_equal(half, views["image/normals"][view][..., k])
+
+
+def test_png_depth_is_right_to_half_a_step_and_zero_for_nothing(views, tmp_path):
+    export_images(views, tmp_path, depth="png")
+    steps = pixels(tmp_path / "distance_to_image_plane_0000.png")
+    assert steps.dtype in (np.uint16, np.int32)
+    finite = np.isfinite(views["image/depth"][0])
+    error = steps * PNG_STEP_M - np.where(finite, views["image/depth"][0], 0.0)
+    # Half a step, and the rounding of float32.
+    assert np.abs(error).max() <= 0.5 * PNG_STEP_M + 1e-7
+    assert steps[0, 0] == 0
+    assert not list(tmp_path.glob("distance*.exr"))
+
+
+def test_what_is_too_far_for_sixteen_bits_is_the_largest_value(views, tmp_path):
+    export_images(views, tmp_path, depth="png")
+    assert pixels(tmp_path / "distance_to_image_plane_0001.png")[0, 0] == 65535
+
+
+def test_the_sidecar_tells_the_camera_and_what_is_not_seen_is_null(views, tmp_path):
+    export_images(views, tmp_path)
+    left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
+    assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
+    assert left["position"] == [0, 0, -0.5]
+    assert left["intrinsics"] == [[9, 0, 4], [0, 9, 3], [0, 0, 1]]
+    assert left["bounding_box_2d_tight"] == [1, 2, 3, 4]
+    assert left["occlusion_ratio"] == 0.25
+    assert right["bounding_box_2d_tight"] is None and right["occlusion_ratio"] is None
+    labels = json.loads((tmp_path / "labels.json").read_text())
+    assert [labels[k]["class"] for k in "0123"] == ["background", "table", "mug", "block"]
+
+
+def test_a_second_export_does_not_mix_with_the_first(views, tmp_path):
+    export_images(views, tmp_path)
+    with pytest.raises(InputError, match="exported views already"):
+        export_images(views, tmp_path)

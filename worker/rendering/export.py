@@ -1,0 +1,135 @@
+"""Views as image files: PNG, OpenEXR, and a JSON per picture with its camera and boxes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+from PIL import Image
+
+from service.errors import InputError
+from service.shards import Shard
+from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
+
+DepthFormat = Literal["exr", "png"]
+#: One step of a 16-bit depth PNG [m]: reaches 6.5 m; 0 is nothing.
+PNG_STEP_M: Final = 1e-4
+_EYES: Final = ("mono", "left", "right")
+#: Dataset and the name its files have in Replicator's BasicWriter.
+_DISTANCES: Final = {"image/depth": "distance_to_image_plane", "image/distance": "distance_to_camera"}
+
+
+def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> list[Path]:
+    """Writes every picture of a views shard as files named as Replicator's BasicWriter names them.
+
+    Per picture: `rgb_NNNN.png` (8 bits), `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf: nothing) or
+    `.png` (16 bits, steps of 0.1 mm, 0: nothing), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves) and
+    `view_NNNN.json`; where the shard has them `distance_to_camera_NNNN`, `normals_NNNN.exr` (half, X Y Z) and
+    `rgb_hand_NNNN.png`. Once: `labels.json`.
+
+    Args:
+        views: a views shard.
+        folder: where to; made if absent.
+        depth: format of distances.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: the folder cannot be written, or has such files already.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made: {error.strerror}; give another folder as --output") from None
+    if any(folder.glob("view_*.json")):
+        raise InputError(f"{folder} holds exported views already; give another folder as --output")
+    written = [_json(folder / "labels.json", _labels(views))]
+    for view in range(len(views["camera/eye"])):
+        written += _one(views, view, folder, depth)
+    return written
+
+
+def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path]:
+    def path(name: str, suffix: str) -> Path:
+        return folder / f"{name}_{view:04}.{suffix}"
+
+    written = [
+        _png(path("rgb", "png"), views["image/rgb"][view]),
+        _png(path("semantic_segmentation", "png"), views["image/segmentation"][view]),
+        _json(path("view", "json"), describe(views, view)),
+    ]
+    for dataset, name in _DISTANCES.items():
+        if dataset in views.arrays:
+            metres = np.asarray(views[dataset][view], np.float32)
+            write: Callable[[Path, NDArray[np.float32]], Path] = _exr_z if depth == "exr" else _png_metres
+            written.append(write(path(name, depth), metres))
+    if "image/normals" in views.arrays:
+        written.append(_exr(path("normals", "exr"), "XYZ", np.moveaxis(views["image/normals"][view], -1, 0)))
+    if "image/rgb_hand" in views.arrays:
+        written.append(_png(path("rgb_hand", "png"), views["image/rgb_hand"][view]))
+    return written
+
+
+def describe(views: Shard, view: int) -> dict[str, Any]:
+    """Camera and boxes of one picture; null where the object is not seen."""
+    height, width = views["image/rgb"].shape[1:3]
+    e = np.asarray(views["camera/extrinsics"][view], float)
+    said: dict[str, Any] = {
+        "scene": int(views["camera/scene_index"][view]),
+        "eye": _EYES[int(views["camera/eye"][view])],
+        "width": int(width),
+        "height": int(height),
+        "intrinsics": views["camera/intrinsics"][view].tolist(),
+        "extrinsics": e.tolist(),
+        "position": (-e[:3, :3].T @ e[:3, 3]).tolist(),
+        "stereo_baseline_m": float(views["camera/stereo_baseline_m"][view]),
+        "distortion": [],
+    }
+    for name in ("bounding_box_2d_tight", "bounding_box_2d_loose", "bounding_box_3d", "occlusion_ratio"):
+        if f"box/{name}" in views.arrays:
+            value = np.asarray(views[f"box/{name}"][view], float)
+            said[name] = value.tolist() if np.isfinite(value).all() else None
+    if "camera/hand_grasp" in views.arrays:
+        said["hand_grasp"] = int(views["camera/hand_grasp"][view])
+    return said
+
+
+def _labels(views: Shard) -> dict[str, dict[str, str]]:
+    names = {BACKGROUND: "background", TABLE: "table", OBJECT: str(views.attributes.get("object", "object"))}
+    neighbours = views.attributes.get("neighbours", [])
+    names |= {OBJECT + 1 + k: name for k, name in enumerate(neighbours if isinstance(neighbours, list) else [])}
+    return {str(label): {"class": name} for label, name in names.items()}
+
+
+def _png(path: Path, pixels: NDArray[Any]) -> Path:
+    Image.fromarray(np.ascontiguousarray(pixels)).save(path, compress_level=1)
+    return path
+
+
+def _png_metres(path: Path, metres: NDArray[np.float32]) -> Path:
+    steps = np.where(np.isfinite(metres), np.asarray(metres, float) / PNG_STEP_M, 0.0)
+    # What is too far for 16 bits says so by the largest value, not by wrapping round.
+    return _png(path, np.clip(np.rint(steps), 0, 65535).astype(np.uint16))
+
+
+def _exr_z(path: Path, metres: NDArray[np.float32]) -> Path:
+    return _exr(path, "Z", [metres])
+
+
+def _exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[Any]) -> Path:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
+    with OpenEXR.File(header, channels, 1) as file:
+        file.write(str(path))
+    return path
+
+
+def _json(path: Path, value: dict[str, Any]) -> Path:
+    path.write_text(json.dumps(value, allow_nan=False) + "\n")
+    return path

@@ -1,0 +1,251 @@
+"""Several objects on one table: dropped together, at rest each on its own, hands kept clear of the others.
+
+Collision shapes are the convex hulls. That is exact against the table and careful among objects: nothing is ever put
+into another one's hollow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from service.errors import InputError, MeshError
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.objects.model import ObjectModel
+from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
+from worker.scenes.simulate import (
+    DENSITY,
+    DROP_HEIGHT,
+    MAX_ATTEMPTS,
+    MAX_SETTLE_ANGLE,
+    REACH,
+    REST_SPEED,
+    REST_WINDOW_S,
+    TIMESTEP_S,
+    rest_probability,
+)
+from worker.transforms import compose, quat_rotate
+
+TIMEOUT_S: Final = 6.0
+#: Neighbours fall at this distance from the object, as a multiple of the sum of both bounding radii.
+RING: Final = (1.0, 1.25)
+#: Neighbours may come to rest this far from the middle of the table [m].
+NEIGHBOUR_REACH: Final = 0.4
+#: Laying an object flat lifts it by what MuJoCo's soft contacts let it sink; more means that it lay on something [m].
+MAX_LIFT: Final = 0.003
+#: Clearances beyond this are not told apart [m].
+FARTHEST_M: Final = 0.1
+MOST_NEIGHBOURS: Final = 8
+_SHAPES: Final = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The M other objects on the table."""
+
+    objects: Sequence[ObjectModel]
+    poses: Floats
+    """(S, M, 7) in the table frame."""
+
+
+def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count: int, seed: int) -> dict[str, Floats]:
+    """Let an object and its neighbours fall onto a table until all rest, `count` times.
+
+    The object falls in the middle, the neighbours around it. Drops in which something does not come to rest, rolls
+    away, or leans or lies on another object are redone. Scene i depends on the objects, the seed and i alone.
+
+    Args:
+        obj: the object that is grasped.
+        neighbours: M others.
+        count: number of scenes S.
+        seed: any non-negative integer.
+
+    Returns:
+        As `worker.scenes.simulate.drop`, and `scene/neighbour_pose` (S, M, 7).
+
+    Raises:
+        InputError: count or seed is negative, or there are too many neighbours.
+        MeshError: a hull is flat, or the objects never come to rest.
+    """
+    if count < 0 or seed < 0 or not 1 <= len(neighbours) <= MOST_NEIGHBOURS:
+        raise InputError(
+            f"scenes with neighbours need 1 to {MOST_NEIGHBOURS} of them and no negative number; "
+            f"got {count} scenes, {len(neighbours)} neighbours, seed {seed}"
+        )
+    heap = _Heap([obj, *neighbours])
+    found = [heap.redo_until_rest((seed, scene)) for scene in range(count)]
+    poses = np.array([poses for poses, _, _ in found]).reshape(count, 1 + len(neighbours), 7)
+    return {
+        "scene/object_pose": poses[:, 0],
+        "scene/neighbour_pose": poses[:, 1:],
+        "scene/rest_probability": rest_probability(obj, [face for _, face, _ in found]),
+        "scene/drop_seconds": np.array([seconds for _, _, seconds in found]),
+    }
+
+
+class _Heap:
+    """The compiled simulation of some objects above a table."""
+
+    def __init__(self, objects: Sequence[ObjectModel]) -> None:
+        self.objects = objects
+        self.faces: list[RestingFaces] = [resting_faces(obj) for obj in objects]
+        spec = mujoco.MjSpec()
+        spec.option.timestep = TIMESTEP_S
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        contact: dict[str, Any] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], **contact)
+        for k, obj in enumerate(objects):
+            body = spec.worldbody.add_body(name=str(k))
+            body.add_freejoint()
+            _add_hull(spec, body, str(k), obj, **contact)
+            body.explicitinertial = True
+            mass = DENSITY * obj.volume
+            inertia = mass * obj.inertia
+            body.mass, body.ipos = mass, obj.centre_of_mass
+            body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        try:
+            self.model = spec.compile()
+        except ValueError as error:
+            reason = str(error).splitlines()[0]
+            raise MeshError(f"these objects cannot be dropped: {reason}; check that each mesh has volume") from None
+        self.data = mujoco.MjData(self.model)
+
+    def redo_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
+        """Poses (1 + M, 7), the face the object rests on, and seconds."""
+        for attempt in range(MAX_ATTEMPTS):
+            if (found := self._drop_once(np.random.default_rng([*key, attempt]))) is not None:
+                return found
+        names = ", ".join(repr(obj.name) for obj in self.objects)
+        raise MeshError(f"{names} did not come to rest apart in any of {MAX_ATTEMPTS} drops; try fewer neighbours")
+
+    def _drop_once(self, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
+        mujoco.mj_resetData(self.model, self.data)
+        start = self._sample(rng)
+        if start is None:
+            return None
+        self.data.qpos[:] = start.ravel()
+        seconds = self._run()
+        return None if seconds is None else self._at_rest(seconds)
+
+    def _sample(self, rng: np.random.Generator) -> Floats | None:
+        """(1 + M, 7) release poses whose bounding balls lie apart; None if the neighbours found no room."""
+        quaternions = rng.normal(size=(len(self.objects), 4))
+        quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+        middles = [np.zeros(2)]
+        for obj in self.objects[1:]:
+            angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(*RING)
+            reach = share * (self.objects[0].radius + obj.radius)
+            middle = reach * np.array([np.cos(angle), np.sin(angle)])
+            others = zip(self.objects[1:], middles[1:], strict=False)
+            if any(np.linalg.norm(middle - m) < obj.radius + o.radius for o, m in others):
+                return None
+            middles.append(middle)
+        poses = np.concatenate([np.zeros((len(self.objects), 3)), quaternions], axis=1)
+        for pose, obj, middle in zip(poses, self.objects, middles, strict=True):
+            lowest = float(quat_rotate(pose[3:], obj.hull_vertices)[:, 2].min())
+            pose[:2] = middle - quat_rotate(pose[3:], obj.centre_of_mass)[:2]
+            pose[2] = rng.uniform(*DROP_HEIGHT) - lowest
+        return poses
+
+    def _run(self) -> float | None:
+        quiet, radii = 0, np.array([obj.radius for obj in self.objects])
+        centres = np.array([obj.centre_of_mass for obj in self.objects])
+        for step in range(round(TIMEOUT_S / TIMESTEP_S)):
+            mujoco.mj_step(self.model, self.data)
+            velocity = self.data.qvel.reshape(-1, 6)
+            quaternion = self.data.qpos.reshape(-1, 7)[:, 3:]
+            linear = velocity[:, :3] + quat_rotate(quaternion, np.cross(velocity[:, 3:], centres))
+            speed = np.linalg.norm(linear, axis=1) + radii * np.linalg.norm(velocity[:, 3:], axis=1)
+            quiet = quiet + 1 if speed.max() < REST_SPEED and self.data.ncon >= len(self.objects) else 0
+            if quiet >= round(REST_WINDOW_S / TIMESTEP_S):
+                return (step + 1) * TIMESTEP_S
+        return None
+
+    def _at_rest(self, seconds: float) -> tuple[Floats, int, float] | None:
+        """The poses laid flat; None where something leans, lies on another, rolled away or would overlap."""
+        flat, first = [], -1
+        for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
+            pose[3:] /= np.linalg.norm(pose[3:])
+            face, angle = settle(self.faces[k], pose[3:])
+            laid = lay_flat(self.faces[k], face, pose)
+            middle = laid[:3] + quat_rotate(laid[3:], obj.centre_of_mass)
+            lift = abs(float(middle[2] - (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[2]))
+            if angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH):
+                return None
+            flat.append(laid)
+            first = face if k == 0 else first
+        self.data.qpos[:] = np.concatenate(flat)
+        mujoco.mj_kinematics(self.model, self.data)
+        pairs = [(a, b) for a in range(1, len(flat) + 1) for b in range(a + 1, len(flat) + 1)]
+        if any(mujoco.mj_geomDistance(self.model, self.data, a, b, FARTHEST_M, None) < 0 for a, b in pairs):
+            return None
+        return np.array(flat), first, seconds
+
+
+def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, neighbours: Neighbours) -> Floats:
+    """Signed distance of the hand from the neighbours' hulls [m], at most `FARTHEST_M`; negative: it reaches in.
+
+    Args:
+        hand: the hand; its convex pieces count.
+        path: P postures in the object frame.
+        object_pose: (S, 7) of the object in the table frame.
+        neighbours: what to stay clear of.
+
+    Returns:
+        (S, P).
+    """
+    spec = mujoco.MjSpec()
+    for k, piece in enumerate(hand.pieces):
+        _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)
+    for k, obj in enumerate(neighbours.objects):
+        _add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    pieces, count = len(hand.pieces), len(neighbours.objects)
+    body = np.array([piece.body for piece in hand.pieces])
+    in_object = body_poses(hand, path.hand_pose, path.joint_positions)[:, body]
+    clearance = np.full((len(object_pose), len(path)), FARTHEST_M)
+    for s, pose in enumerate(object_pose):
+        for p, bodies in enumerate(compose(pose, in_object)):
+            placed = np.concatenate([bodies, neighbours.poses[s]])
+            data.mocap_pos[:], data.mocap_quat[:] = placed[:, :3], placed[:, 3:]
+            mujoco.mj_kinematics(model, data)
+            gap = np.linalg.norm(data.geom_xpos[:pieces, None] - data.geom_xpos[None, pieces:], axis=-1)
+            gap -= model.geom_rbound[:pieces, None] + model.geom_rbound[None, pieces:]
+            for a, b in np.argwhere(gap < clearance[s, p]):
+                distance = mujoco.mj_geomDistance(model, data, int(a), pieces + int(b), FARTHEST_M, None)
+                clearance[s, p] = min(clearance[s, p], distance)
+    assert model.ngeom == pieces + count
+    return clearance
+
+
+def _add_hull(spec: Any, body: Any, name: str, obj: ObjectModel, **options: Any) -> None:
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert = np.asarray(obj.hull_vertices, np.float32).ravel()
+    mesh.userface = np.asarray(obj.hull_faces, np.int32).ravel()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **options)
+
+
+def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
+    if piece.kind not in _SHAPES:
+        mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+        mesh.uservert = np.asarray(piece.vertices, np.float32).ravel()
+        mesh.userface = np.asarray(piece.faces, np.int32).ravel()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+        return
+    size = [0.5 * x for x in piece.size] if piece.kind == "box" else [piece.size[0], *(0.5 * x for x in piece.size[1:])]
+    body.add_geom(
+        type=_SHAPES[piece.kind], size=[*size, 0, 0, 0][:3], pos=piece.pose[:3].tolist(), quat=piece.pose[3:].tolist()
+    )
