@@ -118,7 +118,7 @@ class Simulation:
         self.device = hand.device
         self.dofs, self.bodies, self.count = hand.model.dofs, hand.model.bodies, len(points)
         self._graph: Any = None
-        self._commands: list[Any] = []
+        self._commands: list[tuple[str, Any]] = []
         with wp.ScopedDevice(self.device):
             self._upload_points(points, self_points)
             self._allocate()
@@ -224,7 +224,12 @@ class Simulation:
         self._graph = None
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
-        self._commands.append(wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True))
+        command = wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
+        self._commands.append((kernel.key.rpartition(".")[2], command))
+
+    def commands(self) -> list[tuple[str, Any]]:
+        """Name and launch of each kernel of what was recorded, in order."""
+        return list(self._commands)
 
     def _record_kinematics(self) -> None:
         B = self.capacity
@@ -348,5 +353,5 @@ class Simulation:
             self._launch_all()
 
     def _launch_all(self) -> None:
-        for command in self._commands:
+        for _, command in self._commands:
             command.launch()

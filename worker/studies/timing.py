@@ -28,7 +28,7 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
         seed: of the starts.
     """
     probe = pair.simulation(pair.coarse, count * len(RETREATS))
-    state = sample_starts(pair.hand.model, pair.obj.model, probe, seed=seed, batch=0, indices=range(count))
+    state = sample_starts(pair.hand.model, pair.obj.model, probe, seed=seed, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, points, schedule in (
         ("coarse", pair.coarse, coarse_schedule(fidelity)),
