@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from service.domain import FIDELITIES
@@ -31,8 +30,10 @@ SIZE: Final = (300, 225)
 SAMPLES: Final = 32
 #: Grasps tried in each of so many scenes, in so many rounds, until one stays clear of the table.
 GRASPS: Final = 32
-SCENES: Final = 8
+SCENES: Final = 24
 ROUNDS: Final = 4
+#: Cosine of the elevation of the camera that looks past a neighbour.
+_LEVEL: Final = 0.94
 _VIEW: Final[dict[str, Any]] = {"stereo": False, "width": SIZE[0], "height": SIZE[1], "samples": SAMPLES}
 
 
@@ -65,7 +66,7 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
             obj, poses, views=1, seed=seed + k, device=device, extras=Extras(channels=("normals",)), **options
         )
         rows.append(scene_cells(seen))
-        names.append(obj.name)
+        names.append([obj.name])
     return label_page(
         rows, ["left", "right", "depth", "normals", "segmentation", "boxes"], names,
         title="What the cameras see", subtitle="one scene per object; stereo pair with 60 mm baseline",
@@ -74,22 +75,24 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
 
 def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int, say: Say) -> bytes:
     rows, names = [], []
-    for obj in objects:
-        cells = []
+    for k, obj in enumerate(objects):
+        cells, below = [], []
         for hand in hands:
             drawn, pose, kept, tried = _fitting(hand, obj, device, seed)
             say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps stay clear")
             camera = _camera(drawn, obj, pose)
             seen = render(
-                obj, pose[None], views=1, seed=seed, device=device,
+                obj, pose[None], views=1, seed=seed + k, device=device,
                 extras=Extras(cameras=GivenCameras(extrinsics=camera[None]), drawn=drawn), **_VIEW,
             )  # fmt: skip
             cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
+            below.append(f"{obj.name}: {kept} of {tried} fit")
         rows.append(cells)
-        names.append(obj.name)
+        names.append(below)
     return label_page(
         rows, [hand.name for hand in hands], names,
-        title="Grasps on the table", subtitle="for each pair a grasp whose hand stays clear of the table all the way",
+        title="Grasps on the table",
+        subtitle="a hand that stays clear of the table all the way; an object alone: none of those tried fits",
     )  # fmt: skip
 
 
@@ -145,25 +148,27 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
         first, *others = [objects[(k + j) % len(objects)] for j in range(min(4, len(objects)))]
         scene = drop_together(first, others, count=1, seed=seed + k)
         poses, beside = scene["scene/object_pose"], Neighbours(others, scene["scene/neighbour_pose"])
-        extras = Extras(channels=("normals", "occlusion"), cameras=_wide(poses, first, beside), neighbours=beside)
+        extras = Extras(channels=("normals", "occlusion"), cameras=_past(poses, first, beside), neighbours=beside)
         options: dict[str, Any] = {**_VIEW, "stereo": True}
         seen = render(first, poses, views=1, seed=seed + k, device=device, extras=extras, **options)
         rows.append(scene_cells(seen))
         hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
-        names.append(f"{first.name}, {100 * hidden:.0f} % hidden")
+        names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])
     return label_page(
         rows, ["left", "right", "depth", "normals", "segmentation", "boxes"], names,
         title="Several objects", subtitle="labels 3, 4, ... are the neighbours; boxes are the grasped object's",
     )  # fmt: skip
 
 
-def _wide(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
-    """A camera that has all objects in its picture."""
-    placed = zip([obj, *beside.objects], [poses[0], *beside.poses[0]], strict=True)
-    points: NDArray[np.float64] = np.concatenate([apply(pose, o.hull_vertices) for o, pose in placed])
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    radius = float(np.linalg.norm(points - centre, axis=1).max())
-    direction = np.array([0.75, 0.3, 0.59]) / np.linalg.norm([0.75, 0.3, 0.59])
+def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
+    """A camera that looks past the nearest neighbour at the object, so that something is hidden."""
+    middles = np.stack([apply(pose, o.centre_of_mass) for o, pose in zip(beside.objects, beside.poses[0], strict=True)])
+    middle = apply(poses[0], obj.centre_of_mass)
+    nearest = int(np.argmin(np.linalg.norm(middles - middle, axis=1)))
+    across = (middles[nearest] - middle)[:2]
+    direction = np.append(_LEVEL * across / np.linalg.norm(across), np.sqrt(1 - _LEVEL**2))
+    centre = 0.5 * (middle + middles[nearest])
+    radius = 0.5 * float(np.linalg.norm(across)) + max(obj.radius, beside.objects[nearest].radius)
     return GivenCameras(
-        extrinsics=look_at(centre + distance_to_fill(radius, FIELD_OF_VIEW, 1.1) * direction, centre)[None]
+        extrinsics=look_at(centre + distance_to_fill(radius, FIELD_OF_VIEW, 1.0) * direction, centre)[None]
     )

@@ -127,18 +127,24 @@ def scene_cells(views: Arrays) -> list[Image.Image]:
 
 
 def label_page(
-    rows: Sequence[Sequence[Image.Image]], heads: Sequence[str], names: Sequence[str], *, title: str, subtitle: str = ""
+    rows: Sequence[Sequence[Image.Image]],
+    heads: Sequence[str],
+    names: Sequence[Sequence[str]],
+    *,
+    title: str,
+    subtitle: str = "",
 ) -> bytes:
-    """PNG of a table of pictures with a head above each column and a name below each row's first picture."""
+    """PNG of a table of pictures: a head above each column, names below the first pictures of each row."""
     width, height = rows[0][0].size
     page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
         type_.text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, type_.QUIET)
-    for row, (cells, name) in enumerate(zip(rows, names, strict=True)):
+    for row, (cells, below) in enumerate(zip(rows, names, strict=True)):
         y = top + row * (height + _NAME + GAP)
         for column, cell in enumerate(cells):
             page.paste(cell, (MARGIN + column * (width + GAP), y))
-        type_.text(draw, (MARGIN, y + height + _NAME - 4), name, 14, type_.INK)
+        for column, name in enumerate(below):
+            type_.text(draw, (MARGIN + column * (width + GAP), y + height + _NAME - 4), name, 14, type_.INK)
     return type_.png(page)
 
 

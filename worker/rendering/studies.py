@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
 from worker.devices import Device
+
+if TYPE_CHECKING:
+    from worker.objects.model import ObjectModel
 
 app = typer.Typer(add_completion=False)
 
@@ -43,7 +47,9 @@ def bench_render(
 @app.command(epilog="graspd gallery --object mug --object banana.stl -o docs/images/scenes")
 @reporting_errors
 def gallery(
-    object: Annotated[list[str] | None, typer.Option(help="A mesh or a built-in object; several times.")] = None,
+    object: Annotated[
+        list[str] | None, typer.Option(help="A built-in object, a mesh, or NAME=MESH; several times.")
+    ] = None,
     hand: Annotated[list[str] | None, typer.Option(help="A URDF or a built-in hand; several times.")] = None,
     device: Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")] = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
@@ -52,18 +58,25 @@ def gallery(
 ) -> None:
     """Pages of what the cameras see, of hands in grasps that fit on the table, and of crowded tables."""
     from worker.hands.load import hand_from_path
-    from worker.objects.prepare import object_from_path
     from worker.rendering.gallery import paint
 
     files = paint(
         [hand_from_path(name) for name in hand or ["allegro", "barrett", "shadow"]],
-        [object_from_path(name, face_error_m=3e-4) for name in object or ["mug", "bottle", "block"]],
+        [_object(name) for name in object or ["mug", "bottle", "block"]],
         output, device=Device(device).resolve(), seed=seed, say=lambda line: typer.echo(line, err=True),
     )  # fmt: skip
     if json:
         emit({"files": [str(file) for file in files]})
     else:
         typer.echo("\n".join(map(str, files)))
+
+
+def _object(text: str) -> ObjectModel:
+    from worker.objects.prepare import object_from_path
+
+    name, _, path = text.rpartition("=")
+    obj = object_from_path(path, face_error_m=3e-4)
+    return replace(obj, name=name) if name else obj
 
 
 def _size(text: str) -> tuple[int, int]:

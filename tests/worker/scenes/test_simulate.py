@@ -131,6 +131,34 @@ def test_bricks_rest_on_each_pair_of_faces_as_often_as_the_quasi_static_theory_s
     assert chisquare(counts, 300 * expected / expected.sum()).pvalue > 0.01
 
 
+def hull_of(points) -> trimesh.Trimesh:
+    return trimesh.convex.convex_hull(np.array(points, float))
+
+
+CONVEX = {
+    "prism": hull_of([(x, y, z) for x, y in [(0, 0), (0.06, 0), (0.02, 0.05)] for z in (0, 0.05)]),
+    "frustum": hull_of([(x * w, y * w, z) for w, z in ((0.035, 0), (0.022, 0.05)) for x in (-1, 1) for y in (-1, 1)]),
+    "tetrahedron": hull_of([(0, 0, 0), (0.07, 0, 0), (0.01, 0.06, 0), (0.02, 0.02, 0.055)]),
+    "hexagonal": hull_of(
+        [(0.03 * np.cos(a), 0.03 * np.sin(a), z) for a in np.arange(6) * np.pi / 3 for z in (0, 0.05)]
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONVEX)
+def test_convex_objects_rest_on_each_face_as_often_as_the_quasi_static_theory_says(name):
+    mesh = CONVEX[name]
+    poses = drop(object_from_mesh(mesh, name), count=300, seed=0)["scene/object_pose"]
+    down = quat_rotate(poses[:, 3:] * np.array([1, -1, -1, -1]), np.array([0.0, 0, -1]))
+    transforms, probability = trimesh.poses.compute_stable_poses(mesh, sigma=0.0, n_samples=1)
+    agreement = down @ -transforms[:, 2, :3].T
+    # Every drop ends on one of trimesh's stable faces.
+    assert agreement.max(axis=1).min() > 1 - 1e-6
+    counts = np.bincount(np.argmax(agreement, axis=1), minlength=len(probability))
+    assert chisquare(counts, 300 * probability / probability.sum()).pvalue > 0.01
+
+
 def test_no_scenes_give_empty_arrays():
     result = drop(bracket(), count=0, seed=0)
     assert result["scene/object_pose"].shape == (0, 7)
