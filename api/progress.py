@@ -14,6 +14,8 @@ from service.index.views import JobView, StageProgress, TaskView
 
 #: A shorter look at a task says more about when its progress was reported than about its speed.
 _LEAST_SPAN_S: Final = 1.0
+#: A task that has only begun spent its time on loading, not on its work.
+_LEAST_SHARE: Final = 0.03
 _KEPT_TASKS: Final = 4096
 
 
@@ -36,7 +38,7 @@ class Paces:
             since, start = self._first.setdefault((task.id, task.attempt), (now, share))
             while len(self._first) > _KEPT_TASKS:
                 self._first.popitem(last=False)
-        if now - since < _LEAST_SPAN_S or share <= start:
+        if now - since < _LEAST_SPAN_S or share - start < _LEAST_SHARE:
             return None
         return (share - start) / (now - since)
 
