@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from service.digests import shard_id
+from service.domain import JobRequest, Stage
 from service.errors import InputError
 from service.shards import check_columns
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -206,3 +208,13 @@ def test_channels_are_named_in_any_order_and_kept_in_one():
     assert parse_channels([""]) == ()
     with pytest.raises(InputError, match="unknown channel 'flow'"):
         parse_channels(["flow"])
+
+
+def test_a_jobs_channels_move_its_pictures_and_nothing_else():
+    def address(stage: Stage, *channels: str) -> str:
+        request = JobRequest(hand="h", object="o", scenes=1, views=1, channels=channels)
+        return shard_id(stage, request=request, hand_digest="a", object_digest="b", batch=0, count=1)
+
+    assert address(Stage.RENDER, "occlusion", "distance") == address(Stage.RENDER, "distance", "occlusion")
+    assert address(Stage.RENDER, "distance") != address(Stage.RENDER)
+    assert address(Stage.SCENE, "distance") == address(Stage.SCENE)
