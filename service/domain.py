@@ -62,7 +62,7 @@ class Fidelity(Model):
     name: str = "custom"
     starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp, of which the best is kept")
     finalists: int = Field(2, ge=1, le=64, description="of these, hands that enter the fine phase")
-    coarse_points: int = Field(400, ge=16, le=8192, description="hand surface points in the first phase")
+    coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
     fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
     object_points: int = Field(4000, ge=16, le=65536, description="object surface points tested against the links")
     face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
@@ -81,12 +81,12 @@ class Fidelity(Model):
 
 FIDELITIES: Final[dict[str, Fidelity]] = {
     "draft": Fidelity(
-        name="draft", starts=2, finalists=1, coarse_points=256, fine_points=800, object_points=2000, face_error_m=1e-3,
+        name="draft", starts=2, finalists=1, coarse_points=200, fine_points=800, object_points=2000, face_error_m=1e-3,
         coarse_iterations=60, fine_iterations=20, polish_iterations=6,
     ),
     "standard": Fidelity(name="standard"),
     "fine": Fidelity(
-        name="fine", starts=6, finalists=3, coarse_points=600, fine_points=4000, object_points=8000, face_error_m=1e-4,
+        name="fine", starts=6, finalists=3, coarse_points=400, fine_points=4000, object_points=8000, face_error_m=1e-4,
         coarse_iterations=120, fine_iterations=60, polish_iterations=15,
     ),
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -153,6 +153,14 @@ class DeviceObject:
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             bvh = wp.Bvh(centred, centred)
         return cls(model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh)
+
+    def thinned(self, count: int) -> DeviceObject:
+        """The same object with its first `count` samples: farthest-point samples are even at any length."""
+        if count >= len(self.samples):
+            return self
+        with wp.ScopedDevice(self.device):
+            samples = wp.clone(self.samples[:count])
+            return replace(self, samples=samples, bvh=wp.Bvh(samples, samples))
 
 
 def _add_field(skin: Any, obj: ObjectModel, cell: float) -> None:

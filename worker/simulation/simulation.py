@@ -23,6 +23,10 @@ Floats = NDArray[np.float64]
 REFERENCE_POINTS: Final = 800
 #: Weight of one object sample is 1 at this many samples.
 REFERENCE_SAMPLES: Final = 2000
+#: Weight of one hand point against other links is 1 at this many.
+REFERENCE_SELF_POINTS: Final = 1000
+#: Largest dilation a schedule may ask for [m].
+MAX_DILATION: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,7 @@ class Simulation:
         self.point_position = wp.array(points.position, dtype=wp.vec3)
         self.point_weight = wp.array(weight, dtype=wp.float32)
         self.body_points = _body_points(self_points, self.bodies)
+        self.self_scale = REFERENCE_SELF_POINTS / max(len(self_points), 1)
 
     def _allocate(self) -> None:
         B, N, L, D = self.capacity, self.count, self.bodies, self.dofs
@@ -182,6 +187,7 @@ class Simulation:
         physics.leak_length = self.options.leak_length
         physics.one_sided = int(self.options.one_sided)
         physics.step = self.options.step
+        physics.radius = self.obj.model.radius + self.options.band + MAX_DILATION
         return physics
 
     def set_state(self, state: HandState, active: NDArray[np.bool_] | None = None) -> None:
@@ -213,7 +219,13 @@ class Simulation:
         )
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Upload the per-iteration tables and start counting at 0."""
+        """Upload the per-iteration tables and start counting at 0.
+
+        Raises:
+            ValueError: a dilation above `MAX_DILATION`.
+        """
+        if len(schedule) and schedule.dilation.max() > MAX_DILATION:
+            raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
         with wp.ScopedDevice(self.device):
             self.dilation = wp.array(schedule.dilation, dtype=wp.float32)
             self.penetration_weight = wp.array(schedule.penetration, dtype=wp.float32)
@@ -277,8 +289,8 @@ class Simulation:
         )  # fmt: skip
         self._launch(
             pieces.pieces_in_pieces, (B, len(self.hand.model.pieces)),
-            [self.hand.pieces, self.body_points, o.self_margin, self.active, self.iteration, self.self_weight,
-             self.body_p, self.body_q, self.force, self.torque, self.self_depth],
+            [self.hand.pieces, self.body_points, self.self_scale, o.self_margin, self.active, self.iteration,
+             self.self_weight, self.body_p, self.body_q, self.force, self.torque, self.self_depth],
         )  # fmt: skip
         self._launch(
             penalties.points_to_bodies, (B, self.count),

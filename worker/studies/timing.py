@@ -28,22 +28,22 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
         seed: of the starts.
     """
     probe = pair.simulation(pair.coarse, count * len(RETREATS))
-    state = sample_starts(pair.hand.model, pair.obj.model, probe, seed=seed, batch=0, indices=range(count), each=1)
+    state = sample_starts(pair.hand.model, pair.fine.obj.model, probe, seed=seed, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
-    for name, points, schedule in (
+    for name, side, schedule in (
         ("coarse", pair.coarse, coarse_schedule(fidelity)),
         ("fine", pair.fine, fine_schedule(fidelity)),
     ):
         if len(schedule) < 2:
             continue
-        simulation = pair.simulation(points, count)
+        simulation = pair.simulation(side, count)
         times, state = _timed(simulation, state, schedule, fidelity)
         total = sum(times.values())
         phases[name] = {
             "ms_per_iteration": round(1e3 * total, 3),
-            "points": len(points),
+            "points": len(side.points),
             "share": {kernel: round(t / total, 4) for kernel, t in sorted(times.items(), key=lambda item: -item[1])},
-            "queries_per_second": round(count * len(points) / times["gather"]) if times.get("gather") else None,
+            "queries_per_second": round(count * len(side.points) / times["gather"]) if times.get("gather") else None,
         }
     return phases
 

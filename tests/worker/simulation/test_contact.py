@@ -37,6 +37,7 @@ def physics(world: World, *, leak: float = 0.0, one_sided: bool = True) -> Any:
     out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
     out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
     out.leak, out.leak_length, out.one_sided, out.step = leak, 0.02, int(one_sided), world.step
+    out.radius = 0.2
     return out
 
 

@@ -14,7 +14,7 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance, sample_surface
 from worker.simulation.sampling import object_samples
-from worker.simulation.simulation import REFERENCE_SAMPLES, HandState, LossOptions
+from worker.simulation.simulation import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, HandState, LossOptions
 from worker.transforms import apply, invert, quat_from_axis_angle, quat_multiply
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
@@ -92,7 +92,7 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
             other = np.array([counts[piece.body, int(body)] for body in points.body])
             depth = -piece_distance(piece, apply(invert(poses[piece.body]), world[other]))
             total += float((np.maximum(depth, 0) ** 2).sum())
-        return total
+        return total * REFERENCE_SELF_POINTS / len(points)
 
     rng = np.random.default_rng(0)
     draws = hand.lower + rng.random((60, 1, hand.dofs)) * (hand.upper - hand.lower)

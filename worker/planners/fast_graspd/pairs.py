@@ -19,25 +19,35 @@ from worker.simulation.simulation import LossOptions, Simulation
 
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005
-#: Hand points tested against other links.
-SELF_POINTS: Final = 1000
+#: Hand points tested against other links, and object samples tested against links, in the coarse phase and the fine.
+COARSE_SELF_POINTS: Final = 400
+FINE_SELF_POINTS: Final = 1000
+COARSE_SAMPLES: Final = 1500
 #: Pairs kept on the device.
 KEPT: Final = 4
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A hand and an object on a device with the hand's point sets for each phase."""
+class Side:
+    """How finely a phase sees the hand and the object."""
 
-    hand: DeviceHand
-    obj: DeviceObject
-    coarse: SurfacePoints
-    fine: SurfacePoints
+    points: SurfacePoints
     own: SurfacePoints
-    options: LossOptions
+    """Points tested against other links."""
+    obj: DeviceObject
 
-    def simulation(self, points: SurfacePoints, capacity: int) -> Simulation:
-        return Simulation(self.hand, self.obj, points, self.own, capacity=capacity, options=self.options)
+
+@dataclass(frozen=True)
+class Pair:
+    """A hand and an object on a device, as each phase sees them."""
+
+    coarse: Side
+    fine: Side
+    options: LossOptions
+    hand: DeviceHand
+
+    def simulation(self, side: Side, capacity: int) -> Simulation:
+        return Simulation(self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options)
 
 
 _pairs: OrderedDict[tuple[str, str, str, str], Pair] = OrderedDict()
@@ -53,13 +63,20 @@ def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) 
             return _pairs[key]
         kernels.load(device)
         samples = object_samples(obj, fidelity.object_points)
+        whole = DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL)
         pair = Pair(
-            hand=DeviceHand.create(hand, device),
-            obj=DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL),
-            coarse=sample_surface(hand, fidelity.coarse_points),
-            fine=sample_surface(hand, fidelity.fine_points),
-            own=sample_surface(hand, SELF_POINTS),
+            coarse=Side(
+                points=sample_surface(hand, fidelity.coarse_points),
+                own=sample_surface(hand, COARSE_SELF_POINTS),
+                obj=whole.thinned(COARSE_SAMPLES),
+            ),
+            fine=Side(
+                points=sample_surface(hand, fidelity.fine_points),
+                own=sample_surface(hand, FINE_SELF_POINTS),
+                obj=whole,
+            ),
             options=loss_options(fidelity),
+            hand=DeviceHand.create(hand, device),
         )
         _pairs[key] = pair
         while len(_pairs) > KEPT:

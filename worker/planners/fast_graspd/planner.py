@@ -120,7 +120,7 @@ def _cut(count: int, threads: int, device: str) -> list[range]:
 
 
 def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
-    n, hand, obj = len(part.indices), pair.hand.model, pair.obj.model
+    n, hand, obj = len(part.indices), pair.hand.model, pair.fine.obj.model
     finalists = min(fidelity.finalists, fidelity.starts)
     probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
     state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices, each=fidelity.starts)

@@ -35,6 +35,7 @@ class Physics:
     leak_length: wp.float32  # [m]
     one_sided: wp.int32
     step: wp.float32  # |s0| of a moving simulation [m]
+    radius: wp.float32  # no point taking part is farther from the centre of mass [m]
 
 
 @wp.func
@@ -161,8 +162,12 @@ def direct(
         c0 = float(0.0)
         c1 = wp.vec3(0.0)
         c2 = wp.mat33(0.0)
+        # No point moves farther than this, so points farther from the surface need no look.
+        motion = wp.length(wp.vec3(s[0], s[1], s[2])) + wp.length(wp.vec3(s[3], s[4], s[5])) * physics_in.radius
         for i in range(count):
             rho = distance_in[b, i]
+            if rho - r > motion:
+                continue
             n = normal_in[b, i]
             p = point_in[b, i]
             u = point_motion(s, p)

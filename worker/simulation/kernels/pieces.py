@@ -178,6 +178,7 @@ def may_touch(
 def pieces_in_pieces(
     pieces_in: Pieces,
     points_in: BodyPoints,
+    point_weight_in: wp.float32,
     margin_in: wp.float32,
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
@@ -198,7 +199,7 @@ def pieces_in_pieces(
     other = pieces_in.body[piece]
     q = body_q_in[b, other] * pieces_in.pose_q[piece]
     p = body_p_in[b, other] + wp.quat_rotate(body_q_in[b, other], pieces_in.pose_p[piece])
-    weight = 2.0 * weight_in[iteration_in[0]]
+    weight = 2.0 * point_weight_in * weight_in[iteration_in[0]]
     half = pieces_in.half[piece] + wp.vec3(margin_in, margin_in, margin_in)
     for own in range(body_p_in.shape[1]):
         if may_touch(pieces_in, points_in, piece, own, b, margin_in, body_p_in, body_q_in):
