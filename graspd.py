@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any, Final
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from service.version import PACKAGE_VERSION
 
@@ -25,8 +25,8 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("cancel", "api.commands", "Jobs", "Stop a job; what is written stays."),
     ("retry", "api.commands", "Jobs", "Run again what failed or was cancelled."),
     ("logs", "api.commands", "Jobs", "Failed attempts of a job, with their reasons."),
-    ("hands", "api.commands", "Jobs", "List, show and add hands."),
-    ("objects", "api.commands", "Jobs", "List, show and add objects."),
+    ("hands", "api.commands", "Jobs", "Check, add, list and show hands."),
+    ("objects", "api.commands", "Jobs", "Check, add, list and show objects."),
     ("api", "api.commands", "Parts of the service", "The HTTP API and the dashboard."),
     ("keeper", "service.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
     ("worker", "worker.commands", "Parts of the service", "One worker on one device."),
@@ -43,6 +43,12 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("bench-render", "worker.rendering.studies", "Studies", "Images per second, and where the time goes."),
 )
 
+#: Group of one room, command in it, module of the room that has it, help.
+JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
+    ("hands", "check", "worker.hands.commands", "Say whether a hand can be used, and what was guessed about it."),
+    ("objects", "check", "worker.objects.commands", "Say whether a mesh can be used, and what was repaired."),
+)
+
 
 class LazyGroup(TyperGroup):
     """A group whose overview needs no import: a command's room is imported when the command is called."""
@@ -53,11 +59,27 @@ class LazyGroup(TyperGroup):
         return name, load(module, name, ctx) if module and name else command, rest
 
 
+class Deferred(TyperCommand):
+    """Stands for a command of another room in a group; that room is imported when the command is called."""
+
+    def __init__(self, name: str, module: str, help: str) -> None:
+        super().__init__(name, help=help)
+        self.module = module
+
+    def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
+        return load(self.module, str(self.name)).make_context(info_name, args, parent, **extra)
+
+
 def load(module: str, name: str, ctx: Any = None) -> Any:
     """The command of a room, imported now."""
     group: Any = typer.main.get_command(import_module(module).app)
     # A Typer with a single command is that command itself, not a group.
-    return group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
+    command = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
+    if isinstance(command, TyperGroup):
+        for parent, child, room, text in JOINED:
+            if parent == name:
+                command.add_command(Deferred(child, room, text))
+    return command
 
 
 def build() -> typer.Typer:

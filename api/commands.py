@@ -139,7 +139,7 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
 
 def asset_commands(kind: AssetKind) -> typer.Typer:
     """`graspd hands ...` or `graspd objects ...`."""
-    group = typer.Typer(no_args_is_help=True, help=f"List, show and add {kind.value}s.")
+    group = typer.Typer(no_args_is_help=True, help=f"Check, add, list and show {kind.value}s.")
 
     @group.command("list")
     @reporting_errors

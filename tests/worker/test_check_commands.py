@@ -1,53 +1,122 @@
-"""`hands check` and `objects check`: the JSON contract and the exit codes."""
+"""`graspd hands check` and `graspd objects check` through the entry point: the JSON contract and the exit codes."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner, Result
+from PIL import Image
+from typer.testing import CliRunner
 
-from service.errors import InputError
-from worker.hands.commands import check as check_hand
-from worker.hands.commands import hand_options
-from worker.objects.commands import check as check_object
+from graspd import build
 
-
-def run(command: object, *arguments: str) -> Result:
-    app = typer.Typer()
-    app.command()(command)  # type: ignore[type-var]
-    return CliRunner().invoke(app, list(arguments))
+#: Colours of the arrow on the palm and of the prepared mesh: red exceeds blue by at least this [of 255].
+WARM = 60
 
 
-@pytest.mark.parametrize(("command", "name"), [(check_hand, "allegro"), (check_object, "block")])
-def test_a_built_in_is_accepted_with_exit_code_0(command: object, name: str) -> None:
-    result = run(command, name, "--json")
-    report = json.loads(result.stdout.splitlines()[-1])
-    assert result.exit_code == 0
+def check(*arguments: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and report of `graspd ... --json`."""
+    result = CliRunner().invoke(build(), [*arguments, "--json"])
+    return result.exit_code, json.loads(result.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("hands", "allegro"), ("hands", "barrett"), ("hands", "shadow"), ("objects", "mug"), ("objects", "block")],
+)
+def test_a_built_in_is_accepted_with_exit_code_0(kind: str, name: str) -> None:
+    code, report = check(kind, "check", name)
+    assert code == 0
     assert report["verdict"] == "accept" and report["repairs"] == [] and report["message"] and report["facts"]
 
 
-@pytest.mark.parametrize("command", [check_hand, check_object])
-def test_what_is_refused_exits_with_2_and_says_why(command: object, tmp_path: Path) -> None:
-    empty = tmp_path / ("h.urdf" if command is check_hand else "o.stl")
-    empty.write_bytes(b"")
-    result = run(command, str(empty), "--json")
-    report = json.loads(result.stdout.splitlines()[-1])
+@pytest.mark.parametrize(
+    ("file", "options", "verdict"),
+    [
+        ("mimic_chain.urdf", (), "accept"),
+        ("limits_reversed.urdf", (), "refuse"),
+        ("inverted_normals.stl", (), "repair"),
+        ("banana_in_millimetres.stl", (), "refuse"),
+        ("banana_in_millimetres.stl", ("--units", "mm"), "accept"),
+        ("open_shell.stl", ("--allow-open",), "accept"),
+        ("two_components.stl", ("--keep-largest",), "repair"),
+        ("lying_face_count.stl", (), "refuse"),
+    ],
+)
+def test_a_file_gets_its_verdict_and_exit_code(
+    shared_data: Path, file: str, options: tuple[str, ...], verdict: str
+) -> None:
+    kind = "hands" if file.endswith(".urdf") else "objects"
+    code, report = check(kind, "check", str(shared_data / "bad" / file), *options)
+    assert report["verdict"] == verdict, report["message"]
+    assert code == (2 if verdict == "refuse" else 0)
+    assert bool(report["repairs"]) == (verdict == "repair")
+
+
+@pytest.mark.parametrize("kind", ["hands", "objects"])
+def test_what_is_not_there_is_refused_and_the_built_ins_are_named(kind: str) -> None:
+    code, report = check(kind, "check", "nowhere")
+    assert code == 2
+    assert report["verdict"] == "refuse" and ("allegro" in report["message"]) == (kind == "hands")
+
+
+def test_without_json_a_refusal_is_one_line_on_stderr(tmp_path: Path) -> None:
+    (tmp_path / "o.stl").write_bytes(b"")
+    result = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "o.stl")])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr
+
+
+def test_without_json_the_guesses_are_told() -> None:
+    said = CliRunner().invoke(build(), ["hands", "check", "barrett"]).stdout
+    for word in ("palm", "approach", "fingertips", "dofs", "pre-shape"):
+        assert word in said
+
+
+def test_a_hand_option_goes_over_the_guess() -> None:
+    _, report = check("hands", "check", "allegro", "--fix", "thumb_rotation=1.0,index_distal=0.2")
+    assert len(report["facts"]["dofs"]) == 14
+
+
+def test_a_dropped_link_takes_its_finger_along() -> None:
+    _, report = check("hands", "check", "allegro", "--drop", "ring_proximal_link")
+    assert not [name for name in report["facts"]["fingertips"] if name.startswith("ring")]
+
+
+def test_a_mass_follows_from_the_density_given() -> None:
+    _, report = check("objects", "check", "block", "--density", "500")
+    assert report["facts"]["mass_kg"] == pytest.approx(500 * report["facts"]["volume_m3"])
+
+
+@pytest.mark.parametrize(
+    "options", [("--approach", "1,2"), ("--approach", "a,b,c"), ("--fix", "thumb"), ("--pre-shape", "thumb=x")]
+)
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(options: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(build(), ["hands", "check", "allegro", *options])
     assert result.exit_code == 2
-    assert report["verdict"] == "refuse" and empty.name in report["message"]
+    assert options[0] in result.stderr
 
 
-def test_a_hand_option_on_the_command_line_goes_over_the_guess() -> None:
-    report = json.loads(run(check_hand, "allegro", "--fix", "thumb_rotation=1.0", "--json").stdout)
-    assert "thumb_rotation" not in report["facts"]["dofs"]
+@pytest.mark.parametrize(("kind", "name"), [("hands", "barrett"), ("objects", "mug")])
+def test_the_picture_shows_something(kind: str, name: str, tmp_path: Path) -> None:
+    path = tmp_path / "p.png"
+    code, _ = check(kind, "check", name, "--picture", str(path))
+    assert code == 0
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    thirds = np.array_split(pixels, 3, axis=1)
+    assert all((third[..., 0] - third[..., 2] > WARM).sum() > 100 for third in thirds)
 
 
-@pytest.mark.parametrize("text", ["1,2", "a,b,c", ""])
-def test_an_approach_that_is_no_vector_is_refused(text: str) -> None:
-    if not text:
-        assert hand_options(palm=None, approach=text, root=None, fix=None, pre_shape=None) == {}
-        return
-    with pytest.raises(InputError, match="three numbers"):
-        hand_options(palm=None, approach=text, root=None, fix=None, pre_shape=None)
+@pytest.mark.parametrize("arguments", [["--help"], ["hands", "--help"], ["objects", "--help"]])
+def test_an_overview_imports_no_engine(arguments: list[str]) -> None:
+    code = (
+        "import sys; from typer.testing import CliRunner; from graspd import build;"
+        f"assert CliRunner().invoke(build(), {arguments!r}).exit_code == 0;"
+        "sys.exit(any(name in sys.modules for name in ('warp', 'newton', 'scipy', 'worker')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

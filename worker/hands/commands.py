@@ -2,33 +2,58 @@
 
 from __future__ import annotations
 
-import json
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from service.asset_options import (
+    ApproachOption,
+    DropOption,
+    FixOption,
+    PalmOption,
+    PreShapeOption,
+    RootOption,
+    hand_options,
+)
+from service.asset_summary import say_check
+from service.cli import JsonFlag, emit, reporting_errors
+from service.domain import AssetKind
 from service.errors import GraspdError, InputError
 from worker.hands.check import check_hand
-from worker.hands.load import files_from_path
+from worker.hands.load import files_from_path, hand_from_path
+
+app = typer.Typer(add_completion=False)
 
 
+@app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
+@reporting_errors
 def check(
-    file: Annotated[str, typer.Argument(help="a URDF, a ZIP of its folder, or the name of a built-in hand")],
-    palm: Annotated[str | None, typer.Option(help="link that is the palm")] = None,
-    approach: Annotated[str | None, typer.Option(help="direction out of the palm, in its frame: x,y,z")] = None,
-    root: Annotated[str | None, typer.Option(help="link to begin at; forearm and wrist above it are dropped")] = None,
-    fix: Annotated[list[str] | None, typer.Option(help="freeze a joint: JOINT=VALUE")] = None,
-    pre_shape: Annotated[list[str] | None, typer.Option(help="value on approach: JOINT=VALUE")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on the last line")] = False,
+    file: Annotated[str, typer.Argument(help="A URDF, a ZIP of its folder, or the name of a built-in hand.")],
+    palm: PalmOption = None,
+    approach: ApproachOption = None,
+    root: RootOption = None,
+    pre_shape: PreShapeOption = None,
+    fix: FixOption = None,
+    drop: DropOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the hand open, on approach and closing, with its palm's arrow: a PNG.")
+    ] = None,
+    json: JsonFlag = False,
 ) -> None:
-    """Say whether a hand can be used, and what was guessed about it.
+    """Say whether a hand can be used, and what was guessed about it. Needs no server."""
+    options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    report = report_hand(file, options)
+    if picture and report["verdict"] != "refuse":
+        from worker.rendering.portraits import hand_portrait, write_png
 
-    Example: graspd hands check my_hand.urdf --palm base_link --approach 0,0,1
-    """
-    report = report_hand(file, hand_options(palm=palm, approach=approach, root=root, fix=fix, pre_shape=pre_shape))
-    typer.echo(json.dumps(report) if as_json else f"{report['verdict']}: {report['message']}")
+        write_png(hand_portrait(hand_from_path(file, options)), picture)
+    if json:
+        emit(report)
+    else:
+        say_check(AssetKind.HAND, report)
     if report["verdict"] == "refuse":
-        raise typer.Exit(2)
+        raise typer.Exit(InputError.exit_code)
 
 
 def report_hand(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -38,32 +63,3 @@ def report_hand(file: str, options: dict[str, Any] | None = None) -> dict[str, A
     except GraspdError as error:
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
     return check_hand(files, name, {**stated, **(options or {})})
-
-
-def hand_options(
-    *, palm: str | None, approach: str | None, root: str | None, fix: list[str] | None, pre_shape: list[str] | None
-) -> dict[str, Any]:
-    """Keys of `HandOptions` from the texts of the command line."""
-    options: dict[str, Any] = {}
-    if palm:
-        options["palm"] = {"link": palm}
-    if approach:
-        try:
-            x, y, z = (float(part) for part in approach.split(","))
-        except ValueError:
-            raise InputError(f"--approach {approach!r} must be three numbers: 0,0,1") from None
-        options["approach"] = (x, y, z)
-    if root:
-        options["root"] = root
-    for key, pairs in (("fix", fix), ("preshape", pre_shape)):
-        if pairs:
-            options[key] = dict(_assignment(pair) for pair in pairs)
-    return options
-
-
-def _assignment(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise InputError(f"{text!r} must be JOINT=VALUE with a number") from None

@@ -54,7 +54,7 @@ def _closing_by_limits(hand: HandModel) -> Floats:
     return np.where(up > 2 * down, 1.0, np.where(down > 2 * up, -1.0, 0.0))
 
 
-def _posture(hand: HandModel, share: float) -> Floats:
+def posture(hand: HandModel, share: float) -> Floats:
     """(D,) posture at a share of the way from open (0) to closed (1); dofs that close nothing stay near 0."""
     start = np.where(hand.closing < 0, hand.upper, hand.lower)
     end = np.where(hand.closing < 0, hand.lower, hand.upper)
@@ -71,7 +71,7 @@ def _tips(hand: HandModel, q: Floats) -> Floats:
 
 def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
     """(D, 3) axis of each dof's own joint in the root frame, hand open; (D,) whether its finger starts there."""
-    poses = body_poses(hand, IDENTITY_POSE, hand.expand(_posture(hand, 0.0)))[0]
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.0)))[0]
     axes, at_base = np.zeros((hand.dofs, 3)), np.zeros(hand.dofs, dtype=bool)
     for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
         if name in hand.dof_names:
@@ -88,9 +88,9 @@ def _guess_approach(hand: HandModel) -> Floats:
     where two fingers oppose one; and where the tips of the half-closed hand are, which is ahead of the palm on a
     gripper but also far along the fingers of a human-like hand. Their sum errs least.
     """
-    way = (_tips(hand, _posture(hand, 0.4)) - _tips(hand, _posture(hand, 0.05))).sum(axis=0)
+    way = (_tips(hand, posture(hand, 0.4)) - _tips(hand, posture(hand, 0.05))).sum(axis=0)
     palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
-    ahead = _tips(hand, _posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else 0.0)
+    ahead = _tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else 0.0)
     mean = _unit(way) + _unit(ahead)
     if np.linalg.norm(mean) < 1e-6:
         return np.array([0.0, 0, 1])
@@ -144,7 +144,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 
 
 def _preshape(hand: HandModel, tree: Tree, options: HandOptions) -> Floats:
-    q = _posture(hand, PRESHAPE_SHARE)
+    q = posture(hand, PRESHAPE_SHARE)
     for dof, value in _by_dof(hand, tree, options.preshape):
         if not hand.lower[dof] - 1e-6 <= value <= hand.upper[dof] + 1e-6:
             raise HandError(

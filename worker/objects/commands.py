@@ -2,38 +2,58 @@
 
 from __future__ import annotations
 
-import json
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from service.errors import GraspdError
+from service.asset_options import (
+    AllowOpenOption,
+    DensityOption,
+    KeepLargestOption,
+    MassOption,
+    ScaleToOption,
+    UnitsOption,
+    object_options,
+)
+from service.asset_summary import say_check
+from service.cli import JsonFlag, emit, reporting_errors
+from service.domain import AssetKind
+from service.errors import GraspdError, InputError
 from worker.objects.check import check_object
-from worker.objects.prepare import files_from_path
+from worker.objects.prepare import files_from_path, object_from_path
+
+app = typer.Typer(add_completion=False)
 
 
+@app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
+@reporting_errors
 def check(
-    file: Annotated[str, typer.Argument(help="a mesh (STL, OBJ, PLY, OFF, GLB), a ZIP, or the name of a built-in")],
-    units: Annotated[str | None, typer.Option(help="unit of the file: m, mm, cm or in")] = None,
-    scale_to: Annotated[float | None, typer.Option(help="scale the longest extent to this [m]")] = None,
-    keep_largest: Annotated[bool, typer.Option("--keep-largest", help="of several components keep one")] = False,
-    allow_open: Annotated[bool, typer.Option("--allow-open", help="take a mesh that is not watertight")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on the last line")] = False,
+    file: Annotated[str, typer.Argument(help="A mesh (STL, OBJ, PLY, OFF, GLB), a ZIP, or the name of a built-in.")],
+    units: UnitsOption = None,
+    scale_to: ScaleToOption = None,
+    keep_largest: KeepLargestOption = False,
+    allow_open: AllowOpenOption = False,
+    density: DensityOption = None,
+    mass: MassOption = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the prepared mesh: a PNG.")] = None,
+    json: JsonFlag = False,
 ) -> None:
-    """Say whether a mesh can be used, what was repaired, and how large it is.
-
-    Example: graspd objects check banana.stl --units mm
-    """
-    options = {
-        "units": units,
-        "scale_to": scale_to,
-        "keep_largest": keep_largest or None,
-        "allow_open": allow_open or None,
-    }
+    """Say whether a mesh can be used, what was repaired, and how large it is. Needs no server."""
+    options = object_options(
+        units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
+    )
     report = report_object(file, options)
-    typer.echo(json.dumps(report) if as_json else f"{report['verdict']}: {report['message']}")
+    if picture and report["verdict"] != "refuse":
+        from worker.rendering.portraits import object_portrait, write_png
+
+        write_png(object_portrait(object_from_path(file, options=options)), picture)
+    if json:
+        emit(report)
+    else:
+        say_check(AssetKind.OBJECT, report)
     if report["verdict"] == "refuse":
-        raise typer.Exit(2)
+        raise typer.Exit(InputError.exit_code)
 
 
 def report_object(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -32,11 +32,11 @@ _TOGETHER: Final = 16
 #: Share of the picture's width or height that hand and object take up.
 _FILL: Final = 0.86
 #: Left of the camera, above it, in front of the object: camera looks along -x of the turned world.
-_TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
-_FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
-_FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
-_OBJECT: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
-_STUDIO: Final = Lamp(
+TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
+FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
+FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
+OBJECT_LOOK: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
+STUDIO: Final = Lamp(
     key=(1.85, 1.8, 1.7), sky=(0.76, 0.79, 0.84), ground=(0.3, 0.29, 0.28),
     backdrop_low=(1.15, 1.17, 1.19), backdrop_high=(1.4, 1.42, 1.44),
 )  # fmt: skip
@@ -77,7 +77,7 @@ def grasp_pictures(
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     stages: dict[int, Stage] = {}
     solids: list[Solid | Box] = [
-        Box(_FLOOR_SIZE),
+        Box(FLOOR_SIZE),
         Solid(obj.vertices, obj.faces, obj.corner_normals),
         *hand_solids(hand),
     ]
@@ -115,10 +115,10 @@ def _shoot(
         [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), _hand_points(hand, bodies)], axis=1
     )
     floor = np.tile(IDENTITY_POSE, (worlds, 1))
-    floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * _FLOOR_SIZE[2]
+    floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * FLOOR_SIZE[2]
     shown = drawn_bodies(hand)
     poses = np.concatenate([floor[:, None], np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, shown]], axis=1)
-    stage.place(poses, [[_FLOOR, _OBJECT, *(look_of(hand, body) for body in shown)]] * worlds)
+    stage.place(poses, [[FLOOR, OBJECT_LOOK, *(look_of(hand, body) for body in shown)]] * worlds)
     k = intrinsics(width, height, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
@@ -126,9 +126,9 @@ def _shoot(
         shot = Shot(
             world=np.arange(worlds, dtype=np.int32),
             extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
-            intrinsics=k, width=width, height=height, samples=samples, toward_lamp=_TOWARD_LAMP,
+            intrinsics=k, width=width, height=height, samples=samples, toward_lamp=TOWARD_LAMP,
             # The lamp goes round with the camera, so no side lies in the dark.
-            turn=-angles, lamps=[_STUDIO] * worlds,
+            turn=-angles, lamps=[STUDIO] * worlds,
         )  # fmt: skip
         sides.append(stage.shoot(shot, cancelled=cancelled).rgb)
     return np.stack(sides, axis=1)
@@ -146,7 +146,11 @@ def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tup
     """Extrinsics of a camera from whose picture the near parts stand out by the share `_FILL`."""
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
-    near = points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M]
+    return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)
+
+
+def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
+    """Extrinsics (4, 4) of a camera at azimuth `angle` [rad] from whose picture the points (P, 3) stand out."""
     centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
     direction = np.array([np.cos(angle) * np.cos(ELEVATION), np.sin(angle) * np.cos(ELEVATION), np.sin(ELEVATION)])
     distance = 4.0 * float(np.linalg.norm(near - centre, axis=1).max())
