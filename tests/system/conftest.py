@@ -26,10 +26,11 @@ READY_S = 30.0
 class System:
     """A running service and the parts of it that a test looks at."""
 
-    def __init__(self, supervisor: Supervisor) -> None:
+    def __init__(self, supervisor: Supervisor, *, fakes: bool = True) -> None:
         self.supervisor = supervisor
         self.parts = Parts.open(supervisor.settings)
-        add_assets(self.parts)
+        if fakes:
+            add_assets(self.parts)
 
     def submit(self, wanted: JobRequest) -> str:
         return pipeline.submit(self.parts, wanted)[0].id
@@ -63,20 +64,24 @@ class System:
 
 @pytest.fixture
 def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., System]]:
-    """Starts a service; `environment` is for its workers' fakes. Everything is stopped at the end."""
+    """Starts a service, of real workers if `fakes` is False; `environment` is for its workers' fakes.
+
+    Everything is stopped at the end.
+    """
     running: list[System] = []
 
-    def make(*, workers: int = 1, environment: dict[str, str] | None = None, **settings: Any) -> System:
+    def make(
+        *, workers: int = 1, fakes: bool = True, environment: dict[str, str] | None = None, **settings: Any
+    ) -> System:
         for name, value in (environment or {}).items():
             monkeypatch.setenv(name, value)
         wanted = Settings(data_dir=tmp_path / "data", port=0, device="cpu", keeper_interval_s=0.5, **settings)
-        supervisor = Supervisor(
-            wanted, workers=workers, api=False, worker_command=(sys.executable, "-m", "tests.fakes")
-        )
+        command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
+        supervisor = Supervisor(wanted, workers=workers, api=False, worker_command=(sys.executable, *command))
         supervisor.start()
         try:
             supervisor.wait_ready(READY_S)
-            running.append(System(supervisor))
+            running.append(System(supervisor, fakes=fakes))
         except BaseException:
             supervisor.stop()
             raise
