@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
 FINE_RATES: Final = (5e-4, 5e-3, 1e-2)
+#: The paper's rate of plain gradient descent, the same for all variables in SI units.
+PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
@@ -31,6 +33,8 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
         one_sided=fidelity.leak == "one_sided",
         leak_length=0.02 if fidelity.leak == "one_sided" else 1e3,
         limit_weight=100.0 if paper else 0.0,
+        simulate=fidelity.simulate,
+        leak=0.1 if fidelity.simulate else 1.0,
     )
 
 
@@ -42,6 +46,8 @@ def coarse_schedule(fidelity: Fidelity) -> Schedule:
     """Dilation to 0 over the first four fifths; penetration weight times 10."""
     n = fidelity.coarse_iterations
     dilation = DILATION * np.clip(1.0 - np.arange(n) / max(0.8 * n, 1.0), 0.0, 1.0)
+    if fidelity.optimizer == "gd":
+        return Schedule(dilation, np.zeros(n), np.zeros(n), np.zeros(n), np.tile(PAPER_RATES, (n, 1)))
     penetration = np.geomspace(3e3, 3e4, max(n, 1))[:n]
     return Schedule(dilation, penetration, penetration, np.full(n, SELF_WEIGHT), _decayed(COARSE_RATES, n, 0.25))
 
@@ -49,6 +55,8 @@ def coarse_schedule(fidelity: Fidelity) -> Schedule:
 def fine_schedule(fidelity: Fidelity) -> Schedule:
     """No dilation; penetration dear."""
     n = fidelity.fine_iterations
+    if fidelity.optimizer == "gd":
+        return Schedule(np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.tile(PAPER_RATES, (n, 1)))
     penetration = np.geomspace(1e5, 1e6, max(n, 1))[:n]
     return Schedule(
         np.zeros(n), penetration, 0.3 * penetration, np.full(n, 3 * SELF_WEIGHT), _decayed(FINE_RATES, n, 0.1)
