@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -40,7 +41,7 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except zipfile.BadZipFile:
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         raise InputError("the archive is not a readable ZIP file; zip the folder again") from None
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
@@ -53,14 +54,24 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
             raise InputError(f"the archive entry {name!r} is a symbolic link; pack the file itself")
         if entry.flag_bits & 1:
             raise InputError(f"the archive entry {name!r} is encrypted; pack it without a password")
-        # The header's size may lie: read one byte past what is left of the limit and no further.
-        with archive.open(entry) as stream:
-            content = stream.read(limit_bytes - total + 1)
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            # Others may ask for gigabytes of memory before the first byte.
+            raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
+        content = _read_entry(archive, entry, limit_bytes - total + 1)
         total += len(content)
         if total > limit_bytes:
             raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
         files[name] = content
     return files
+
+
+def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> bytes:
+    """At most `limit` bytes of an entry, whatever its header says."""
+    try:
+        with archive.open(entry) as stream:
+            return stream.read(limit)
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError):
+        raise InputError(f"the archive entry {entry.filename!r} is damaged; zip the folder again") from None
 
 
 def check_path(name: str) -> str:

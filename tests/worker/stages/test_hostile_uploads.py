@@ -1,0 +1,186 @@
+"""Every bad file from its upload to its verdict, and what attacks a reader: refused in bounded time, worker unharmed."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import time
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from api.uploads import files_of_upload
+from service import names
+from service.domain import AssetKind, IngestMessage, Stage
+from service.errors import InputError
+from service.library import publish_asset
+from service.queue.port import EventKind
+from service.store import Store, open_store
+from tests.worker.objects.shapes import sphere, stl
+from worker.context import TaskContext
+from worker.runner import Runner
+from worker.stages import ingest
+
+UPLOAD_BYTES = 64 * 2**20
+#: What issue and design promise for any upload [s].
+BOUND_S = 30.0
+#: Children at a time: as many as the smallest machine has cores.
+TOGETHER = 2
+BALL = stl(sphere())
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: dict[str, Any] | None = None) -> Any:
+    """What a user is told of an upload: refused at the door, or what the worker's check says."""
+    try:
+        files = files_of_upload(kind, filename, data, limit_bytes=UPLOAD_BYTES)
+        asset = publish_asset(store, kind, "upload", files)
+    except InputError as error:
+        return {"verdict": "refuse", "message": str(error)}
+    message = IngestMessage(schema_=1, task_id="i", kind=kind, name=Path(filename).stem, digest=asset.digest)
+    outcome = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None).run(
+        message.model_dump(mode="json", by_alias=True), TaskContext(store)
+    )
+    assert outcome is not None and outcome.kind is EventKind.FINISHED, outcome
+    return json.loads(store.get(names.asset_check(kind, asset.digest)))
+
+
+def kind_of(filename: str) -> AssetKind:
+    return AssetKind.HAND if filename.endswith(".urdf") else AssetKind.OBJECT
+
+
+def test_every_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path) -> None:
+    entries = json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"]
+
+    def judge(entry: dict[str, str]) -> str | None:
+        data, start = (shared_data / "bad" / entry["file"]).read_bytes(), time.monotonic()
+        found = upload(open_store("memory://"), kind_of(entry["file"]), entry["file"], data)
+        right = found["verdict"] == entry["expect"] and entry["message_names"].lower() in found["message"].lower()
+        return None if right and time.monotonic() - start < BOUND_S else f"{entry['file']}: {found}"
+
+    with ThreadPoolExecutor(TOGETHER) as pool:
+        wrong = [text for text in pool.map(judge, entries) if text]
+    assert len(entries) >= 40 and not wrong
+
+
+def big_entity_bomb() -> bytes:
+    """Ten levels of ten: 10^10 characters once expanded."""
+    levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 11))
+    return f'<!DOCTYPE robot [<!ENTITY e0 "x">{levels}]><robot name="&e10;"/>'.encode()
+
+
+def external_entity() -> bytes:
+    return b'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="h"><link name="&x;"/></robot>'
+
+
+def huge_promise() -> bytes:
+    """4 10^9 faces of 50 bytes: 200 GB."""
+    return b"promise".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(600)
+
+
+def ply_promise() -> bytes:
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
+    return (header + "property float x\nproperty float y\nproperty float z\nend_header\n").encode() + bytes(64)
+
+
+def zip_bomb() -> bytes:
+    """A few hundred kilobytes that unpack to more than eight times the upload limit."""
+    return zipped({f"{i}.stl": bytes(UPLOAD_BYTES) for i in range(9)})
+
+
+def nested_bomb() -> bytes:
+    return zipped({"inner.zip": zipped({"innermost.zip": zip_bomb()})})
+
+
+def symlink() -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        entry = zipfile.ZipInfo("mesh.stl")
+        entry.external_attr = 0o120777 << 16
+        archive.writestr(entry, "/etc/passwd")
+    return buffer.getvalue()
+
+
+def damaged_zip() -> bytes:
+    data = bytearray(zipped({"ball.stl": BALL["m.stl"]}))
+    data[200:260] = bytes(60)
+    return bytes(data)
+
+
+def unusual_zip() -> bytes:
+    """LZMA's header may ask for a dictionary of 4 GiB."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("ball.stl", BALL["m.stl"])
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("filename", "data", "says"),
+    [
+        ("bomb.urdf", big_entity_bomb(), "entit"),
+        ("external.urdf", external_entity(), "entit"),
+        ("promise.stl", huge_promise(), "truncated"),
+        ("promise.ply", ply_promise(), ""),
+        ("slip.zip", zipped({"../../../tmp/slip.stl": BALL["m.stl"]}), "leaves its folder"),
+        ("absolute.zip", zipped({"/tmp/slip.stl": BALL["m.stl"]}), "leaves its folder"),
+        ("nested.zip", nested_bomb(), "holds no object file"),
+        ("link.zip", symlink(), "symbolic link"),
+        ("many.zip", zipped({f"{i}.obj": b"v" for i in range(3000)}), "3000 files"),
+        ("damaged.zip", damaged_zip(), "damaged"),
+        ("lzma.zip", unusual_zip(), "unusual"),
+        ("far.obj", b"v 1e300 0 0\nv 0 1e300 0\nv 0 0 1e300\nf 1 2 3\nf 1 3 2\n", "exceeds"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and "." in value else "",
+)
+def test_an_attack_is_refused_and_the_worker_does_the_next_task(filename: str, data: bytes, says: str) -> None:
+    store, start = open_store("memory://"), time.monotonic()
+    found = upload(store, kind_of(filename), filename, data)
+    assert time.monotonic() - start < BOUND_S
+    assert found["verdict"] == "refuse"
+    assert says in found["message"] and "root:" not in found["message"]
+    assert upload(store, AssetKind.OBJECT, "ball.stl", BALL["m.stl"])["verdict"] == "accept"
+
+
+def test_a_zip_that_unpacks_to_more_than_the_limit_is_refused() -> None:
+    start = time.monotonic()
+    found = upload(open_store("memory://"), AssetKind.OBJECT, "bomb.zip", zip_bomb())
+    assert found["verdict"] == "refuse" and "unpacks to more" in found["message"]
+    assert time.monotonic() - start < BOUND_S
+
+
+def rough(segments: int) -> bytes:
+    """A ball with noise on it: slow to simplify."""
+    vertices, faces = sphere(0.04, segments)
+    noise = np.random.default_rng(0).normal(1.0, 0.003, (len(vertices), 1))
+    return stl((vertices * noise, faces))["m.stl"]
+
+
+@pytest.mark.parametrize(
+    ("limits", "says"),
+    [({"cpu_s": 1}, "takes longer than 1 s"), ({"memory_bytes": 400 * 2**20}, "needs more than 0.391 GiB")],
+)
+def test_a_mesh_that_costs_too_much_is_refused_and_the_next_one_is_taken(limits: dict[str, int], says: str) -> None:
+    context, start = TaskContext(open_store("memory://")), time.monotonic()
+    files = {"asset.json": b'{"file": "m.stl"}', "m.stl": rough(512)}
+    found = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]
+    assert found["verdict"] == "refuse" and says in found["message"]
+    assert time.monotonic() - start < BOUND_S
+    sound = {"asset.json": b'{"file": "m.stl"}', **BALL}
+    assert ingest.check_in_child(AssetKind.OBJECT, "ball", sound, context)["verdict"] == "accept"
+
+
+def test_the_limits_of_a_check_keep_the_promised_bound() -> None:
+    assert ingest.CPU_LIMIT_S < ingest.WALL_LIMIT_S <= BOUND_S
