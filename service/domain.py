@@ -76,6 +76,9 @@ class Fidelity(Model):
     contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
     optimizer: Literal["adam", "gd"] = "adam"
     leak: Literal["one_sided", "two_sided"] = "one_sided"
+    dilation: Literal["fixed", "touch"] = Field(
+        "fixed", description="first dilation of the object: 10 mm, or so much that it just touches the hand"
+    )
     simulate: bool = Field(True, description="False: hands are only drawn to the surface; a control, not a method")
     phong_alpha: float = Field(0.5, ge=0, le=1)
 

@@ -141,6 +141,7 @@ class Simulation:
         M = self.options.velocities
         self.active = wp.ones(B, dtype=wp.int32)
         self.iteration = wp.zeros(1, dtype=wp.int32)
+        self.dilation_scale = wp.ones(B, dtype=wp.float32)
         self.pivot = wp.zeros(B, dtype=wp.vec3)
         self.rotation = wp.zeros(B, dtype=wp.quat)
         self.q = wp.zeros((B, D), dtype=wp.float32)
@@ -190,9 +191,18 @@ class Simulation:
         physics.radius = self.obj.model.radius + self.options.band + MAX_DILATION
         return physics
 
-    def set_state(self, state: HandState, active: NDArray[np.bool_] | None = None) -> None:
-        """Load up to `capacity` hands; the rest of the capacity is switched off. Optimiser moments are cleared."""
+    def set_state(
+        self, state: HandState, active: NDArray[np.bool_] | None = None, dilation: Floats | None = None
+    ) -> None:
+        """Load up to `capacity` hands; the rest of the capacity is switched off. Optimiser moments are cleared.
+
+        `dilation` (n,) multiplies the schedule's dilation for each hand; 1 where it is not given.
+        """
         n = len(state.pivot)
+        scale = np.ones(self.capacity, dtype=np.float32)
+        if dilation is not None:
+            scale[:n] = dilation
+        self.dilation_scale.assign(scale)
         mask = np.zeros(self.capacity, dtype=np.int32)
         mask[:n] = 1 if active is None else active
         self._assign(self.pivot, state.pivot)
@@ -252,7 +262,8 @@ class Simulation:
         )  # fmt: skip
         self._launch(
             surface.gather, (B, self.count),
-            [self.obj.surface, self.active, self.iteration, self.dilation, self.options.band, self.options.exact_below,
+            [self.obj.surface, self.active, self.iteration, self.dilation, self.dilation_scale, self.options.band,
+             self.options.exact_below,
              self.point_body, self.point_position, self.point_weight, self.body_p, self.body_q, self.contacts,
              self.contact_body, self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
              self.contact_gradient],
@@ -261,7 +272,8 @@ class Simulation:
     def _record_contact(self) -> None:
         o = self.options
         inputs = [
-            self.physics, self.motions, o.passes, self.active, self.iteration, self.dilation, self.contacts,
+            self.physics, self.motions, o.passes, self.active, self.iteration, self.dilation, self.dilation_scale,
+            self.contacts,
             self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
         ]  # fmt: skip
         if self.states is not None:

@@ -53,6 +53,7 @@ def run(
         inputs = [
             physics(world, leak=leak, one_sided=one_sided), wp.array(motions, dtype=contact.vec6), passes,
             wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32),
+            wp.ones(1, dtype=wp.float32),
             wp.array([n], dtype=wp.int32),
             wp.array(contacts.points[None], dtype=wp.vec3), wp.array(contacts.normals[None], dtype=wp.vec3),
             wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
@@ -142,6 +143,19 @@ def test_an_object_between_two_fingers_sticks_with_friction_and_slides_without()
         # One sweep leaves part of the slip that the second contact causes at the first.
         assert abs(run(kernel, squeeze, rough)[0][along_y, 1]) < 0.35 * WORLD.step
         assert abs(run(kernel, squeeze, smooth)[0][along_y, 1]) > 0.9 * WORLD.step
+
+
+def test_one_contact_gives_the_object_the_momentum_of_its_impulse() -> None:
+    """Off-centre and without friction: M s = lambda (n, p x n) with lambda = -C / w, in closed form."""
+    point, normal, depth = np.array([0.04, 0.01, -0.02]), np.array([0.0, 0.6, 0.8]), 1e-3
+    single = Contacts(point[None], normal[None], np.array([-depth]), np.ones(1))
+    world = World(inertia=INERTIA, gyration=WORLD.gyration, friction=1e-9)
+    arm = np.cross(point, normal)
+    w = 1.0 + arm @ np.linalg.inv(INERTIA) @ arm
+    impulse = -depth / w
+    expected = np.concatenate([impulse * normal, np.linalg.inv(INERTIA) @ (impulse * arm)])
+    end = run(contact.gauss_seidel, single, world)[0][0]
+    np.testing.assert_allclose(end, expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_balanced_grasp_leaves_the_object_at_rest() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance, sample_surface
 from worker.simulation.sampling import object_samples
-from worker.simulation.simulation import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, HandState, LossOptions
+from worker.simulation.simulation import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, HandState, LossOptions, Schedule
 from worker.transforms import apply, invert, quat_from_axis_angle, quat_multiply
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
@@ -111,3 +112,73 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-4, "the links touch"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
+
+
+def test_the_range_and_limit_penalties_have_their_closed_form_gradient() -> None:
+    hand = hand_from_path("barrett")
+    q = hand.upper + 0.1
+    state = HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q[None])
+    options = LossOptions(simulate=False, leak=0.0, range_weight=0.3, limit_weight=7.0)
+    simulation = rig(hand, ball(), capacity=1, options=options)
+    simulation.set_state(state)
+    simulation.record_evaluation()
+    simulation.run()
+    half = 0.5 * (hand.upper - hand.lower)
+    expected = 2 * 0.3 * (half + 0.1) / half**2 + 2 * 7.0 * 0.1
+    np.testing.assert_allclose(simulation.gradient.numpy()[0, 6:], expected, rtol=1e-5)
+
+
+PLACES = {
+    "at the centre of the object": (0.0, 0.0, 0.0),
+    "on the surface": (0.035, 0.0, 0.0),
+    "far away": (3.0, 2.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("solver", ["direct", "jacobi", "gauss_seidel"])
+def test_loss_and_gradient_are_finite_wherever_the_hand_is(place: str, solver: str) -> None:
+    hand, obj = hand_from_path("allegro"), ball()
+    state = HandState(np.array([PLACES[place]]), np.array([[1.0, 0.0, 0.0, 0.0]]), hand.preshape[None])
+    simulation = rig(hand, obj, capacity=1, options=LossOptions(contact_solver=solver))
+    simulation.set_schedule(still(dilation=0.01, weight=1e4))
+    simulation.set_state(state)
+    simulation.record_evaluation()
+    simulation.run()
+    assert np.all(np.isfinite(simulation.loss.numpy()))
+    assert np.all(np.isfinite(simulation.gradient.numpy()))
+
+
+def test_a_mesh_with_degenerate_normals_gives_finite_gradients() -> None:
+    """Corner normals of length 0, as a sliver face has them."""
+    obj = ball()
+    broken = replace(obj, corner_normals=np.zeros_like(obj.corner_normals))
+    hand = hand_from_path("allegro")
+    simulation = rig(hand, broken, capacity=1)
+    simulation.set_schedule(still(dilation=0.01, weight=1e4))
+    simulation.set_state(fist_in_ball(hand))
+    simulation.record_evaluation()
+    simulation.run()
+    assert np.all(np.isfinite(simulation.gradient.numpy()))
+
+
+def test_small_descent_steps_never_raise_the_loss() -> None:
+    """L_stable of a hand in contact, plain descent without leak: the descent direction is one."""
+    hand, obj = hand_from_path("allegro"), ball()
+    options = LossOptions(leak=0.0, range_weight=0.0)
+    steps = 30
+    ones = np.zeros(steps)
+    schedule = Schedule(ones + 0.004, ones, ones, ones, np.tile([1e-10, 1e-8, 1e-8], (steps, 1)))
+    simulation = rig(hand, obj, capacity=1, options=options)
+    simulation.set_schedule(schedule)
+    simulation.set_state(
+        HandState(np.array([[0.037, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), hand.preshape[None])
+    )
+    simulation.record_iteration("gd")
+    losses = []
+    for _ in range(steps):
+        simulation.run()
+        losses.append(float(simulation.loss.numpy().mean()))
+    assert losses[-1] < losses[0]
+    # float32 sums of losses of size 1.
+    assert max(np.diff(losses)) < 1e-5

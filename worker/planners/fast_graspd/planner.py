@@ -26,8 +26,8 @@ from worker.objects.model import ObjectModel
 from worker.planners import Cancelled, Progress
 from worker.planners.fast_graspd.merit import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.starts import RETREATS, nearest_distances, sample_starts
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule, Simulation
@@ -124,10 +124,11 @@ def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, ste
     finalists = min(fidelity.finalists, fidelity.starts)
     probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
     state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices, each=fidelity.starts)
+    touch = nearest_distances(probe, state) / DILATION if fidelity.dilation == "touch" else None
     steps(n, "starts")
     part.curve = []
     simulation = pair.simulation(pair.coarse, n * fidelity.starts)
-    state = _optimize(simulation, state, coarse_schedule(fidelity), fidelity, steps, "coarse", part.curve)
+    state = _optimize(simulation, state, coarse_schedule(fidelity), fidelity, steps, "coarse", part.curve, touch)
     if finalists < fidelity.starts:
         state = state[best_of_each(merits(hand, obj, state, _losses(simulation, state)), n, finalists)]
     simulation = pair.simulation(pair.fine, n * finalists)
@@ -148,11 +149,11 @@ def _losses(simulation: Simulation, state: HandState) -> Floats:
 
 def _optimize(
     simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, steps: _Steps, name: str,
-    curve: list[float],
+    curve: list[float], dilation: Floats | None = None,
 ) -> HandState:  # fmt: skip
     n = len(state.pivot)
     simulation.set_schedule(schedule)
-    simulation.set_state(state)
+    simulation.set_state(state, dilation=dilation)
     # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
     patience = fidelity.patience if name == "fine" else 0
     simulation.record_iteration(fidelity.optimizer, patience=patience)

@@ -146,3 +146,13 @@ def probe_depths(probe: Simulation, states: HandState) -> Floats:
     probe.run()
     parts = (probe.point_depth, probe.object_depth, probe.self_depth)
     return np.max([part.numpy()[:n] for part in parts], axis=0).astype(float)
+
+
+def nearest_distances(probe: Simulation, states: HandState) -> Floats:
+    """Distance of each hand's nearest point from the object (n,) [m], at most the probe's band."""
+    probe_depths(probe, states)
+    n = len(states.pivot)
+    counts = probe.contacts.numpy()[:n]
+    distances = probe.contact_distance.numpy()[:n]
+    present = np.arange(distances.shape[1]) < counts[:, None]
+    return np.where(present, distances, probe.options.band).min(axis=1).clip(0.0, probe.options.band).astype(float)

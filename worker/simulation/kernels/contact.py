@@ -131,6 +131,7 @@ def direct(
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
     normal_in: wp.array2d(dtype=wp.vec3),
@@ -149,7 +150,7 @@ def direct(
     b, m = wp.tid()
     if active_in[b] == 0:
         return
-    r = dilation_in[iteration_in[0]]
+    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
     s0 = motion_in[m]
     s = s0
     k = physics_in.stiffness
@@ -221,6 +222,7 @@ def gauss_seidel(
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
     normal_in: wp.array2d(dtype=wp.vec3),
@@ -240,7 +242,7 @@ def gauss_seidel(
     b, m = wp.tid()
     if active_in[b] == 0:
         return
-    r = dilation_in[iteration_in[0]]
+    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
     s = motion_in[m]
     count = count_in[b]
     for i in range(count):
@@ -307,6 +309,7 @@ def jacobi(
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
     normal_in: wp.array2d(dtype=wp.vec3),
@@ -325,7 +328,7 @@ def jacobi(
     b, m = wp.tid()
     if active_in[b] == 0:
         return
-    r = dilation_in[iteration_in[0]]
+    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
     s = motion_in[m]
     count = count_in[b]
     for step in range(passes_in):

@@ -160,6 +160,7 @@ def gather(
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
     band_in: wp.float32,
     exact_in: wp.float32,
     body_in: wp.array(dtype=wp.int32),
@@ -181,7 +182,7 @@ def gather(
         return
     body = body_in[i]
     point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
-    dilation = dilation_in[iteration_in[0]]
+    dilation = dilation_scale_in[b] * dilation_in[iteration_in[0]]
     reach = dilation + band_in
     sample = distance(surface_in, point, reach, exact_in)
     if sample.distance < reach:
