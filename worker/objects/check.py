@@ -57,6 +57,8 @@ def _facts(mesh: Repaired, face_error_m: float, options: ObjectOptions) -> dict[
         "faces": len(mesh.faces),
         "prepared_faces": len(model.faces),
         "deviation_m": model.deviation_m,
+        "repair_deviation_m": mesh.moved_m,
+        "self_intersections": mesh.self_intersections,
         "extents_m": [float(extent) for extent in np.ptp(mesh.vertices, axis=0)],
         "volume_m3": model.volume,
         "mass_kg": mass,

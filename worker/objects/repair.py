@@ -15,7 +15,9 @@ from scipy.spatial import cKDTree
 
 from service.errors import MeshError
 from worker.objects import solid, topology
+from worker.objects.distance import MeshDistance, surface_points
 from worker.objects.formats import Soup
+from worker.objects.intersections import crossings, untangle
 from worker.objects.mass import signed_volume
 from worker.objects.options import UNITS, ObjectOptions
 from worker.objects.topology import Floats, Indices
@@ -32,6 +34,8 @@ HOLE: Final = 0.03
 DEBRIS: Final = 1e-6
 #: A mean wall below this [m] is worth a warning: it can pass between hand points.
 THIN_M: Final = 2.5e-3
+#: Points, besides the vertices, at which the repaired surface is held against the one that was given.
+_SAMPLES: Final = 4000
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,10 @@ class Repaired:
     repairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     components: int = field(default=1)
+    self_intersections: int | None = None
+    """Pairs of faces that still pass through each other; None: not looked for."""
+    moved_m: float = 0.0
+    """Largest distance of the repaired surface from the one that was given [m]."""
 
     def but(self, vertices: Floats, faces: Indices, repair: str) -> Repaired:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
@@ -55,12 +63,19 @@ def repair(soup: Soup, options: ObjectOptions) -> Repaired:
     Raises:
         MeshError: wrong units, no volume, holes, several components; the message says the mend.
     """
-    mesh = _to_metres(soup, options)
-    mesh = _clean(mesh)
-    mesh = _close(mesh)
+    given = _to_metres(soup, options)
+    mesh = _solid(given, options)
+    if not mesh.repairs:
+        return mesh
+    moved = MeshDistance(given.vertices, given.faces).furthest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))
+    return replace(mesh, moved_m=moved)
+
+
+def _solid(mesh: Repaired, options: ObjectOptions) -> Repaired:
+    mesh = _close(_clean(mesh))
     if not topology.is_closed(mesh.faces):
         return _open(mesh, options)
-    mesh = _resolve_components(mesh, options)
+    mesh = _resolve_self_intersections(_resolve_components(mesh, options))
     volume = signed_volume(mesh.vertices, mesh.faces)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if volume < 1e-9 * extent**3:
@@ -258,6 +273,19 @@ def _unite(
     if abs(united.volume() - before) > 1e-6 * before:
         return mesh.but(*solid.from_manifold(united), f"united {len(parts)} intersecting components")
     return replace(mesh, vertices=_join_oriented(positives, holes)[0], faces=_join_oriented(positives, holes)[1])
+
+
+def _resolve_self_intersections(mesh: Repaired) -> Repaired:
+    """What a shell encloses twice counts once, where that leaves the outer surface as it is; else a note."""
+    found = crossings(mesh.vertices, mesh.faces)
+    if found is None or not len(found):
+        return replace(mesh, self_intersections=None if found is None else 0)
+    united = untangle(mesh.vertices, mesh.faces)
+    if united is None:
+        note = f"{len(found)} pairs of faces pass through each other; volume and mass may err there"
+        return replace(mesh, self_intersections=len(found), notes=(*mesh.notes, note))
+    mesh = mesh.but(*united, f"united the mesh with itself where {len(found)} pairs of faces intersected")
+    return replace(mesh, self_intersections=0)
 
 
 def _touching(parts: list[tuple[Floats, Indices]]) -> int:

@@ -1,0 +1,123 @@
+"""Where a surface passes through itself, and the solid that remains when the overlap counts once."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from worker.objects import solid, topology
+from worker.objects.distance import MeshDistance, cut, surface_points
+from worker.objects.mass import signed_volume
+from worker.objects.topology import Floats, Indices
+
+Mesh = tuple[Floats, Indices]
+
+#: Larger meshes are not looked through: it would cost more than everything else.
+MAX_FACES: Final = 120_000
+#: Pairs of near pieces looked at in all; bounds memory and time.
+MAX_PAIRS: Final = 6_000_000
+#: An edge crosses a face if it stands out on both sides by this share of the mesh's extent: touching is no crossing.
+DEPTH: Final = 1e-6
+#: ... and does so off the rim of that face by this share of its height: edges that meet do not cross.
+_RIM: Final = 1e-6
+#: Halvings of a piece that crosses itself before it is given up.
+_HALVINGS: Final = 7
+#: The new surface lies on the old one within this share of the extent, or the repair is not safe.
+_SAME: Final = 1e-5
+_SAMPLES: Final = 4000
+_CHUNK: Final = 200_000
+
+
+def crossings(vertices: Floats, faces: Indices) -> Indices | None:
+    """(P, 2) pairs of faces without a common vertex that pass through each other; None: too many faces to look.
+
+    Broad phase: faces cut into pieces of one size, and pieces whose balls meet. Narrow phase: an edge of one face
+    through the inside of the other.
+    """
+    if len(faces) > MAX_FACES:
+        return None
+    corners = vertices[faces]
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    # Well above the side of an even mesh of so many faces: only long faces are cut.
+    pieces, owner = cut(corners, 4 * np.sqrt(area / max(len(faces), 2000)))
+    centres = pieces.mean(axis=1)
+    radius = float(np.linalg.norm(pieces - centres[:, None], axis=2).max())
+    tree = cKDTree(centres)
+    if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
+        return None
+    near = owner[tree.query_pairs(2 * radius, output_type="ndarray")]
+    near = np.unique(np.sort(near[near[:, 0] != near[:, 1]], axis=1), axis=0)
+    apart = ~(faces[near[:, 0]][:, :, None] == faces[near[:, 1]][:, None, :]).any(axis=(1, 2))
+    near = near[apart]
+    depth = DEPTH * float(np.ptp(vertices, axis=0).max())
+    found = [
+        _pass(corners[part[:, 0]], corners[part[:, 1]], depth) | _pass(corners[part[:, 1]], corners[part[:, 0]], depth)
+        for part in np.array_split(near, max(1, len(near) // _CHUNK))
+    ]
+    return near[np.concatenate(found)]
+
+
+def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
+    """(P,) whether an edge of the one triangle (P, 3, 3) goes through the inside of the other, `depth` [m] deep."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)
+    height = np.einsum("pkj,pj->pk", edges_of - a[:, None], normal) / np.sqrt(square)[:, None]
+    hit = np.zeros(len(triangles), dtype=bool)
+    for k in range(3):
+        start, end = height[:, k], height[:, (k + 1) % 3]
+        through = (start * end < 0) & (np.minimum(np.abs(start), np.abs(end)) > depth)
+        t = start / np.where(through, start - end, 1.0)
+        point = edges_of[:, k] + t[:, None] * (edges_of[:, (k + 1) % 3] - edges_of[:, k]) - a
+        v = np.einsum("ij,ij->i", np.cross(point, c - a), normal) / square
+        w = np.einsum("ij,ij->i", np.cross(b - a, point), normal) / square
+        hit |= through & (v > _RIM) & (w > _RIM) & (v + w < 1 - _RIM)
+    return hit
+
+
+def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
+    """The solid in which what the surface encloses twice counts once; None where that is not safe.
+
+    The mesh is halved until no piece crosses itself, and the pieces are united: no vertex moves. It is safe if the
+    result is closed, free of crossings and every point of its surface lies on the old surface.
+    """
+    whole = solid.to_manifold(vertices, faces)
+    pieces = None if whole is None else _halved(whole, _HALVINGS)
+    if pieces is None:
+        return None
+    united = solid.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
+    extent = float(np.ptp(vertices, axis=0).max())
+    united = topology.compact(*topology.merge_vertices(*united, 1e-9 * extent))
+    left = crossings(*united) if topology.is_closed(united[1]) else None
+    if left is None or len(left) or not 0 < signed_volume(*united) <= signed_volume(vertices, faces):
+        return None
+    strayed = MeshDistance(vertices, faces).furthest(surface_points(*united, _SAMPLES))
+    return united if strayed <= _SAME * extent else None
+
+
+def _halved(piece: Any, halvings: int) -> list[Any] | None:
+    """Parts of a solid that do not cross themselves and fill the same space; None if that takes too many cuts."""
+    parts: list[Any] = []
+    for part in piece.decompose():
+        mesh = solid.from_manifold(part)
+        crossed = crossings(*mesh)
+        if crossed is None or part.volume() <= 0:
+            return None
+        if not len(crossed):
+            parts.append(part)
+            continue
+        if not halvings:
+            return None
+        middles = mesh[0][mesh[1][crossed.reshape(-1)]].mean(axis=1)
+        axis = np.eye(3)[int(np.argmax(np.ptp(mesh[0], axis=0)))]
+        for half in part.split_by_plane(tuple(axis), float(np.median(middles @ axis))):
+            more = [] if half.is_empty() else _halved(half, halvings - 1)
+            if more is None:
+                return None
+            parts += more
+    return parts
