@@ -93,15 +93,18 @@ class Client:
     def asset(self, kind: AssetKind, name: str) -> AssetView:
         return AssetView.model_validate_json(self._send("GET", f"/v1/{kind.value}s/{name}").content)
 
-    def upload(self, kind: AssetKind, path: Path, *, name: str | None = None) -> AssetView:
-        """Send a file or a ZIP; InputError if it cannot be opened."""
+    def upload(
+        self, kind: AssetKind, path: Path, *, name: str | None = None, options: dict[str, Any] | None = None
+    ) -> AssetView:
+        """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened."""
+        fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
         try:
             with path.open("rb") as file:
                 answer = self._send(
                     "POST",
                     f"/v1/{kind.value}s",
                     files={"file": (path.name, file)},
-                    data={"name": name} if name else {},
+                    data=fields,
                 )
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from api import key_commands
+from api.add_commands import add_hand, add_object
 from api.client import Client
 from api.dashboard.filters import count, percent, size
 from api.models import Job
@@ -168,29 +169,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
 
-    @group.command("add")
-    @reporting_errors
-    def add(
-        file: Annotated[Path, typer.Argument(help="The file, or a ZIP of its folder.")],
-        name: Annotated[str | None, typer.Option(help="Name to give it; default: the file's.")] = None,
-        wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")] = True,
-        url: UrlOption = None,
-        json: JsonFlag = False,
-    ) -> None:
-        """Upload one, and wait for its check."""
-        with open_client(url) as client:
-            asset = client.upload(kind, file, name=name or name_of_upload(file.name))
-            if wait:
-                asset = client.wait_checked(kind, asset.name)
-        show_asset(asset.model_dump(mode="json"), json=json)
-        if asset.verdict == "refuse":
-            raise InputError(f"refused: {asset.message}")
-
     return group
 
 
-app.add_typer(asset_commands(AssetKind.HAND), name="hands")
-app.add_typer(asset_commands(AssetKind.OBJECT), name="objects")
+hands_app, objects_app = asset_commands(AssetKind.HAND), asset_commands(AssetKind.OBJECT)
+hands_app.command("add", epilog="graspd hands add my_hand.zip --palm base_link --approach 0,0,1")(add_hand)
+objects_app.command("add", epilog="graspd objects add banana.stl --units mm --density 950")(add_object)
+app.add_typer(hands_app, name="hands")
+app.add_typer(objects_app, name="objects")
 app.add_typer(key_commands.app, name="keys")
 
 

@@ -13,8 +13,9 @@ from api.client import Client
 from api.dashboard.filters import count, duration, metric, percent
 from api.models import JobDetail
 from api.watching import JobDisplay
+from service.asset_summary import summary
 from service.cli import emit, load_settings
-from service.domain import JobRequest, State
+from service.domain import AssetKind, JobRequest, State
 from service.errors import InputError, TaskError
 
 UrlOption = Annotated[str | None, typer.Option("--url", help="Where the API answers; default GRASPD_API_URL.")]
@@ -86,8 +87,9 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
             console.print(f"{name:<18} {asset[name]}", markup=False, soft_wrap=True)
     for line in asset.get("repairs", []):
         console.print(f"{'repair':<18} {line}", markup=False, soft_wrap=True)
-    for name, value in asset.get("facts", {}).items():
-        console.print(f"{name:<18} {value}", markup=False, soft_wrap=True)
+    facts = asset.get("facts", {})
+    for line in summary(AssetKind(asset["kind"]), facts) or [f"{name:<18} {value}" for name, value in facts.items()]:
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def _print_job(job: JobDetail, url: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import PurePosixPath
-from typing import Final
+from typing import Any, Final
 
 from service.assets import check_path, unpack
 from service.domain import AssetKind
@@ -20,11 +20,21 @@ UNPACK_FACTOR: Final = 8
 _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 
 
-def files_of_upload(kind: AssetKind, filename: str, data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
+def files_of_upload(
+    kind: AssetKind, filename: str, data: bytes, *, limit_bytes: int, options: str = ""
+) -> dict[str, bytes]:
     """Files of an asset, `asset.json` among them, from an uploaded file or ZIP.
 
+    Args:
+        kind: hand or object.
+        filename: as the user called it.
+        data: its bytes.
+        limit_bytes: largest upload [bytes].
+        options: a JSON object; its keys go over those of `asset.json`.
+
     Raises:
-        InputError: empty, an unknown suffix, or a ZIP in which the main file cannot be told.
+        InputError: empty, an unknown suffix, options that are no JSON object, or a ZIP in which the main file cannot be
+            told.
         LimitError: the ZIP unpacks to more than `UNPACK_FACTOR` times the limit, or holds too many files.
     """
     leaf = PurePosixPath(filename.replace("\\", "/")).name
@@ -36,7 +46,20 @@ def files_of_upload(kind: AssetKind, filename: str, data: bytes, *, limit_bytes:
         files = {check_path(leaf): data}
     if "asset.json" not in files:
         files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
+    if options:
+        described = _json_object(files["asset.json"], "asset.json") | _json_object(options, "options")
+        files["asset.json"] = json.dumps(described).encode()
     return files
+
+
+def _json_object(text: bytes | str, what: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        raise InputError(f'{what} must be a JSON object such as {{"units": "mm"}}')
+    return value
 
 
 def name_of_upload(filename: str) -> str:

@@ -20,7 +20,7 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
         return
     typer.echo(f"{report['verdict']}: {report['message']}")
     for line in report["repairs"]:
-        typer.echo(f"  {'repair':<12} {line}")
+        typer.echo(f"  {'repair':<18} {line}")
     for line in summary(kind, report["facts"]):
         typer.echo(f"  {line}")
 
@@ -28,7 +28,7 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
     """Lines of a label and what it holds; a fact that is not there is left out."""
     pairs = _hand(facts) if kind is AssetKind.HAND else _object(facts)
-    return [f"{label:<12} {text}" for label, text in pairs]
+    return [f"{label:<18} {text}" for label, text in pairs]
 
 
 def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -67,6 +67,8 @@ def _object(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"largest surface deviation {1e3 * facts['deviation_m']:.2f} mm",
             )
         )
+    if facts.get("repair_deviation_m"):
+        lines.append(("repaired", f"surface moved by at most {1e3 * facts['repair_deviation_m']:.2g} mm"))
     if "volume_m3" in facts:
         mass = facts.get("mass_kg")
         lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg" if mass else "")))

@@ -50,9 +50,13 @@ def asset_router(kind: AssetKind) -> APIRouter:
         request: Request,
         catalog: CatalogOf,
         name: Annotated[Name | None, Form()] = None,
+        options: Annotated[
+            str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
+        ] = "",
     ) -> AssetView:
         """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
-        asset = store_upload(catalog, kind, file, name, limit_bytes=request.app.state.settings.max_upload_bytes)
+        limit = request.app.state.settings.max_upload_bytes
+        asset = store_upload(catalog, kind, file, name, limit_bytes=limit, options=options)
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         response.headers["Retry-After"] = "1"
         return asset
@@ -61,12 +65,12 @@ def asset_router(kind: AssetKind) -> APIRouter:
 
 
 def store_upload(
-    catalog: Catalog, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int
+    catalog: Catalog, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int, options: str = ""
 ) -> AssetView:
     """Take an upload whole: an asset of immutable bytes, and the task that checks it."""
     data = file.file.read(limit_bytes + 1)
     if len(data) > limit_bytes:
         raise LimitError(f"{file.filename} is larger than {limit_bytes} bytes; simplify it or raise the limit")
     filename = file.filename or ""
-    files = files_of_upload(kind, filename, data, limit_bytes=limit_bytes)
+    files = files_of_upload(kind, filename, data, limit_bytes=limit_bytes, options=options)
     return catalog.add_asset(kind, name or name_of_upload(filename), files)

@@ -1,0 +1,85 @@
+"""`graspd hands add` and `graspd objects add`: upload one with what its files do not say, and wait for its check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.reports import UrlOption, open_client, show_asset
+from api.uploads import name_of_upload
+from service.asset_options import (
+    AllowOpenOption,
+    ApproachOption,
+    DensityOption,
+    DropOption,
+    FixOption,
+    KeepLargestOption,
+    MassOption,
+    PalmOption,
+    PreShapeOption,
+    RootOption,
+    ScaleToOption,
+    UnitsOption,
+    hand_options,
+    object_options,
+)
+from service.cli import JsonFlag, reporting_errors
+from service.domain import AssetKind
+from service.errors import InputError
+
+NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
+WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
+
+
+@reporting_errors
+def add_hand(
+    file: Annotated[Path, typer.Argument(help="A URDF, or a ZIP of its folder.")],
+    name: NameOption = None,
+    palm: PalmOption = None,
+    approach: ApproachOption = None,
+    root: RootOption = None,
+    pre_shape: PreShapeOption = None,
+    fix: FixOption = None,
+    drop: DropOption = None,
+    wait: WaitOption = True,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload a hand, wait for its check, and say what was guessed."""
+    options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    _add(AssetKind.HAND, file, name, options, wait=wait, url=url, json=json)
+
+
+@reporting_errors
+def add_object(
+    file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one.")],
+    name: NameOption = None,
+    units: UnitsOption = None,
+    scale_to: ScaleToOption = None,
+    keep_largest: KeepLargestOption = False,
+    allow_open: AllowOpenOption = False,
+    density: DensityOption = None,
+    mass: MassOption = None,
+    wait: WaitOption = True,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload an object, wait for its check, and say what was repaired."""
+    options = object_options(
+        units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
+    )
+    _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
+
+
+def _add(
+    kind: AssetKind, file: Path, name: str | None, options: dict[str, Any], *, wait: bool, url: str | None, json: bool
+) -> None:
+    with open_client(url) as client:
+        asset = client.upload(kind, file, name=name or name_of_upload(file.name), options=options)
+        if wait:
+            asset = client.wait_checked(kind, asset.name)
+    show_asset(asset.model_dump(mode="json"), json=json)
+    if asset.verdict == "refuse":
+        raise InputError(f"refused: {asset.message}")

@@ -1,0 +1,90 @@
+"""What a user says about an upload reaches its check, and goes over what its own asset.json says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from api.uploads import files_of_upload
+from service.asset_options import hand_options, object_options
+from service.assets import builtin_files
+from service.domain import AssetKind, IngestMessage
+from service.library import load_asset_files, load_check
+from service.parts import Parts
+from worker.context import TaskContext
+from worker.stages import ingest
+
+
+def check(http: TestClient, parts: Parts, kind: AssetKind, file: tuple[str, bytes], options: dict[str, Any]) -> Any:
+    """Upload over HTTP and let the worker's stage check what the store then holds."""
+    answer = http.post(f"/v1/{kind.value}s", files={"file": file}, data={"options": json.dumps(options)})
+    assert answer.status_code == 202, answer.text
+    digest = answer.json()["digest"]
+    message = IngestMessage(schema_=1, task_id="i", kind=kind, name=answer.json()["name"], digest=digest)
+    ingest.run(message, TaskContext(parts.store))
+    return load_check(parts.store, kind, digest)
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "verdict", "volume"),
+    [
+        ("banana_in_millimetres.stl", {"units": "mm", "density": 950.0}, "accept", 171.3e-6),
+        ("banana_in_millimetres.stl", {"scale_to": 0.1}, "accept", 171.3e-6 * (0.1 / 0.1785) ** 3),
+        ("two_components.stl", {"keep_largest": True, "mass": 0.2}, "repair", 0.2647e-3),
+        ("open_shell.stl", {"allow_open": True}, "accept", None),
+        ("open_shell.stl", {}, "refuse", None),
+    ],
+)
+def test_an_option_of_an_object_decides_its_check(
+    http: TestClient, parts: Parts, shared_data: Path, file: str, options: dict[str, Any], verdict: str, volume: Any
+) -> None:
+    data = (shared_data / "bad" / file).read_bytes()
+    found = check(http, parts, AssetKind.OBJECT, (file, data), object_options(**options))
+    assert found["verdict"] == verdict, found["message"]
+    facts = found["facts"]
+    if volume is not None:
+        # Simplified within 0.3 mm: a per cent of the volume.
+        assert facts["volume_m3"] == pytest.approx(volume, rel=0.01)
+    if "density" in options:
+        assert facts["mass_kg"] == pytest.approx(options["density"] * facts["volume_m3"])
+    if "mass" in options:
+        assert facts["mass_kg"] == options["mass"]
+
+
+def test_the_options_of_a_hand_decide_its_check(http: TestClient, parts: Parts) -> None:
+    urdf = builtin_files(AssetKind.HAND, "allegro")["allegro.urdf"]
+    options = hand_options(
+        palm="palm",
+        approach="0,0,1",
+        pre_shape=["index_proximal=0.5,middle_proximal=0.6"],
+        fix=["thumb_rotation=1.0"],
+        drop=["ring_proximal_link"],
+    )
+    facts = check(http, parts, AssetKind.HAND, ("mine.urdf", urdf), options)["facts"]
+    assert facts["palm_approach"] == [0.0, 0.0, 1.0]
+    assert facts["preshape"]["index_proximal"] == 0.5 and facts["preshape"]["middle_proximal"] == 0.6
+    assert "thumb_rotation" not in facts["dofs"]
+    assert not [name for name in facts["dofs"] if name.startswith("ring_m")]
+    assert "palm" not in facts["guessed"] and "closing" in facts["guessed"]
+
+
+def test_options_stand_over_the_asset_json_of_the_upload() -> None:
+    options = json.dumps({"units": "mm"})
+    files = files_of_upload(AssetKind.OBJECT, "b.stl", b"solid", limit_bytes=99, options=options)
+    assert json.loads(files["asset.json"]) == {"file": "b.stl", "units": "mm"}
+
+
+@pytest.mark.parametrize("options", ["{", "[]", "3", "[" * 5000])
+def test_options_that_are_no_json_object_are_refused(http: TestClient, options: str) -> None:
+    answer = http.post("/v1/objects", files={"file": ("b.stl", b"solid")}, data={"options": options})
+    assert answer.status_code == 422 and "JSON object" in answer.json()["detail"]
+
+
+def test_the_other_keys_stay_as_uploaded(http: TestClient, parts: Parts) -> None:
+    answer = http.post("/v1/objects", files={"file": ("b.stl", b"solid b\nendsolid b")}).json()
+    files = load_asset_files(parts.store, AssetKind.OBJECT, answer["digest"])
+    assert json.loads(files["asset.json"]) == {"file": "b.stl"}
