@@ -1,4 +1,4 @@
-"""What a check found, in lines for people: sizes, what was guessed, what was repaired."""
+"""What a check found, in lines for people: sizes, what was guessed. Messages tell the repairs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import typer
 
 from service.domain import AssetKind
 
-_OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,...", "closing": "closing"}
+#: Rounding moves a surface so far; it is no news [m].
+_NOTHING_M = 1e-7
+_OVERRIDES = {
+    "palm": "--palm LINK --approach x,y,z",
+    "preshape": "--pre-shape JOINT=VALUE,...",
+}
 
 
 def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
@@ -19,8 +24,6 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
         typer.echo(f"graspd: refused: {report['message']}", err=True)
         return
     typer.echo(f"{report['verdict']}: {report['message']}")
-    for line in report["repairs"]:
-        typer.echo(f"  {'repair':<18} {line}")
     for line in summary(kind, report["facts"]):
         typer.echo(f"  {line}")
 
@@ -42,8 +45,7 @@ def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "dofs" in facts:
         lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
         lines += [("", _dof(name, facts)) for name in facts["dofs"]]
-    lines += [("note", note) for note in facts.get("notes", [])]
-    mend = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES and key != "closing"]
+    mend = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES]
     if guessed:
         lines.append(("guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(mend) if mend else ''}"))
     return lines
@@ -67,12 +69,11 @@ def _object(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
                 f"largest surface deviation {1e3 * facts['deviation_m']:.2f} mm",
             )
         )
-    if facts.get("repair_deviation_m"):
-        lines.append(("repaired", f"surface moved by at most {1e3 * facts['repair_deviation_m']:.2g} mm"))
+    if (moved := facts.get("repair_deviation_m")) is not None and moved > _NOTHING_M:
+        lines.append(("repaired", f"surface moved by at most {1e3 * moved:.2g} mm"))
     if "volume_m3" in facts:
         mass = facts.get("mass_kg")
         lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg" if mass else "")))
-    lines += [("note", note) for note in facts.get("notes", [])]
     return lines
 
 
