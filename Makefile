@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: help install demo test test-slow check format browser extras docs clean
+.PHONY: help install demo test test-slow check format browser docs clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
@@ -35,6 +35,10 @@ check: $(STAMP) ## format, lint, types, import contract
 format: $(STAMP) ## rewrite the sources in the house style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+browser: $(STAMP) ## Chromium and Playwright for the dashboard's tests (Debian, as root)
+	command -v chromium > /dev/null || { apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs

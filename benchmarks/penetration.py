@@ -1,0 +1,70 @@
+"""Penetration, contact and variety of the planner's grasps with and without the final projection, as Markdown.
+
+usage: python benchmarks/penetration.py DATA_DIR     DATA_DIR holds hands/ and objects/ (YCB) and bad/
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from service.domain import FIDELITIES
+from worker.hands.kinematics import body_poses
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.hands.surface import sample_surface
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.quality.table import measure
+from worker.transforms import apply
+
+COMPACT = ("061_foam_brick", "005_tomato_soup_can", "006_mustard_bottle", "011_banana", "056_tennis_ball")
+SHELLS = ("025_mug", "024_bowl")
+THIN = ("037_scissors", "048_hammer")
+GRASPS = 32
+
+
+def nearest_mm(hand: HandModel, poses: np.ndarray, joints: np.ndarray) -> float:
+    """Smallest mean distance between the same surface points of two grasps [mm]."""
+    points = sample_surface(hand, 200)
+    bodies = body_poses(hand, poses, joints)
+    world = apply(bodies[:, points.body], points.position)
+    distance = np.linalg.norm(world[:, None] - world[None], axis=-1).mean(axis=-1)
+    return 1e3 * float(distance[np.triu_indices(len(poses), 1)].min())
+
+
+def row(hand: HandModel, path: Path, label: str, polish: bool) -> str:
+    fidelity = FIDELITIES["standard"]
+    if not polish:
+        fidelity = fidelity.model_copy(update={"polish_iterations": 0})
+    obj = object_from_path(path, face_error_m=fidelity.face_error_m)
+    found = synthesize(hand, obj, count=GRASPS, fidelity=fidelity, seed=2, device="cpu")
+    quality = measure(hand, obj, found, friction=1.0)
+    depth, own = quality["quality/penetration_depth_mm"], quality["quality/self_penetration_depth_mm"]
+    column = int(np.argmin(np.abs(quality["quality/thresholds_m"] - 0.005)))
+    area = quality["quality/contact_area_cm2"][:, column]
+    shallow = 100 * (depth < 1).mean()
+    return (
+        f"| {label} | {'yes' if polish else 'no'} | {depth.mean():.2f} | {depth.max():.1f} | {shallow:.0f} % "
+        f"| {own.mean():.2f} | {area.mean():.1f} | {quality['quality/epsilon'][:, column].mean():.2f} "
+        f"| {nearest_mm(hand, found.grasp.hand_pose, found.grasp.joint_positions):.0f} |"
+    )
+
+
+def main(data: Path) -> None:
+    hand = hand_from_path(data / "hands" / "allegro" / "allegro_hand_right.urdf")
+    sys.stdout.write(
+        "| object | projection | mean depth mm | max | below 1 mm | self mean mm | contact cm2 | ε | nearest two mm |\n"
+        "| --- | --- | --: | --: | --: | --: | --: | --: | --: |\n"
+    )
+    objects = [(name, data / "objects" / name / "clean.stl") for name in (*COMPACT, *SHELLS, *THIN)]
+    for name, path in [*objects, ("plate of 1 mm", data / "bad" / "thin_sheet_1mm.stl")]:
+        for polish in (False, True):
+            sys.stdout.write(row(hand, path, name, polish) + "\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
