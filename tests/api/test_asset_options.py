@@ -13,7 +13,7 @@ from api.uploads import files_of_upload
 from service.asset_options import hand_options, object_options
 from service.assets import builtin_files
 from service.domain import AssetKind, IngestMessage
-from service.library import load_asset_files, load_check
+from service.library import load_asset, load_asset_files, load_check
 from service.parts import Parts
 from worker.context import TaskContext
 from worker.stages import ingest
@@ -82,6 +82,18 @@ def test_options_stand_over_the_asset_json_of_the_upload() -> None:
 def test_options_that_are_no_json_object_are_refused(http: TestClient, options: str) -> None:
     answer = http.post("/v1/objects", files={"file": ("b.stl", b"solid")}, data={"options": options})
     assert answer.status_code == 422 and "JSON object" in answer.json()["detail"]
+
+
+def test_what_was_refused_gets_in_under_its_name_with_the_mend(
+    http: TestClient, parts: Parts, shared_data: Path
+) -> None:
+    file = ("open_shell.stl", (shared_data / "bad" / "open_shell.stl").read_bytes())
+    first = http.post("/v1/objects", files={"file": file}).json()
+    asset = load_asset(parts.store, AssetKind.OBJECT, first["digest"])
+    parts.index.add_asset(asset, check(http, parts, AssetKind.OBJECT, file, {}))
+    second = http.post("/v1/objects", files={"file": file}, data={"options": '{"allow_open": true}'})
+    assert second.status_code == 202, second.text
+    assert http.get("/v1/objects/open_shell").json()["digest"] == second.json()["digest"] != first["digest"]
 
 
 def test_the_other_keys_stay_as_uploaded(http: TestClient, parts: Parts) -> None:
