@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from api.add_sets import add_set, files_of_set
 from api.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
 from service.asset_options import (
@@ -54,7 +55,7 @@ def add_hand(
 
 @reporting_errors
 def add_object(
-    file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one.")],
+    file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one; or a folder or ZIP of many objects.")],
     name: NameOption = None,
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
@@ -66,10 +67,13 @@ def add_object(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload an object, wait for its check, and say what was repaired."""
+    """Upload an object or a whole set of them, wait for the check, and say what was repaired."""
     options = object_options(
         units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
     )
+    if files := files_of_set(file):
+        add_set(files, prefix=name, options=options, wait=wait, url=url, json=json)
+        return
     _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
 
 

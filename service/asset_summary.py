@@ -28,6 +28,11 @@ def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
         typer.echo(f"  {line}")
 
 
+def verdict_line(asset: Mapping[str, Any]) -> str:
+    """An asset of a list in one line."""
+    return f"{asset['verdict'] or 'waiting':<8} {asset['message'] or asset['name']}"
+
+
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
     """Lines of a label and what it holds; a fact that is not there is left out."""
     pairs = _hand(facts) if kind is AssetKind.HAND else _object(facts)

@@ -9,8 +9,9 @@ from typing import Final
 
 from service.assets import MAX_FILES, unpack
 from service.errors import InputError, LimitError
-from worker.objects.formats import READERS
 
+#: Meshes by their file names.
+SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
 #: Of several meshes of one object the first of these stems is taken: what closed and cleaned scans are called.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Folders inside an object's folder that say how the mesh was made, not what it shows.
@@ -32,9 +33,9 @@ def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:
     Raises:
         InputError: there is no mesh.
     """
-    meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in READERS)
+    meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
-        raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(READERS)}")
+        raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
     owners: dict[tuple[str, ...], list[str]] = {}
     for mesh in meshes:
         owners.setdefault(_owner(mesh), []).append(mesh)
@@ -61,7 +62,7 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
         raise InputError(f"{path} is neither a folder nor a ZIP of meshes")
     root, files, total = path.resolve(), dict[str, bytes](), 0
     for file in sorted(root.rglob("*")):
-        wanted = file.suffix.lower() in READERS or file.name == "asset.json"
+        wanted = file.suffix.lower() in SUFFIXES or file.name == "asset.json"
         if not wanted or not file.is_file() or not file.resolve().is_relative_to(root):
             continue
         total += file.stat().st_size

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.errors import InputError, LimitError
-from worker.objects.sets import object_set, read_set
+from service.object_sets import object_set, read_set
 
 
 def names(*paths: str) -> dict[str, list[str]]:

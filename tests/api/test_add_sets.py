@@ -1,0 +1,73 @@
+"""A folder of meshes on the command line: which objects it is, and that one bad mesh stops nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+from api import add_sets
+from api.add_commands import add_object
+from api.add_sets import files_of_set
+from api.client import Client
+from service.assets import pack
+from service.domain import AssetKind
+
+STL = b"solid box\nendsolid box\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A set as YCB is laid out, with one object whose description is broken."""
+    root = tmp_path / "ycb"
+    for name in ("003_cracker_box", "025_mug", "broken"):
+        (root / name / "google_16k").mkdir(parents=True)
+        (root / name / "google_16k" / "nontextured.stl").write_bytes(STL + name.encode())
+    (root / "broken" / "google_16k" / "asset.json").write_text("{}")
+    return root
+
+
+def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> tuple[int, dict[str, list[object]]]:
+    client = Client("http://127.0.0.1:8000")
+    client._http = http
+    monkeypatch.setattr(client, "close", lambda: None)
+    monkeypatch.setattr(add_sets, "open_client", lambda url: client)
+    app = typer.Typer()
+    app.command()(add_object)
+    result = CliRunner().invoke(app, [*arguments, "--no-wait", "--json"])
+    return result.exit_code, json.loads(result.stdout.splitlines()[-1])
+
+
+def test_every_object_of_a_folder_is_uploaded_and_a_bad_one_stops_nothing(
+    monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
+) -> None:
+    code, told = add(monkeypatch, http, str(folder), "--units", "mm")
+    assert (code, told["refused"]) == (2, ["broken"])
+    known = {asset["name"] for asset in http.get(f"/v1/{AssetKind.OBJECT.value}s").json()["items"]}
+    assert {"003_cracker_box", "025_mug"} <= known and "broken" not in known
+
+
+def test_adding_a_set_again_changes_nothing(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
+    add(monkeypatch, http, str(folder))
+    before = http.get("/v1/objects").json()
+    add(monkeypatch, http, str(folder))
+    assert http.get("/v1/objects").json() == before
+
+
+def test_a_name_goes_before_those_of_the_set(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
+    _, told = add(monkeypatch, http, str(folder), "--name", "ycb")
+    assert told["refused"] == ["ycb-broken"]
+
+
+def test_a_zip_of_several_meshes_is_a_set_and_of_one_is_an_object(tmp_path: Path) -> None:
+    (tmp_path / "many.zip").write_bytes(pack({"egad/A0.obj": b"v", "egad/B1.obj": b"v"}))
+    (tmp_path / "one.zip").write_bytes(pack({"A0.obj": b"v"}))
+    described = {"asset.json": b'{"file": "a.obj"}', "a.obj": b"v", "b.obj": b"v"}
+    (tmp_path / "described.zip").write_bytes(pack(described))
+    assert set(files_of_set(tmp_path / "many.zip") or {}) == {"A0", "B1"}
+    assert files_of_set(tmp_path / "one.zip") is None
+    assert files_of_set(tmp_path / "described.zip") is None
