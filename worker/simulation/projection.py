@@ -23,15 +23,15 @@ CAPACITY: Final = 1024
 class ProjectionOptions:
     """Clearances in metres."""
 
-    near: float = 3e-4
+    near: float = 2e-4
     """Hand points nearer to the object than this are moved ..."""
-    target: float = 5e-4
+    target: float = 3.5e-4
     """... to this distance."""
     hold: float = 2e-3
     """Points nearer than this are contacts, drawn to `hold_target` with weight `hold_weight`."""
     hold_target: float = 5e-4
-    hold_weight: float = 0.01
-    sample_near: float = 4e-4
+    hold_weight: float = 0.02
+    sample_near: float = 2.5e-4
     """Object samples nearer to a link than this are moved to `target`."""
     self_near: float = 2e-4
     self_target: float = 5e-4
