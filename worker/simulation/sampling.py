@@ -5,24 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.hands.surface import farthest_points
 from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
 
 #: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))
-
-
-def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
-    """Indices of `count` of the points (n, 3), each the farthest from those before it; the first is point 0."""
-    chosen = np.empty(min(count, len(points)), dtype=np.intp)
-    distance = np.full(len(points), np.inf)
-    pick = 0
-    for k in range(len(chosen)):
-        chosen[k] = pick
-        np.minimum(distance, ((points - points[pick]) ** 2).sum(axis=1), out=distance)
-        pick = int(np.argmax(distance))
-    return chosen
 
 
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
@@ -38,7 +27,6 @@ def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
     a, b, c = (corners[faces, k] for k in range(3))
     inner = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     edges = _edge_samples(obj, cross / area[:, None].clip(1e-18), count, rng)
-    # Edge points first: farthest-point thinning keeps early points where it has a choice.
     points = np.concatenate([edges, inner])
     return points[farthest_points(points, count)]
 

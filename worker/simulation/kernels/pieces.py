@@ -90,6 +90,19 @@ def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
     return wp.vec4(n[0], n[1], n[2], d)
 
 
+@wp.func
+def world_extent(q: wp.quat, half: wp.vec3):
+    """Half extents along the world's axes of a box turned by q."""
+    ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
+    ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
+    ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
+    return wp.vec3(
+        wp.abs(ex[0]) + wp.abs(ey[0]) + wp.abs(ez[0]),
+        wp.abs(ex[1]) + wp.abs(ey[1]) + wp.abs(ez[1]),
+        wp.abs(ex[2]) + wp.abs(ey[2]) + wp.abs(ez[2]),
+    )
+
+
 @wp.kernel
 def object_in_pieces(
     pieces_in: Pieces,
@@ -117,14 +130,7 @@ def object_in_pieces(
     q = body_q_in[b, body] * pieces_in.pose_q[piece]
     p = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], pieces_in.pose_p[piece])
     half = pieces_in.half[piece]
-    ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
-    ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
-    ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
-    extent = wp.vec3(
-        wp.abs(ex[0]) + wp.abs(ey[0]) + wp.abs(ez[0]),
-        wp.abs(ex[1]) + wp.abs(ey[1]) + wp.abs(ez[1]),
-        wp.abs(ex[2]) + wp.abs(ey[2]) + wp.abs(ez[2]),
-    )
+    extent = world_extent(q, half)
     weight = 2.0 * sample_weight_in * weight_in[iteration_in[0]]
     force = wp.vec3(0.0)
     torque = wp.vec3(0.0)

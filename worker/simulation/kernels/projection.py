@@ -8,7 +8,7 @@ sample to a link, or of a point of one link to another link.
 import warp as wp
 
 from worker.simulation.kernels.kinematics import Tree
-from worker.simulation.kernels.pieces import BodyPoints, Pieces, may_touch, piece_distance
+from worker.simulation.kernels.pieces import BodyPoints, Pieces, may_touch, piece_distance, world_extent
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,14 +87,7 @@ def sample_residuals(
     q = body_q_in[b, body] * pieces_in.pose_q[piece]
     p = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], pieces_in.pose_p[piece])
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
-    ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
-    ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
-    ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
-    extent = wp.vec3(
-        wp.abs(ex[0]) + wp.abs(ey[0]) + wp.abs(ez[0]),
-        wp.abs(ex[1]) + wp.abs(ey[1]) + wp.abs(ez[1]),
-        wp.abs(ex[2]) + wp.abs(ey[2]) + wp.abs(ez[2]),
-    )
+    extent = world_extent(q, half)
     query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
     index = wp.int32(0)
     while wp.bvh_query_next(query, index):
