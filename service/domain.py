@@ -101,6 +101,9 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
     "control": Fidelity(name="control", simulate=False),
 }  # fmt: skip
 
+#: Fidelities offered to users; the others are for comparison.
+OFFERED: Final = ("draft", "standard", "fine")
+
 
 def resolve_fidelity(value: str | Fidelity) -> Fidelity:
     """The knobs behind a fidelity's name.

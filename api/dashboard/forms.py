@@ -15,7 +15,7 @@ from api.catalog import Catalog
 from api.dashboard.rendering import render
 from api.dependencies import CatalogOf, may_read, may_submit
 from api.routes.assets import store_upload
-from service.domain import FIDELITIES, AssetKind, JobRequest
+from service.domain import OFFERED, AssetKind, JobRequest
 from service.errors import GraspdError, InputError
 from service.index.views import AssetView
 
@@ -128,7 +128,7 @@ def _form(
         problem=problem,
         hands=_choices(catalog, AssetKind.HAND),
         objects=_choices(catalog, AssetKind.OBJECT),
-        fidelities=[(name, name) for name in FIDELITIES],
+        fidelities=[(name, name) for name in OFFERED],
         max_upload=request.app.state.settings.max_upload_bytes,
     )
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.domain import FIDELITIES, Fidelity
+from service.domain import FIDELITIES, OFFERED, Fidelity
 from service.errors import InputError
 from worker.devices import Device
 
@@ -22,7 +22,7 @@ app = typer.Typer()
 def bench(
     hand: Annotated[str, typer.Option(help="A URDF, a ZIP with one, or a built-in hand.")] = "allegro",
     object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "mug",
-    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; give it several times. Default: all.")] = None,
+    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; give it several times. Default: all offered.")] = None,
     batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; several times.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; several times.")] = None,
     points: Annotated[list[int] | None, typer.Option(min=16, help="Also sweep the fine phase's hand points.")] = None,
@@ -59,7 +59,7 @@ def bench(
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
     """The named fidelities, then the first of them with one knob changed at a time."""
-    chosen = names or list(FIDELITIES)
+    chosen = names or list(OFFERED)
     if unknown := [name for name in chosen if name not in FIDELITIES]:
         raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {', '.join(FIDELITIES)}")
     found = [FIDELITIES[name] for name in chosen]
