@@ -93,7 +93,7 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
         name="fine", starts=6, finalists=3, coarse_points=400, fine_points=4000, object_points=8000, face_error_m=1e-4,
         coarse_iterations=120, fine_iterations=60, polish_iterations=15,
     ),
-    # As the paper writes it: plain descent with one rate, one sweep of contacts, no penalty on penetration, no selection.
+    # As the paper writes it: plain descent with one rate, one sweep of contacts, no penetration penalty, no selection.
     "paper": Fidelity(
         name="paper", starts=1, finalists=1, coarse_points=2000, coarse_iterations=200, fine_iterations=0, patience=0,
         polish_iterations=0, contact_solver="gauss_seidel", optimizer="gd", leak="two_sided", phong_alpha=0.75,

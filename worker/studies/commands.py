@@ -22,7 +22,7 @@ app = typer.Typer()
 def bench(
     hand: Annotated[str, typer.Option(help="A URDF, a ZIP with one, or a built-in hand.")] = "allegro",
     object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "mug",
-    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; give it several times. Default: all offered.")] = None,
+    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; several times. Default: all offered.")] = None,
     batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; several times.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; several times.")] = None,
     points: Annotated[list[int] | None, typer.Option(min=16, help="Also sweep the fine phase's hand points.")] = None,
