@@ -1,4 +1,4 @@
-"""Every bad file from its upload to its verdict, and what attacks a reader: refused in bounded time, worker unharmed."""
+"""Every bad file from upload to verdict; attacks on a reader are refused in bounded time, the worker unharmed."""
 
 from __future__ import annotations
 

@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 FRICTION: Final = 0.3
 #: Weight of L_stable against the residual of the balance.
 STABILITY: Final = 0.05
+#: Weight of penetration [1/m] above the tolerated [m]: a millimetre too deep outweighs most of an unbalanced grasp.
+DEPTH: Final = 200.0
+TOLERATED_M: Final = 5e-4
 
 
 def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
@@ -28,10 +31,14 @@ def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
     return Posture(np.concatenate([root, state.rotation], axis=1), hand.expand(state.q))
 
 
-def merits(hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats) -> Floats:
-    """(n,) the smaller the better: residual of balanced contact forces, plus a little of L_stable (n,)."""
+def merits(hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
+    """(n,) the smaller the better: residual of balanced contact forces, a little of L_stable (n,), and what the
+    penetration `depths` (n,) [m] have above the tolerated."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=FRICTION)
-    return np.array([hold.residual for hold in holds]) + STABILITY * losses
+    merit = np.array([hold.residual for hold in holds]) + STABILITY * losses
+    if depths is not None:
+        merit += DEPTH * np.maximum(depths - TOLERATED_M, 0.0)
+    return merit
 
 
 def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:

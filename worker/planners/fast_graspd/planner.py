@@ -134,10 +134,10 @@ def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, ste
     simulation = pair.simulation(pair.fine, n * finalists)
     state = _optimize(simulation, state, fine_schedule(fidelity), fidelity, steps, "fine", part.curve)
     losses = _losses(simulation, state)
-    if fidelity.polish_iterations:
-        state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
+    # Without iterations this only tells how deep each hand is.
+    state, depths = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
     if finalists > 1:
-        winners = best_of_each(merits(hand, obj, state, losses), n, 1)
+        winners = best_of_each(merits(hand, obj, state, losses, depths), n, 1)
         state, losses = state[winners], losses[winners]
     part.state, part.loss = state, losses
 
