@@ -43,7 +43,7 @@ def bench(
         hand_from_path(hand),
         lambda error: object_from_path(object_, face_error_m=error),
         fidelities=_fidelities(fidelity, points, face_error),
-        batches=batch or [1, 8, 32, 128],
+        batches=batch or [1, 8, 32, 256],
         threads=threads or ([1] if resolved != "cpu" else sorted({1, os.cpu_count() or 1})),
         device=resolved,
         repeats=repeats,

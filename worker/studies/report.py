@@ -26,7 +26,8 @@ def table(result: dict[str, Any]) -> str:
         shares = ", ".join(f"{kernel} {100 * share:.0f} %" for kernel, share in phase["share"].items() if share >= 0.01)
         lines += [
             "",
-            f"{name}: {phase['points']} points, {phase['ms_per_iteration']:.2f} ms per iteration on one thread "
+            f"{name}: {phase['points']} points, {phase['ms_per_iteration']:.2f} ms per iteration on one thread, "
+            f"{phase['iterations_to_convergence']:.0f} iterations to convergence "
             f"({shares}); {phase['queries_per_second'] / 1e6:.2f} M distances/s",
         ]
     start = result["start"]

@@ -37,15 +37,33 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
         if len(schedule) < 2:
             continue
         simulation = pair.simulation(side, count)
+        used = _iterations_used(simulation, state, schedule, fidelity, name)
         times, state = _timed(simulation, state, schedule, fidelity)
         total = sum(times.values())
         phases[name] = {
+            "iterations_to_convergence": round(used, 1),
             "ms_per_iteration": round(1e3 * total, 3),
             "points": len(side.points),
             "share": {kernel: round(t / total, 4) for kernel, t in sorted(times.items(), key=lambda item: -item[1])},
             "queries_per_second": round(count * len(side.points) / times["gather"]) if times.get("gather") else None,
         }
     return phases
+
+
+def _iterations_used(
+    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, phase: str
+) -> float:
+    """Mean iterations until a hand is switched off; the coarse phase always runs to its end."""
+    if phase == "coarse" or not fidelity.patience:
+        return float(len(schedule))
+    simulation.set_schedule(schedule)
+    simulation.set_state(state)
+    simulation.record_iteration(fidelity.optimizer, patience=fidelity.patience)
+    alive = 0
+    for _ in range(len(schedule)):
+        alive += int(simulation.active.numpy().sum())
+        simulation.run()
+    return alive / len(state.pivot)
 
 
 def _timed(

@@ -59,6 +59,7 @@ def test_kernel_shares_add_up_and_the_distance_query_is_among_them() -> None:
     for phase in kernel_shares(pair, fidelity, 4).values():
         assert sum(phase["share"].values()) == pytest.approx(1.0, abs=2e-3)
         assert phase["share"]["gather"] > 0
+        assert 1 <= phase["iterations_to_convergence"] <= fidelity.coarse_iterations
         assert phase["queries_per_second"] > 0
 
 
