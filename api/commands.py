@@ -37,6 +37,9 @@ def submit(
     scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 0,
     views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
     stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    width: Annotated[int, typer.Option(help="Picture width [px].")] = 320,
+    height: Annotated[int, typer.Option(help="Picture height [px].")] = 240,
+    channels: Annotated[list[str] | None, typer.Option(help="distance, normals or occlusion; several times.")] = None,
     friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
     wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
     url: UrlOption = None,
@@ -55,6 +58,9 @@ def submit(
                 "scenes": scenes,
                 "views": views,
                 "stereo": stereo,
+                "width": width,
+                "height": height,
+                "channels": channels or [],
                 "friction": friction,
             }
         )

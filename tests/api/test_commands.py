@@ -70,6 +70,14 @@ def test_a_submitted_job_is_listed_shown_cancelled_and_retried(graspd: Shell) ->
     assert graspd.json("logs", job["job"])["attempts"] == []
 
 
+def test_a_job_can_ask_for_larger_pictures_with_more_channels(graspd: Shell) -> None:
+    wanted = ("--scenes", "1", "--views", "1", "--channels", "normals", "--width", "640", "--height", "480")
+    plain = graspd.json("submit", "--hand", "allegro", "--object", "mug", "--scenes", "1", "--views", "1")
+    rich = graspd.json("submit", "--hand", "allegro", "--object", "mug", *wanted)
+    assert rich["state"] == "queued"
+    assert rich["job"] != plain["job"], "other pictures are another job"
+
+
 def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
     assert "allegro" in {hand["name"] for hand in graspd.json("hands", "list")["hands"]}
     assert graspd.json("objects", "show", "mug")["verdict"] == "accept"
@@ -89,6 +97,7 @@ def test_an_object_can_be_added_from_a_file(graspd: Shell, tmp_path: Path) -> No
         (("--hand", "allegro", "--object", "mug", "-n", "-5"), "--grasps"),
         (("--hand", "allegro", "--object", "mug", "--fidelity", "perfect"), "standard"),
         (("--hand", "allegro", "--object", "mug", "--views", "2"), "scenes"),
+        (("--hand", "allegro", "--object", "mug", "--channels", "infrared"), "channels"),
         (("--hand", "allegro", "--object", "nowhere/box.stl"), "nowhere/box.stl"),
     ],
 )
