@@ -1,0 +1,63 @@
+"""What parts of the recipe buy: success of Allegro grasps with one thing changed at a time, as Markdown.
+
+usage: python benchmarks/recipes.py DATA_DIR     DATA_DIR holds hands/ and objects/
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.domain import FIDELITIES, Fidelity
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.quality.referee.judge import judge
+
+OBJECTS = ("003_cracker_box", "011_banana", "006_mustard_bottle", "048_hammer", "077_rubiks_cube", "035_power_drill")
+GRASPS = 32
+SEED = 101
+CHANGES: dict[str, dict[str, Any]] = {
+    "standard": {},
+    "one start, no selection": {"starts": 1, "finalists": 1},
+    "two starts, both finish": {"starts": 2, "finalists": 2},
+    "four starts, one finishes": {"starts": 4, "finalists": 1},
+    "no projection": {"polish_iterations": 0},
+    "first dilation where it touches": {"dilation": "touch"},
+    "13 velocities": {"velocities": 13},
+    "contacts by averaged Jacobi": {"contact_solver": "jacobi"},
+    "contacts by Gauss-Seidel": {"contact_solver": "gauss_seidel"},
+}
+
+
+def recipes() -> dict[str, Fidelity]:
+    standard = FIDELITIES["standard"]
+    found = {name: standard.model_copy(update=change) for name, change in CHANGES.items()}
+    return found | {
+        "attraction alone, no simulation": FIDELITIES["control"],
+        "the paper's, as written": FIDELITIES["paper"],
+    }
+
+
+def main(data: Path) -> None:
+    hand = hand_from_path(data / "hands" / "allegro" / "allegro_hand_right.urdf")
+    error = FIDELITIES["standard"].face_error_m
+    objects = [object_from_path(data / "objects" / name / "clean.stl", face_error_m=error) for name in OBJECTS]
+    sys.stdout.write("| recipe | success | seconds per 32 grasps |\n| --- | --: | --: |\n")
+    for name, fidelity in recipes().items():
+        rates, seconds = [], 0.0
+        for obj in objects:
+            began = time.perf_counter()
+            found = synthesize(hand, obj, count=GRASPS, fidelity=fidelity, seed=SEED, device="cpu")
+            seconds += time.perf_counter() - began
+            rates.append(float(judge(hand, obj, found).success.mean()))
+        sys.stdout.write(f"| {name} | {np.mean(rates):.2f} | {seconds / len(objects):.1f} |\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
