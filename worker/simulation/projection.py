@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from worker.simulation.kernels import projection as kernels
-from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.simulation.simulation import HandState, Simulation, still_schedule
 from worker.transforms import quat_from_axis_angle, quat_multiply
 
 Floats = NDArray[np.float64]
@@ -55,12 +55,6 @@ def _residuals(capacity: int) -> Any:
     return out
 
 
-def exact_schedule() -> Schedule:
-    """Tables for a simulation that only tells distances."""
-    zero = np.zeros(1)
-    return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))
-
-
 class Projection:
     """Moves the hands of a simulation; keeps of each the least penetrating state it saw."""
 
@@ -81,7 +75,7 @@ class Projection:
         """
         sim = self.simulation
         n = len(state.pivot)
-        sim.set_schedule(exact_schedule())
+        sim.set_schedule(still_schedule())
         sim.record_placement()
         best, depth = state, np.full(n, np.inf)
         current = state

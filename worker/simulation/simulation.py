@@ -68,6 +68,12 @@ class Schedule:
         return len(self.dilation)
 
 
+def still_schedule() -> Schedule:
+    """Tables for telling distances and depths only: no dilation, no weights, no step."""
+    zero = np.zeros(1)
+    return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))
+
+
 @dataclass
 class HandState:
     """State of B hands: pivot (B, 3) = palm centre relative to the object's centre of mass, rotation (B, 4) w x y z,

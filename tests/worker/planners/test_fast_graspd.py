@@ -92,6 +92,11 @@ def test_the_papers_plain_descent_runs_and_stays_finite() -> None:
     assert np.all(np.isfinite(found.grasp.hand_pose)) and np.all(np.isfinite(found.grasp.joint_positions))
 
 
+def test_without_a_fine_phase_the_loss_is_that_of_the_coarse_one() -> None:
+    found = grasps(3, fidelity=QUICK.model_copy(update={"fine_iterations": 0}))
+    assert np.all(found.stability_loss > 0)
+
+
 def test_cancelling_stops_within_a_few_iterations() -> None:
     calls, stop = [], threading.Event()
 

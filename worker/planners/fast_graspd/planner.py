@@ -107,7 +107,12 @@ def optimise_batch(
 
 def _hands(fidelity: Fidelity) -> int:
     """Hand iterations that one grasp costs."""
-    return fidelity.starts * fidelity.coarse_iterations + fidelity.finalists * fidelity.fine_iterations
+    return fidelity.starts * fidelity.coarse_iterations + _finalists(fidelity) * fidelity.fine_iterations
+
+
+def _finalists(fidelity: Fidelity) -> int:
+    """Hands of a grasp that enter the fine phase: no more than set out."""
+    return min(fidelity.finalists, fidelity.starts)
 
 
 def _cut(count: int, threads: int, device: str) -> list[range]:
@@ -121,7 +126,7 @@ def _cut(count: int, threads: int, device: str) -> list[range]:
 
 def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
     n, hand, obj = len(part.indices), pair.hand.model, pair.fine.obj.model
-    finalists = min(fidelity.finalists, fidelity.starts)
+    finalists = _finalists(fidelity)
     probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
     state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices, each=fidelity.starts)
     touch = nearest_distances(probe, state) / DILATION if fidelity.dilation == "touch" else None
@@ -129,11 +134,14 @@ def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, ste
     part.curve = []
     simulation = pair.simulation(pair.coarse, n * fidelity.starts)
     state = _optimize(simulation, state, coarse_schedule(fidelity), fidelity, steps, "coarse", part.curve, touch)
+    losses = _losses(simulation, state)
     if finalists < fidelity.starts:
-        state = state[best_of_each(merits(hand, obj, state, _losses(simulation, state)), n, finalists)]
+        chosen = best_of_each(merits(hand, obj, state, losses), n, finalists)
+        state, losses = state[chosen], losses[chosen]
     simulation = pair.simulation(pair.fine, n * finalists)
     state = _optimize(simulation, state, fine_schedule(fidelity), fidelity, steps, "fine", part.curve)
-    losses = _losses(simulation, state)
+    if fidelity.fine_iterations:
+        losses = _losses(simulation, state)
     # Without iterations this only tells how deep each hand is.
     state, depths = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
     if finalists > 1:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.errors import InputError
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.simulation.simulation import HandState, Simulation, still_schedule
 from worker.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 
 Floats = NDArray[np.float64]
@@ -90,12 +90,6 @@ def _retreated(draws: list[_Draw]) -> HandState:
     )
 
 
-def placement_schedule() -> Schedule:
-    """Tables for telling penetration only: no dilation, no weights."""
-    zero = np.zeros(1)
-    return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))
-
-
 def sample_starts(
     hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range, each: int
 ) -> HandState:
@@ -106,7 +100,7 @@ def sample_starts(
     Raises:
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
-    probe.set_schedule(placement_schedule())
+    probe.set_schedule(still_schedule())
     probe.record_placement()
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     best: list[tuple[float, HandState] | None] = [None] * len(generators)

@@ -91,6 +91,27 @@ def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
 
 
 @wp.func
+def piece_rotation(pieces: Pieces, piece: wp.int32, b: wp.int32, body_q: wp.array2d(dtype=wp.quat)):
+    """Rotation of a piece's frame in the object's."""
+    return body_q[b, pieces.body[piece]] * pieces.pose_q[piece]
+
+
+@wp.func
+def piece_centre(
+    pieces: Pieces, piece: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
+):  # fmt: skip
+    """Origin of a piece's frame in the object's."""
+    body = pieces.body[piece]
+    return body_p[b, body] + wp.quat_rotate(body_q[b, body], pieces.pose_p[piece])
+
+
+@wp.func
+def in_box(x: wp.vec3, half: wp.vec3):
+    """Whether x lies strictly inside the box of these half extents about the origin."""
+    return wp.abs(x[0]) < half[0] and wp.abs(x[1]) < half[1] and wp.abs(x[2]) < half[2]
+
+
+@wp.func
 def world_extent(q: wp.quat, half: wp.vec3):
     """Half extents along the world's axes of a box turned by q."""
     ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
@@ -127,8 +148,8 @@ def object_in_pieces(
     if active_in[b] == 0:
         return
     body = pieces_in.body[piece]
-    q = body_q_in[b, body] * pieces_in.pose_q[piece]
-    p = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], pieces_in.pose_p[piece])
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece]
     extent = world_extent(q, half)
     weight = 2.0 * sample_weight_in * weight_in[iteration_in[0]]
@@ -140,7 +161,7 @@ def object_in_pieces(
     while wp.bvh_query_next(query, index):
         x = sample_in[index]
         local = wp.quat_rotate_inv(q, x - p)
-        if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+        if in_box(local, half):
             nd = piece_distance(pieces_in, piece, local)
             depth = -nd[3]
             if depth > 0.0:
@@ -171,10 +192,9 @@ def may_touch(
     body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
 ):  # fmt: skip
     """Whether the points of body `own` count against a piece and their bounding spheres meet."""
-    other = pieces.body[piece]
-    if pieces.apart[own, other] == 0 or points.first[own] == points.first[own + 1]:
+    if pieces.apart[own, pieces.body[piece]] == 0 or points.first[own] == points.first[own + 1]:
         return False
-    centre = body_p[b, other] + wp.quat_rotate(body_q[b, other], pieces.pose_p[piece])
+    centre = piece_centre(pieces, piece, b, body_p, body_q)
     offset = body_p[b, own] + wp.quat_rotate(body_q[b, own], points.centre[own]) - centre
     reach = wp.length(pieces.half[piece]) + points.radius[own] + margin
     return wp.dot(offset, offset) < reach * reach
@@ -203,8 +223,8 @@ def pieces_in_pieces(
     if active_in[b] == 0:
         return
     other = pieces_in.body[piece]
-    q = body_q_in[b, other] * pieces_in.pose_q[piece]
-    p = body_p_in[b, other] + wp.quat_rotate(body_q_in[b, other], pieces_in.pose_p[piece])
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     weight = 2.0 * point_weight_in * weight_in[iteration_in[0]]
     half = pieces_in.half[piece] + wp.vec3(margin_in, margin_in, margin_in)
     for own in range(body_p_in.shape[1]):
@@ -212,7 +232,7 @@ def pieces_in_pieces(
             for i in range(points_in.first[own], points_in.first[own + 1]):
                 x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
                 local = wp.quat_rotate_inv(q, x - p)
-                if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+                if in_box(local, half):
                     nd = piece_distance(pieces_in, piece, local)
                     depth = margin_in - nd[3]
                     if depth > 0.0:

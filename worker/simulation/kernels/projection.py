@@ -8,7 +8,16 @@ sample to a link, or of a point of one link to another link.
 import warp as wp
 
 from worker.simulation.kernels.kinematics import Tree
-from worker.simulation.kernels.pieces import BodyPoints, Pieces, may_touch, piece_distance, world_extent
+from worker.simulation.kernels.pieces import (
+    BodyPoints,
+    Pieces,
+    in_box,
+    may_touch,
+    piece_centre,
+    piece_distance,
+    piece_rotation,
+    world_extent,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -84,8 +93,8 @@ def sample_residuals(
     if active_in[b] == 0:
         return
     body = pieces_in.body[piece]
-    q = body_q_in[b, body] * pieces_in.pose_q[piece]
-    p = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], pieces_in.pose_p[piece])
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
     extent = world_extent(q, half)
     query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
@@ -93,7 +102,7 @@ def sample_residuals(
     while wp.bvh_query_next(query, index):
         x = sample_in[index]
         local = wp.quat_rotate_inv(q, x - p)
-        if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+        if in_box(local, half):
             nd = piece_distance(pieces_in, piece, local)
             if nd[3] < near_in:
                 n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
@@ -117,15 +126,15 @@ def self_residuals(
     if active_in[b] == 0:
         return
     other = pieces_in.body[piece]
-    q = body_q_in[b, other] * pieces_in.pose_q[piece]
-    p = body_p_in[b, other] + wp.quat_rotate(body_q_in[b, other], pieces_in.pose_p[piece])
+    q = piece_rotation(pieces_in, piece, b, body_q_in)
+    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
     for own in range(body_p_in.shape[1]):
         if may_touch(pieces_in, points_in, piece, own, b, near_in, body_p_in, body_q_in):
             for i in range(points_in.first[own], points_in.first[own + 1]):
                 x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
                 local = wp.quat_rotate_inv(q, x - p)
-                if wp.abs(local[0]) < half[0] and wp.abs(local[1]) < half[1] and wp.abs(local[2]) < half[2]:
+                if in_box(local, half):
                     nd = piece_distance(pieces_in, piece, local)
                     if nd[3] < near_in:
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
