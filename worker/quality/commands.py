@@ -15,7 +15,7 @@ from rich.table import Table
 from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
 from worker.quality.evaluate import Protocol, combine, evaluate
-from worker.quality.referee.judge import Level
+from worker.quality.referee.key import Level
 from worker.quality.sources import load_case
 
 app = typer.Typer(add_completion=False)

@@ -14,9 +14,10 @@ from service.errors import MeshError
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.judge import Level, Verdicts, judge
+from worker.quality.referee.judge import Verdicts, judge
+from worker.quality.referee.key import Level
 from worker.quality.sources import Case
 from worker.quality.table import DEFAULT_FRICTION, measure
 
@@ -63,16 +64,8 @@ def evaluate(
             )  # fmt: skip
             row |= _success(case, verdicts, verdicts.seconds)
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, threads=threads)
-        row |= _decomposition(pieces)
+        row |= pieces.facts
     return row | _medians(case, table, sd)
-
-
-def _decomposition(pieces: ConvexPieces) -> dict[str, Any]:
-    return {
-        "pieces": len(pieces),
-        "volume_ratio": _plain(pieces.volume_ratio),
-        "excess_mm": _plain(pieces.excess_m * 1e3),
-    }
 
 
 def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:
@@ -88,7 +81,7 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
         "sgs_without_referee": _plain(held / made) if made else None,
         "referee_seconds": _plain(seconds),
         "reasons": dict(Counter(verdicts.reasons).most_common()),
-        "verdict_key": verdicts.key,
+        "verdict_key": verdicts.terms,
         "agreement_published": None,
     }
     if case.published is not None and (known := case.published >= 0).any():

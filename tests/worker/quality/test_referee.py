@@ -18,9 +18,11 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.quality.postures import pregrasp, squeeze
 from worker.quality.referee.decomposition import ConvexPieces, decompose, union_volume
-from worker.quality.referee.judge import judge, robustness
+from worker.quality.referee.judge import judge
+from worker.quality.referee.key import verdict_key
 from worker.quality.referee.model import OBJECT_MASS, Physics, build
 from worker.quality.referee.protocol import Outcome, Test
+from worker.quality.referee.robustness import robustness
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
@@ -124,6 +126,24 @@ def test_everything_that_moves_a_verdict_is_in_its_key() -> None:
     assert len(keys) == 5
 
 
+def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE)
+    assert judge(PLATES, BOX, grasp_of(force=10.0), level="letter", pieces=WHOLE).terms == terms
+    heavier = dataclasses.replace(PLATES, masses=PLATES.masses * 2)
+    found = {
+        terms,
+        verdict_key(PLATES, BOX, "letter", True, pieces=WHOLE),
+        verdict_key(PLATES, BOX, "screen", False, pieces=WHOLE),
+        verdict_key(heavier, BOX, "letter", False, pieces=WHOLE),
+        verdict_key(PLATES, BOX, "letter", False, pieces=dataclasses.replace(WHOLE, digest="other")),
+    }
+    for constant in ("postures.TOTAL_NORMAL_FORCE", "referee.protocol.HOLD_S", "referee.model.FRICTION"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"worker.quality.{constant}", 1.5)
+            found.add(verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE))
+    assert len(found) == 8
+
+
 def test_joint_limits_reach_the_engine_in_radians() -> None:
     hand = two_finger_hand()
     model = build(hand, BOX, WHOLE, Physics()).model
@@ -193,6 +213,15 @@ def test_a_firm_grasp_survives_noise_and_a_grazing_one_does_not_gain() -> None:
     share = robustness(PLATES, BOX, many_grasps(), repeats=2, pieces=WHOLE)
     assert share[0] == 1.0
     assert share[-1] == 0.0
+
+
+def test_only_grasps_that_held_are_tried_with_noise() -> None:
+    grasps = many_grasps()
+    all_of_them = robustness(PLATES, BOX, grasps, repeats=2, pieces=WHOLE)
+    held = np.array([1, 0, 1, 0, -1, 0, 0, 0], np.int8)
+    share = robustness(PLATES, BOX, grasps, held=held, repeats=2, pieces=WHOLE)
+    assert np.isfinite(share).tolist() == (held == 1).tolist()
+    assert np.array_equal(share[held == 1], all_of_them[held == 1]), "noise must not depend on what else is tried"
 
 
 def test_unknown_level_is_refused() -> None:

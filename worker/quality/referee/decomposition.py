@@ -68,6 +68,16 @@ class ConvexPieces:
     def __len__(self) -> int:
         return len(self.vertices)
 
+    @property
+    def facts(self) -> dict[str, int | float | str]:
+        """What to keep beside verdicts on these pieces: count, volume ratio, mean excess [mm], digest."""
+        return {
+            "pieces": len(self),
+            "volume_ratio": round(self.volume_ratio, 6),
+            "excess_mm": round(self.excess_m * 1e3, 6),
+            "pieces_digest": self.digest,
+        }
+
 
 def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     """Convex pieces of an object, from the cache where they were made before.

@@ -7,37 +7,32 @@ import queue
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.digests import digest_bytes, digest_json
 from service.errors import InputError, TaskCancelled
-from worker.grasps import GraspSet, Posture
+from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.quality.referee import protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.model import DAMPING_TIME, FRICTION, HARD, OBJECT_MASS, Physics, build
+from worker.quality.referee.key import Level, postures_key, verdict_key
+from worker.quality.referee.model import COARSE, Physics, build
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
-from worker.transforms import compose, invert, quat_from_axis_angle
 
 Floats = NDArray[np.float64]
-Level = Literal["letter", "certificate", "screen"]
 Progress = Callable[[float, float, str], None]
 Cancelled = Callable[[], bool]
 
 LEVELS: Final = ("letter", "certificate", "screen")
-_SCREEN: Final = Physics(timestep=0.008, noslip_iterations=0, root="fixed")
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What the referee says of N grasps. Verdicts of different keys must not be mixed in one number."""
+    """What the referee says of N grasps. Verdicts of different terms must not be mixed in one number."""
 
     success: NDArray[np.int8]
     """(N,) 1 held in all six directions, 0 not."""
@@ -56,8 +51,10 @@ class Verdicts:
     """Volume of the object's convex pieces over its own."""
     excess_m: float
     """Mean height of the pieces above the object's surface [m]."""
+    terms: str
+    """`verdict_key`: digest of all that moves a verdict but the grasp. Rates of different terms do not compare."""
     key: str
-    """Digest of everything that moves a verdict: hand, object, pieces, postures, protocol, engine version."""
+    """Digest of the terms and of the postures that were judged."""
     seconds: float
     """Wall time."""
     steps: int
@@ -128,7 +125,8 @@ def judge(
 
     with ThreadPoolExecutor(bench.threads, thread_name_prefix="referee") as pool:
         trials = list(pool.map(work, range(len(grasps))))
-    return _verdicts(trials, bench, _key(hand, obj, grasps, pieces, level, hard), time.perf_counter() - began)
+    terms = verdict_key(hand, obj, level, hard, pieces=pieces)
+    return _verdicts(trials, bench, terms, postures_key(terms, grasps), time.perf_counter() - began)
 
 
 class _Bench:
@@ -140,7 +138,7 @@ class _Bench:
         self.level, self.hard, self.pieces, self.threads = level, hard, pieces, threads
         self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
         self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        levels = [Physics().hardened(), _SCREEN.hardened()] if hard else [Physics(), _SCREEN]
+        levels = [Physics().hardened(), COARSE.hardened()] if hard else [Physics(), COARSE]
         full = build(hand, obj, pieces, levels[0])
         coarse = build(hand, obj, pieces, levels[1]) if level == "screen" else None
         for _ in range(threads):
@@ -168,7 +166,7 @@ class _Bench:
             tests.put(test)
 
 
-def _verdicts(trials: list[Trial], bench: _Bench, key: str, seconds: float) -> Verdicts:
+def _verdicts(trials: list[Trial], bench: _Bench, terms: str, key: str, seconds: float) -> Verdicts:
     return Verdicts(
         success=np.array([t.success for t in trials], np.int8),
         outcome=np.array([t.outcomes for t in trials], np.uint8).reshape(-1, len(DIRECTIONS)),
@@ -180,74 +178,8 @@ def _verdicts(trials: list[Trial], bench: _Bench, key: str, seconds: float) -> V
         pieces=len(bench.pieces),
         volume_ratio=bench.pieces.volume_ratio,
         excess_m=bench.pieces.excess_m,
+        terms=terms,
         key=key,
         seconds=seconds,
         steps=sum(t.steps for t in trials),
     )
-
-
-def _key(hand: HandModel, obj: ObjectModel, grasps: GraspSet, pieces: ConvexPieces, level: Level, hard: bool) -> str:
-    postures = b"".join(
-        np.ascontiguousarray(array, float).tobytes()
-        for posture in (grasps.pregrasp, grasps.grasp, grasps.squeeze)
-        for array in (posture.hand_pose, posture.joint_positions)
-    )
-    constants = {name: value for name, value in vars(protocol).items() if name.isupper()}
-    return digest_json(
-        {
-            "hand": [hand.digest, hand.stiffness.tolist(), hand.effort.tolist()],
-            "object": obj.digest,
-            "pieces": pieces.digest,
-            "postures": digest_bytes(postures),
-            "protocol": constants,
-            "scene": [FRICTION, HARD, OBJECT_MASS, DAMPING_TIME, asdict(_SCREEN)],
-            "level": level,
-            "hard": hard,
-            "engine": mujoco.__version__,
-        }
-    )
-
-
-def robustness(
-    hand: HandModel,
-    obj: ObjectModel,
-    grasps: GraspSet,
-    *,
-    repeats: int = 5,
-    noise_m: float = 1e-3,
-    noise_rad: float = float(np.radians(1.0)),
-    seed: int = 0,
-    level: Level = "certificate",
-    hard: bool = False,
-    threads: int = 0,
-    pieces: ConvexPieces | None = None,
-) -> Floats:
-    """(N,) share of `repeats` in which a grasp still holds when the object is not quite where it was thought.
-
-    The object is moved by `noise_m` in a random direction and turned by `noise_rad` about a random axis through its
-    centre of mass; grasp i in repeat k gets the same noise in every set.
-    """
-    held = np.zeros(len(grasps))
-    for repeat in range(repeats):
-        moves = np.array([_noise(obj, noise_m, noise_rad, (seed, repeat, i)) for i in range(len(grasps))])
-        moved = _moved(grasps, invert(moves.reshape(-1, 7)))
-        held += judge(hand, obj, moved, level=level, hard=hard, threads=threads, pieces=pieces).success
-    return held / max(1, repeats)
-
-
-def _noise(obj: ObjectModel, noise_m: float, noise_rad: float, seed: tuple[int, ...]) -> Floats:
-    """(7,) motion of the object."""
-    rng = np.random.default_rng(seed)
-    shift, axis = rng.normal(size=(2, 3))
-    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(noise_rad))
-    about = np.concatenate([obj.centre_of_mass + noise_m * shift / np.linalg.norm(shift), rotation])
-    return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
-
-
-def _moved(grasps: GraspSet, motion: Floats) -> GraspSet:
-    """The grasps with the hand moved by one motion (N, 7) each."""
-
-    def moved(part: Posture) -> Posture:
-        return Posture(compose(motion, part.hand_pose), part.joint_positions)
-
-    return GraspSet(moved(grasps.grasp), moved(grasps.pregrasp), moved(grasps.squeeze), grasps.stability_loss)

@@ -51,6 +51,10 @@ class Physics:
         return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
 
 
+#: Coarse physics that decide the clear cases of a screen.
+COARSE: Final = Physics(timestep=0.008, noslip_iterations=0, root="fixed")
+
+
 @dataclass(frozen=True)
 class Scene:
     """A compiled model with the places of its parts. The model is read-only: threads share it, each with its data."""

@@ -1,0 +1,71 @@
+"""The key of a verdict: a digest of everything that moves it. Rates of verdicts with different keys do not compare."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Literal
+
+import mujoco
+import numpy as np
+
+from service.digests import digest_bytes, digest_json
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality import postures, squeeze
+from worker.quality.referee import model, protocol
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+
+Level = Literal["letter", "certificate", "screen"]
+
+#: Raise when the code of the protocol or of the scene changes what it says, constants aside.
+REVISION: Final = 2
+
+
+def verdict_key(
+    hand: HandModel,
+    obj: ObjectModel,
+    level: Level,
+    hard: bool,
+    *,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+) -> str:
+    """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
+
+    In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
+    convex pieces of the object, constants of the protocol, version of the engine.
+
+    Raises:
+        MeshError: `pieces` is not given and the object has none that are usable.
+    """
+    pieces = pieces or decompose(obj, cache=cache)
+    shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
+    return digest_json(
+        {
+            "revision": REVISION,
+            "level": level,
+            "hard": hard,
+            "engine": mujoco.__version__,
+            "hand": [hand.digest, digest_bytes(shapes)],
+            "gains": [array.tolist() for array in (hand.stiffness, hand.effort, hand.masses)],
+            "object": [obj.digest, np.round(obj.inertia, 12).tolist(), np.round(obj.centre_of_mass, 9).tolist()],
+            "pieces": pieces.digest,
+            "constants": [_constants(part) for part in (protocol, model, postures, squeeze)],
+        }
+    )
+
+
+def postures_key(terms: str, grasps: GraspSet) -> str:
+    """Digest of the terms (`verdict_key`) together with the postures that were judged."""
+    parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
+    arrays = (array for part in parts for array in (part.hand_pose, part.joint_positions))
+    return digest_json([terms, digest_bytes(b"".join(np.ascontiguousarray(a, float).tobytes() for a in arrays))])
+
+
+def _constants(module: ModuleType) -> dict[str, Any]:
+    """Values of the module's constants."""
+    found = {name: value for name, value in vars(module).items() if name.lstrip("_").isupper()}
+    return {name: asdict(value) if isinstance(value, model.Physics) else value for name, value in found.items()}
