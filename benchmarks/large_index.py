@@ -34,7 +34,7 @@ from service.planning import PlannedTask, plan
 from service.records import AttemptRecord, JobRecord
 from service.settings import Settings
 from service.store import Store, open_store
-from service.version import PACKAGE_VERSION
+from service.version import PACKAGE_VERSION, STAGE_REVISIONS
 
 _CHUNK: Final = 20_000
 #: Of a hundred jobs so many are in each state; the running ones are half done.
@@ -101,6 +101,7 @@ class _Maker:
             request=request,
             hand_digest=hand.digest,
             object_digest=obj.digest,
+            revisions=dict(STAGE_REVISIONS),
             lane=Lane.BULK,
             created=self._at(number, 0.0),
         )
@@ -164,13 +165,16 @@ class _Maker:
             batch=task.batch,
             inputs=task.inputs,
             code_version=PACKAGE_VERSION,
-            stage_revision=1,
+            stage_revision=STAGE_REVISIONS[task.stage],
             shard_schema=f"graspd/{kind}@1",
             created=self._at(record.request.seed, task.batch / 1000),
             device="cpu",
             seconds=2.5,
             worker="worker-0",
             valid=int(_validity(task).sum()),
+            tried=task.count if kind == "base" else 0,
+            audited=0,
+            audit_held=0,
             index_threshold_m=0.005,
             grasps=(),
             info={},
