@@ -118,11 +118,9 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
     return FIDELITIES[value]
 
 
-class JobRequest(Model):
-    """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
+class JobOptions(Model):
+    """What a job says besides its hand and object: how many grasps, how made, with which scenes and views."""
 
-    hand: Name = Field(description="name of a hand known to the service")
-    object: Name = Field(description="name of an object known to the service")
     grasps: int = Field(32, ge=1, le=1_000_000, description="number of grasps to synthesize")
     method: Name = "fast_graspd"
     fidelity: str | Fidelity = "standard"
@@ -158,6 +156,13 @@ class JobRequest(Model):
     @property
     def knobs(self) -> Fidelity:
         return resolve_fidelity(self.fidelity)
+
+
+class JobRequest(JobOptions):
+    """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
+
+    hand: Name = Field(description="name of a hand known to the service")
+    object: Name = Field(description="name of an object known to the service")
 
 
 class Asset(Model):
