@@ -97,6 +97,11 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
     }
 
 
+def builtin_model(kind: AssetKind, name: str) -> bytes:
+    """Binary glTF of a built-in hand or object, as `python -m worker.stages.models` wrote it."""
+    return (Path(str(resources.files("service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb").read_bytes()
+
+
 def builtin_names(kind: AssetKind) -> tuple[str, ...]:
     """Names of the built-in hands or objects."""
     root = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s"

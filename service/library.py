@@ -6,7 +6,7 @@ import json
 from typing import Final
 
 from service import names
-from service.assets import builtin_asset, builtin_names, describe, pack, unpack
+from service.assets import builtin_asset, builtin_model, builtin_names, describe, pack, unpack
 from service.clock import timestamp
 from service.digests import digest_files
 from service.domain import Asset, AssetKind
@@ -47,6 +47,7 @@ def publish_builtins(store: Store) -> list[Asset]:
         for name in builtin_names(kind):
             asset, files = builtin_asset(kind, name)
             published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+            store.put(names.asset_model(kind, asset.digest), builtin_model(kind, name))
     return published
 
 

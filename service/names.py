@@ -30,6 +30,11 @@ def asset_check(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/check.json"
 
 
+def asset_model(kind: AssetKind, digest: str) -> str:
+    """The prepared hand or object as binary glTF, for viewers."""
+    return f"{ASSETS}/{kind.value}/{digest}/model.glb"
+
+
 def job_record(job: str) -> str:
     """The request with the digests of hand and object."""
     return f"{JOBS}/{job}/job.json"

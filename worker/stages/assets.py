@@ -13,6 +13,7 @@ from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
+from worker.stages.models import publish_model
 
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
@@ -24,7 +25,13 @@ def hand_of(store: Store, message: TaskMessage) -> HandModel:
     """The hand of a task."""
     name, digest = message.request.hand, message.hand_digest
     key = (store.url, AssetKind.HAND, name, digest)
-    return _cached(key, lambda: load_hand(load_asset_files(store, AssetKind.HAND, digest), name=name, digest=digest))
+
+    def load() -> HandModel:
+        hand = load_hand(load_asset_files(store, AssetKind.HAND, digest), name=name, digest=digest)
+        publish_model(store, AssetKind.HAND, hand)
+        return hand
+
+    return _cached(key, load)
 
 
 def object_of(store: Store, message: TaskMessage) -> ObjectModel:
@@ -32,12 +39,14 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     name, digest = message.request.object, message.object_digest
     error = message.request.knobs.face_error_m
     key = (store.url, AssetKind.OBJECT, name, digest, error)
-    return _cached(
-        key,
-        lambda: load_object(
-            load_asset_files(store, AssetKind.OBJECT, digest), name=name, digest=digest, face_error_m=error
-        ),
-    )
+
+    def load() -> ObjectModel:
+        files = load_asset_files(store, AssetKind.OBJECT, digest)
+        obj = load_object(files, name=name, digest=digest, face_error_m=error)
+        publish_model(store, AssetKind.OBJECT, obj)
+        return obj
+
+    return _cached(key, load)
 
 
 def _cached(key: Hashable, load: Callable[[], T]) -> T:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -27,12 +28,18 @@ WALL_LIMIT_S: Final = 29.0
 _PASSED_ON: Final = ("PATH", "HOME", "LANG", "TMPDIR", "PYTHONPATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV")
 _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed to map")
 _FINDING_BYTES: Final = 2**20
+_MODEL: Final = "model.glb"
+_MODEL_BYTES: Final = 2**24
+#: A check that took longer leaves no time for the model within the limit; the first task that loads the asset makes it.
+_MODEL_CPU_S: Final = 8.0
 
 
 def run(message: IngestMessage, context: TaskContext) -> None:
     """Check the asset and write `check.json`, whatever is found; a refusal is a finding too."""
     files = load_asset_files(context.store, message.kind, message.digest)
-    found = check_in_child(message.kind, message.name, files, context)
+    found, model = check_in_child(message.kind, message.name, files, context)
+    if model:
+        context.store.put(names.asset_model(message.kind, message.digest), model)
     context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
 
 
@@ -45,8 +52,12 @@ def check_in_child(
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     cpu_s: int = CPU_LIMIT_S,
     wall_s: float = WALL_LIMIT_S,
-) -> dict[str, Any]:
-    """What the check of a hand or object says, or a refusal that says how the check itself ended."""
+) -> tuple[dict[str, Any], bytes]:
+    """What the check of a hand or object says, or a refusal that says how the check itself ended.
+
+    Returns:
+        the finding, and the model for viewers (glTF); empty where it was refused or making it would take too long.
+    """
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target = Path(folder) / "files.zip", Path(folder) / "check.json"
         source.write_bytes(pack(files))
@@ -63,8 +74,9 @@ def check_in_child(
             code = _wait(child, context, wall_s)
             complaint = (child.stderr.read() if child.stderr else b"")[-4000:].decode(errors="replace")
         if code == 0 and target.is_file() and target.stat().st_size <= _FINDING_BYTES:
-            return dict(json.loads(target.read_bytes()))
-        return _refusal(kind, name, code, complaint, memory_bytes, cpu_s)
+            model = target.with_name(_MODEL)
+            return dict(json.loads(target.read_bytes())), model.read_bytes() if model.is_file() else b""
+        return _refusal(kind, name, code, complaint, memory_bytes, cpu_s), b""
 
 
 def _environment() -> dict[str, str]:
@@ -108,7 +120,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
         (resource.RLIMIT_AS, int(memory_bytes)),
         (resource.RLIMIT_CPU, int(cpu_s)),
         (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_FSIZE, _FINDING_BYTES),
+        (resource.RLIMIT_FSIZE, _MODEL_BYTES),
     ):
         resource.setrlimit(limit, (value, value))
     files = unpack(Path(source).read_bytes(), limit_bytes=UNPACKED_LIMIT_BYTES)
@@ -121,6 +133,14 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
 
         found = check_object(files, name)
     Path(target).write_text(json.dumps(found))
+    if found["verdict"] != "refuse" and time.process_time() < _MODEL_CPU_S:
+        from worker.stages.models import model_of
+
+        # The finding stands whatever becomes of its picture.
+        with contextlib.suppress(Exception):
+            model = model_of(AssetKind(kind), name, files)
+            if len(model) <= _MODEL_BYTES:
+                Path(target).with_name(_MODEL).write_bytes(model)
 
 
 if __name__ == "__main__":

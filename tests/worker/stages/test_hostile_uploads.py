@@ -175,11 +175,11 @@ def rough(segments: int) -> bytes:
 def test_a_mesh_that_costs_too_much_is_refused_and_the_next_one_is_taken(limits: dict[str, int], says: str) -> None:
     context, start = TaskContext(open_store("memory://")), time.monotonic()
     files = {"asset.json": b'{"file": "m.stl"}', "m.stl": rough(512)}
-    found = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]
+    found, _ = ingest.check_in_child(AssetKind.OBJECT, "rough", files, context, **limits)  # type: ignore[arg-type]
     assert found["verdict"] == "refuse" and says in found["message"]
     assert time.monotonic() - start < BOUND_S
     sound = {"asset.json": b'{"file": "m.stl"}', **BALL}
-    assert ingest.check_in_child(AssetKind.OBJECT, "ball", sound, context)["verdict"] == "accept"
+    assert ingest.check_in_child(AssetKind.OBJECT, "ball", sound, context)[0]["verdict"] == "accept"
 
 
 def test_the_limits_of_a_check_keep_the_promised_bound() -> None:

@@ -78,14 +78,14 @@ def test_a_broken_object_is_refused_with_a_reason(context: TaskContext) -> None:
 
 
 def test_a_check_that_wants_too_much_memory_is_a_refusal(context: TaskContext) -> None:
-    found = ingest.check_in_child(AssetKind.OBJECT, "big", OBJECT, context, memory_bytes=64 * 2**20)
+    found, _ = ingest.check_in_child(AssetKind.OBJECT, "big", OBJECT, context, memory_bytes=64 * 2**20)
     assert found["verdict"] == "refuse"
     assert "needs more than 0.0625 GiB of memory" in found["message"]
 
 
 def test_a_check_that_takes_too_long_is_ended(context: TaskContext) -> None:
     start = time.monotonic()
-    found = ingest.check_in_child(AssetKind.OBJECT, "slow", OBJECT, context, wall_s=0.05)
+    found, _ = ingest.check_in_child(AssetKind.OBJECT, "slow", OBJECT, context, wall_s=0.05)
     assert found["verdict"] == "refuse"
     assert "takes longer" in found["message"]
     assert time.monotonic() - start < 5
