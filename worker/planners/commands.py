@@ -22,8 +22,9 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
+from worker.planners import PLANNERS, planner, synthesize
 from worker.planners import Progress as Report
-from worker.planners import synthesize
+from worker.planners.registry import parsed_options
 from worker.quality.table import measure
 from worker.stages.gate import passes
 from worker.stages.synthesize import postures
@@ -40,7 +41,12 @@ def synth(
     object_: Annotated[str, typer.Option("--object", help="a mesh (STL, OBJ, PLY, GLB, OFF) or a built-in object")],
     out: Annotated[Path, typer.Option("-o", "--out", help="HDF5 file to write")],
     grasps: Annotated[int, typer.Option("-n", "--grasps", help="number of grasps", min=1, max=100_000)] = 32,
-    method: Annotated[str, typer.Option(help="planner")] = "fast_graspd",
+    method: Annotated[
+        str, typer.Option(help=f"planner: {', '.join(PLANNERS)}, or one that another package offers")
+    ] = "fast_graspd",
+    option: Annotated[
+        list[str] | None, typer.Option(help="An option of the method, such as steps=20000; several times.")
+    ] = None,
     fidelity: Annotated[str, typer.Option(help=f"one of {', '.join(FIDELITIES)}")] = "standard",
     contact_solver: Annotated[str, typer.Option(help="direct, jacobi or gauss_seidel; empty: the fidelity's")] = "",
     seed: Annotated[int, typer.Option(min=0)] = 0,
@@ -55,6 +61,8 @@ def synth(
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     knobs = chosen_fidelity(fidelity, contact_solver)
+    options = parsed_options(option or [])
+    planner(method, options)  # a wrong name or option is told before the files are read
     model, obj = hand_from_path(hand), object_from_path(object_, face_error_m=knobs.face_error_m)
     device = Device(device).resolve()
     began = time.perf_counter()
@@ -76,8 +84,9 @@ def synth(
             count = min(BATCH_SIZE, grasps - first)
             parts.append(
                 _batch(
-                    model, obj, count=count, method=method, fidelity=knobs, seed=seed, batch=first // BATCH_SIZE,
-                    friction=friction, threads=threads, device=device, progress=report(first, count),
+                    model, obj, count=count, method=method, fidelity=knobs, options=options, seed=seed,
+                    batch=first // BATCH_SIZE, friction=friction, threads=threads, device=device,
+                    progress=report(first, count),
                 )
             )  # fmt: skip
     seconds = time.perf_counter() - began
@@ -114,12 +123,12 @@ def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
 
 
 def _batch(
-    hand: HandModel, obj: ObjectModel, *, count: int, method: str, fidelity: Fidelity, seed: int, batch: int,
-    friction: float, threads: int, device: str, progress: Report,
+    hand: HandModel, obj: ObjectModel, *, count: int, method: str, fidelity: Fidelity,
+    options: dict[str, str], seed: int, batch: int, friction: float, threads: int, device: str, progress: Report,
 ) -> Arrays:  # fmt: skip
     found: GraspSet = synthesize(
-        hand, obj, count=count, method=method, fidelity=fidelity, seed=seed, batch=batch, threads=threads,
-        device=device, progress=progress,
+        hand, obj, count=count, method=method, fidelity=fidelity, options=options, seed=seed, batch=batch,
+        threads=threads, device=device, progress=progress,
     )  # fmt: skip
     quality = measure(hand, obj, found, friction=friction, threads=threads)
     return {**postures(found), **quality, "quality/valid": passes(quality)}

@@ -1,17 +1,9 @@
-"""The planner: starts, coarse phase, fine phase, projection. A batch is cut into one part per CPU thread.
-
-Warp releases the interpreter lock while a kernel runs, so threads use all cores; a grasp's result does not depend on
-the part it is in.
-"""
+"""The planner: starts, coarse phase, fine phase, projection. A batch is cut into one part per CPU thread."""
 
 from __future__ import annotations
 
-import os
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -19,15 +11,15 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.domain import Fidelity
-from service.errors import TaskCancelled
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import Cancelled, Progress
 from worker.planners.fast_graspd.merit import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import RETREATS, nearest_distances, sample_starts
+from worker.planners.parts import Steps, cut, run_parts
+from worker.planners.port import Cancelled, Progress
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule, Simulation
@@ -48,22 +40,6 @@ class Part:
     state: HandState | None = None
     loss: Floats | None = None
     curve: list[float] | None = None
-
-
-class _Steps:
-    """Counts work done by all threads; looks at cancellation."""
-
-    def __init__(self, total: int, progress: Progress, cancelled: Cancelled) -> None:
-        self._total, self._progress, self._cancelled = total, progress, cancelled
-        self._done = 0
-        self._lock = threading.Lock()
-
-    def __call__(self, work: int, message: str) -> None:
-        if self._cancelled():
-            raise TaskCancelled("the synthesis was cancelled")
-        with self._lock:
-            self._done += work
-            self._progress(self._done, self._total, message)
 
 
 def plan(
@@ -94,15 +70,14 @@ def optimise_batch(
 ) -> list[Part]:  # fmt: skip
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     pair = pair_of(hand, obj, fidelity, device)
-    parts = [Part(indices) for indices in _cut(count, threads, device)]
-    steps = _Steps(count * (_hands(fidelity) + 1), progress, cancelled)
-    if len(parts) == 1:
-        _work(pair, parts[0], fidelity, seed, batch, steps)
-    else:
-        with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
-            for future in [pool.submit(_work, pair, part, fidelity, seed, batch, steps) for part in parts]:
-                future.result()
-    return parts
+    steps = Steps(count * (_hands(fidelity) + 1), progress, cancelled)
+
+    def work(indices: range) -> Part:
+        part = Part(indices)
+        _work(pair, part, fidelity, seed, batch, steps)
+        return part
+
+    return run_parts(cut(count, threads, device, least=PART), work)
 
 
 def _hands(fidelity: Fidelity) -> int:
@@ -115,16 +90,7 @@ def _finalists(fidelity: Fidelity) -> int:
     return min(fidelity.finalists, fidelity.starts)
 
 
-def _cut(count: int, threads: int, device: str) -> list[range]:
-    """Contiguous, nearly equal parts of a batch: one on a GPU, at most one per thread on a CPU."""
-    if wp.get_device(device).is_cuda:
-        return [range(count)]
-    parts = max(1, min(threads or os.cpu_count() or 1, count // PART))
-    bounds = np.linspace(0, count, parts + 1).astype(int)
-    return [range(int(a), int(b)) for a, b in pairwise(bounds)]
-
-
-def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: _Steps) -> None:
+def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: Steps) -> None:
     n, hand, obj = len(part.indices), pair.hand.model, pair.fine.obj.model
     finalists = _finalists(fidelity)
     probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
@@ -156,7 +122,7 @@ def _losses(simulation: Simulation, state: HandState) -> Floats:
 
 
 def _optimize(
-    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, steps: _Steps, name: str,
+    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, steps: Steps, name: str,
     curve: list[float], dilation: Floats | None = None,
 ) -> HandState:  # fmt: skip
     n = len(state.pivot)

@@ -1,0 +1,16 @@
+"""How `fast_graspd` is offered."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from service.domain import Fidelity
+from worker.planners.fast_graspd.planner import plan
+from worker.planners.port import Method
+
+METHOD: Final = Method(
+    summary="gradient descent through a differentiable contact simulation",
+    source="D. Turpin et al., Fast-Grasp'D, ICRA 2023",
+    planner=lambda options: plan,
+    uses=tuple(name for name in Fidelity.model_fields if name != "name"),
+)

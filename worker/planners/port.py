@@ -1,0 +1,66 @@
+"""What a grasp planner is: the one interface that `fast_graspd`, its peers and planners of third parties fill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+from service.domain import Fidelity
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+
+Progress = Callable[[float, float, str], None]
+Cancelled = Callable[[], bool]
+
+
+class Planner(Protocol):
+    """Makes `count` grasps of a hand on an object.
+
+    The same seed, batch and index of a grasp within its batch give the same grasp, whatever the other grasps are; on
+    the CPU bit for bit. `progress(done, total, message)` may be called often; `cancelled()` is polled between launches.
+
+    Raises:
+        TaskCancelled: when `cancelled()` answers True.
+        InputError: when the pair cannot be grasped at all, with the reason.
+    """
+
+    def __call__(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        *,
+        count: int,
+        fidelity: Fidelity,
+        seed: int,
+        batch: int,
+        threads: int,
+        device: str,
+        progress: Progress,
+        cancelled: Cancelled,
+    ) -> GraspSet: ...
+
+
+class Options(BaseModel):
+    """Base of a method's own options: those that the fidelity, which all methods share, does not have."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A planner with what people should know of it."""
+
+    summary: str
+    """One line for lists."""
+    source: str
+    """Where the method is published."""
+    planner: Callable[[Any], Planner]
+    """From the options to the planner."""
+    options: type[Options] = Options
+    """The options it takes."""
+    uses: tuple[str, ...] = ()
+    """Knobs of `Fidelity` that move its grasps; the others are ignored."""

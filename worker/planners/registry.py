@@ -1,0 +1,79 @@
+"""The methods graspd knows: its own, and those that installed packages offer as `graspd.planners` entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from service.cli import validation_line
+from service.errors import InputError
+from worker.planners.port import Method, Planner
+
+#: Entry-point group of planners of other packages.
+GROUP: Final = "graspd.planners"
+
+#: Method name -> module and attribute of its `Method`. Modules are imported when used.
+PLANNERS: Final[dict[str, tuple[str, str]]] = {
+    "fast_graspd": ("worker.planners.fast_graspd.method", "METHOD"),
+}
+
+
+def method_names() -> list[str]:
+    """All known methods: graspd's own, then those of other packages."""
+    return [*PLANNERS, *sorted(set(_offered()) - set(PLANNERS))]
+
+
+def method(name: str) -> Method:
+    """The method of a name. graspd's own names cannot be taken by another package.
+
+    Raises:
+        InputError: unknown method, or a package's entry point that cannot be loaded or is no `Method`.
+    """
+    if name in PLANNERS:
+        module, attribute = PLANNERS[name]
+        own: Method = getattr(import_module(module), attribute)
+        return own
+    offered = _offered()
+    if name not in offered:
+        raise InputError(f"unknown method {name!r}; there are: {', '.join(method_names())}")
+    try:
+        found = offered[name].load()
+    except Exception as error:
+        raise InputError(f"method {name!r} cannot be loaded from {offered[name].value}: {error}") from error
+    if not isinstance(found, Method):
+        raise InputError(f"method {name!r}: {offered[name].value} is no worker.planners.Method")
+    return found
+
+
+def planner(name: str, options: Mapping[str, Any] | None = None) -> Planner:
+    """The planner of a method with its options; texts are read as the option's type.
+
+    Raises:
+        InputError: unknown method, unknown option, or a value out of its range.
+    """
+    known = method(name)
+    try:
+        chosen = known.options(**(options or {}))
+    except ValidationError as error:
+        there_are = ", ".join(known.options.model_fields) or "none"
+        raise InputError(f"option of {name}: {validation_line(error)}; its options: {there_are}") from None
+    return known.planner(chosen)
+
+
+def parsed_options(pairs: list[str]) -> dict[str, str]:
+    """`["steps=20000"]` as `{"steps": "20000"}`.
+
+    Raises:
+        InputError: a text without `=`.
+    """
+    if wrong := [pair for pair in pairs if "=" not in pair]:
+        raise InputError(f"{wrong[0]!r} is no option; write it as name=value, for example steps=20000")
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+def _offered() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
