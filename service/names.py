@@ -10,6 +10,8 @@ ASSETS: Final = "assets"
 JOBS: Final = "jobs"
 TASKS: Final = "tasks"
 SHARDS: Final = "shards"
+DATASETS: Final = "datasets"
+OBJECT_SETS: Final = "object_sets"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -68,3 +70,28 @@ def shard_file(stage: Stage, shard: str) -> str:
 def shard_manifest(stage: Stage, shard: str) -> str:
     """Manifest of a shard: the shard exists for its readers once this does."""
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
+
+
+def dataset_record(dataset: str) -> str:
+    """Hands, objects and options of a dataset with the jobs that follow from them."""
+    return f"{DATASETS}/{dataset}/dataset.json"
+
+
+def dataset_events(dataset: str) -> str:
+    """Prefix of what a user did to the dataset later."""
+    return f"{DATASETS}/{dataset}/events"
+
+
+def dataset_event(dataset: str, number: int, what: str) -> str:
+    """One of `dataset_events`; numbers start at 1."""
+    return f"{dataset_events(dataset)}/{number:06}-{what}.json"
+
+
+def dataset_snapshot(dataset: str, digest: str) -> str:
+    """An immutable list of shards."""
+    return f"{DATASETS}/{dataset}/snapshots/{digest}.json"
+
+
+def object_set(name: str, digest: str) -> str:
+    """One version of a named set of objects."""
+    return f"{OBJECT_SETS}/{name}/{digest}.json"
