@@ -40,6 +40,7 @@ class JobEvent(Record):
     what: Literal["cancelled", "retried"]
     at: str
     retried: dict[str, int] = Field(default_factory=dict)
+    cause: str = Field("", description="event of the dataset that asked for it: its name, a slash, its number")
 
 
 class AttemptRecord(Record):
@@ -84,12 +85,18 @@ def job_events(store: Store, job: str) -> list[JobEvent]:
 
 
 def add_job_event(
-    store: Store, job: str, what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None
+    store: Store,
+    job: str,
+    what: Literal["cancelled", "retried"],
+    retried: dict[str, int] | None = None,
+    *,
+    cause: str = "",
 ) -> JobEvent:
     """Append an event after those there are; the state of a job follows from reading them all again, in order."""
     while True:
         taken = [int(entry.key.rsplit("/", 1)[1].partition("-")[0]) for entry in store.list(names.job_events(job))]
-        event = JobEvent(number=max(taken, default=0) + 1, what=what, at=timestamp(), retried=retried or {})
+        number = max(taken, default=0) + 1
+        event = JobEvent(number=number, what=what, at=timestamp(), retried=retried or {}, cause=cause)
         if put_record(store, names.job_event(job, event.number, what), event):
             return event
 
