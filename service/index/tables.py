@@ -180,5 +180,7 @@ workers: Final = Table(
 )
 
 #: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
-LIVE_COLUMNS: Final = frozenset({"queued", "not_before", "progress_done", "progress_total", "progress_message"})
+LIVE_COLUMNS: Final = frozenset(
+    {"queued", "not_before", "progress_done", "progress_total", "progress_message", "applied", "planned"}
+)
 LIVE_TABLES: Final = frozenset({"workers"})
