@@ -47,6 +47,15 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
         lane=lane or lane_of(request),
         created=timestamp(),
     )
+    return enter(parts, record)
+
+
+def enter(parts: Parts, record: JobRecord) -> tuple[JobView, bool]:
+    """Keep a planned job and queue its first tasks.
+
+    Returns:
+        the job, and whether it is new.
+    """
     new = put_record(parts.store, names.job_record(record.id), record)
     if not new:
         record = read_record(JobRecord, parts.store, names.job_record(record.id))
@@ -55,8 +64,11 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
     return parts.index.job(record.id), new
 
 
-def cancel(parts: Parts, job_id: str) -> JobView:
+def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
     """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
+
+    Args:
+        cause: event of a dataset that asks for it, kept with the job's event.
 
     Raises:
         NotFoundError: unknown job.
@@ -66,7 +78,7 @@ def cancel(parts: Parts, job_id: str) -> JobView:
     if job.state.is_final:
         raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
     in_queue = parts.index.unfinished_tasks(job_id)
-    add_job_event(parts.store, job_id, "cancelled")
+    add_job_event(parts.store, job_id, "cancelled", cause=cause)
     parts.index.set_job_events(job_id, job_events(parts.store, job_id))
     try:
         parts.queue.discard(in_queue)
@@ -75,8 +87,11 @@ def cancel(parts: Parts, job_id: str) -> JobView:
     return _told(parts, job_id)
 
 
-def retry(parts: Parts, job_id: str) -> JobView:
+def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
     """Queue the failed and cancelled tasks of a job again, with fresh attempts.
+
+    Args:
+        cause: event of a dataset that asks for it, kept with the job's event.
 
     Raises:
         NotFoundError: unknown job.
@@ -85,7 +100,7 @@ def retry(parts: Parts, job_id: str) -> JobView:
     job = parts.index.job(job_id)
     if job.state not in (State.FAILED, State.CANCELLED):
         raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
-    add_job_event(parts.store, job_id, "retried", parts.index.failed_tasks(job_id))
+    add_job_event(parts.store, job_id, "retried", parts.index.failed_tasks(job_id), cause=cause)
     parts.index.set_job_events(job_id, job_events(parts.store, job_id))
     _start(parts, job_id)
     return _told(parts, job_id)
