@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import logging
 import os
 import sys
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar
 import typer
 from pydantic import BaseModel, ValidationError
 
+from service import logs
 from service.errors import GraspdError, InputError
 from service.settings import Settings
 
@@ -63,17 +63,9 @@ def load_settings(**overrides: Any) -> Settings:
         raise InputError(validation_line(error)) from None
 
 
-def log_to_stderr(settings: Settings) -> None:
-    """Log lines of this process: time, level, module, message."""
-    logging.basicConfig(
-        level=settings.log_level.upper(),
-        stream=sys.stderr,
-        format="%(asctime)s %(levelname)s %(name)s %(message)s",
-        force=True,
-    )
-    # Alembic tells of every migration check, RQ of every idle poll, httpx of every request.
-    for name in ("alembic", "rq.worker", "rq.job", "rq.queue", "httpx"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
+    """Log lines of this process: JSON, or text on a terminal."""
+    logs.set_up(settings, process)
 
 
 def validation_line(error: ValidationError) -> str:

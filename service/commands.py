@@ -35,7 +35,7 @@ def up(
     from service.supervisor import Supervisor
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
-    log_to_stderr(settings)
+    log_to_stderr(settings, "up")
     stop = stop_on_signals()
     console = Console(stderr=True)
     supervisor = Supervisor(settings, workers=workers)
@@ -60,7 +60,7 @@ def keeper(data_dir: DataDir = None) -> None:
     from service.parts import Parts
 
     settings = load_settings(data_dir=data_dir)
-    log_to_stderr(settings)
+    log_to_stderr(settings, "keeper")
     stop = stop_on_signals()
     parts = Parts.open(settings)
     try:

@@ -34,6 +34,7 @@ def shard_id(
     object_digest: str,
     batch: int,
     count: int,
+    revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
     """Address of the shard that a stage makes of its inputs.
@@ -42,7 +43,7 @@ def shard_id(
     """
     inputs_of: dict[str, object] = {
         "stage": stage,
-        "revision": STAGE_REVISIONS[stage],
+        "revision": revision,
         "hand": hand_digest,
         "object": object_digest,
         "names": [request.hand, request.object],  # written into the shard
@@ -56,12 +57,23 @@ def shard_id(
             "method": request.method,
             "fidelity": request.knobs.model_dump(mode="json"),
             "friction": request.friction,
+            **_judgement(request, batch),
         }
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
     return digest_json(inputs_of)
+
+
+def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
+    """What decides which grasps of a batch are kept, and what is known of them."""
+    found: dict[str, object] = {}
+    if request.want == "valid":
+        found |= {"want": request.want, "budget": request.budget}
+    if request.referee != "none":
+        found |= {"referee": request.referee, "audits": request.audits_of(batch), "robustness": request.robustness}
+    return found
 
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str) -> str:

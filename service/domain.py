@@ -134,6 +134,15 @@ class JobOptions(Model):
         (), description="what pictures show besides colour, depth and segmentation"
     )
     friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
+    want: Literal["valid", "raw"] = Field(
+        "valid", description="whether `grasps` counts grasps that are valid, or all that were tried"
+    )
+    budget: float = Field(4.0, ge=1, le=100, description="grasps tried for each valid grasp wanted, at most")
+    referee: Literal["letter", "certificate", "screen", "none"] = Field(
+        "certificate", description="level at which MuJoCo judges the grasps; none: valid means geometrically sound"
+    )
+    audits: int = Field(8, ge=0, le=10_000, description="valid grasps of the job that are judged again by the letter")
+    robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
 
     @field_validator("fidelity")
     @classmethod
@@ -153,9 +162,22 @@ class JobOptions(Model):
             raise ValueError("views need scenes: ask for scenes >= 1")
         return self
 
+    @model_validator(mode="after")
+    def _noise_needs_a_referee(self) -> Self:
+        if self.robustness and self.referee == "none":
+            raise ValueError("robustness counts verdicts: choose a referee")
+        return self
+
     @property
     def knobs(self) -> Fidelity:
         return resolve_fidelity(self.fidelity)
+
+    def audits_of(self, batch: int) -> int:
+        """Grasps of a batch that are audited: the first batches share the job's audits, so that a longer job has the
+        same first batches as a shorter one."""
+        if self.referee in ("none", "letter"):
+            return 0
+        return min(BATCH_SIZE, max(0, self.audits - batch * BATCH_SIZE))
 
 
 class JobRequest(JobOptions):
@@ -188,7 +210,8 @@ class TaskMessage(Model):
     job_id: str
     stage: Stage
     batch: int = Field(ge=0)
-    count: int = Field(ge=1, description="grasps in this batch")
+    count: int = Field(ge=1, description="grasps wanted of this batch")
+    revision: int = Field(1, ge=1, description="revision of the stage's algorithm that the output's address stands for")
     attempt: int = Field(1, ge=1)
     max_attempt: int = Field(3, ge=1, description="number of the attempt that is the last")
     request: JobRequest

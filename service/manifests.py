@@ -33,6 +33,8 @@ _PLAIN: Final = {
     "self_penetration_depth_mm": "quality/self_penetration_depth_mm",
     "stability_loss": "quality/stability_loss",
 }
+#: The same for columns that a shard may lack.
+_OPTIONAL: Final = {"robustness": "quality/robustness"}
 
 
 class GraspSummary(BaseModel):
@@ -50,6 +52,8 @@ class GraspSummary(BaseModel):
     contact_links: int | None = None
     valid: bool
     success: bool | None = None
+    verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
+    robustness: float | None = None
 
 
 class ShardManifest(BaseModel):
@@ -81,9 +85,20 @@ class ShardManifest(BaseModel):
     seconds: float
     worker: str
     valid: int = Field(0, description="rows that passed their stage's gate")
+    tried: int = Field(0, ge=0, description="grasps planned for this base shard, kept or not")
+    audited: int = Field(0, ge=0, description="certified grasps that were tested again by the letter")
+    audit_held: int = Field(0, ge=0, description="of these, grasps that held")
     index_threshold_m: float | None = None
     grasps: tuple[GraspSummary, ...] = ()
     info: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tried_what_it_holds(cls, data: Any) -> Any:
+        # Before a shard could hold valid grasps alone, it held every grasp that was tried.
+        if isinstance(data, dict) and "tried" not in data and data.get("kind") == "base":
+            return {**data, "tried": data.get("counts", {}).get("N", 0)}
+        return data
 
     @model_validator(mode="after")
     def _one_summary_a_grasp(self) -> ShardManifest:
@@ -101,6 +116,7 @@ def manifest_of(
     message: TaskMessage,
     data: bytes,
     arrays: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, Any],
     counts: Mapping[str, int],
     *,
     device: str,
@@ -108,10 +124,9 @@ def manifest_of(
     worker: str,
     info: Mapping[str, Any] | None = None,
 ) -> ShardManifest:
-    """The manifest of a shard that a task made; `arrays` and `counts` are the shard's columns and axis lengths."""
+    """The manifest of a shard that a task made; `arrays`, `attributes` and `counts` are the shard's columns, root
+    attributes and axis lengths."""
     kind = names.SHARD_KINDS[message.stage]
-    valid = arrays.get("quality/valid", arrays.get("grasp/valid"))
-    threshold, grasps = summarise(arrays) if kind == "base" else (None, ())
     return ShardManifest(
         shard_id=message.output,
         stage=message.stage,
@@ -135,23 +150,38 @@ def manifest_of(
         device=device,
         seconds=round(seconds, 4),
         worker=worker,
-        valid=0 if valid is None else int(np.count_nonzero(valid)),
-        index_threshold_m=threshold,
-        grasps=grasps,
         info=dict(info or {}),
+        **_contents(kind, arrays, attributes),
     )
 
 
-def summarise(arrays: Mapping[str, NDArray[Any]]) -> tuple[float, tuple[GraspSummary, ...]]:
+def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The manifest's fields that follow from the shard's own columns and attributes."""
+    valid = arrays.get("quality/valid", arrays.get("grasp/valid"))
+    fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
+    if kind == "base":
+        audit = arrays.get("quality/audit", np.empty(0, np.int8))
+        fields["index_threshold_m"], fields["grasps"] = summarise(arrays, attributes)
+        fields["tried"] = int(attributes.get("tried", len(arrays["quality/valid"])))
+        fields["audited"], fields["audit_held"] = int(np.count_nonzero(audit >= 0)), int(np.count_nonzero(audit == 1))
+    return fields
+
+
+def summarise(
+    arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any] | None = None
+) -> tuple[float, tuple[GraspSummary, ...]]:
     """The contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
+    count = len(arrays["quality/valid"])
     columns: dict[str, list[Any]] = {name: _numbers(arrays[path][:, at]) for name, path in _SWEPT.items()}
     columns |= {name: _numbers(arrays[path]) for name, path in _PLAIN.items()}
+    columns |= {name: _numbers(arrays[path]) for name, path in _OPTIONAL.items() if path in arrays}
     columns["contact_links"] = [int(v) for v in arrays["quality/contact_links"]]
     columns["valid"] = [bool(v) for v in arrays["quality/valid"]]
-    verdicts = arrays.get("quality/success")
-    columns["success"] = [None] * len(columns["valid"]) if verdicts is None else [_verdict(int(v)) for v in verdicts]
+    columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
+    level = (attributes or {}).get("verdict_level")
+    columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
     rows = zip(*columns.values(), strict=True)
     return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)
 
@@ -178,15 +208,12 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 def _describing(manifest: ShardManifest, data: bytes) -> ShardManifest:
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
-    arrays = read_shard(data, without=pictures).arrays
-    valid = arrays.get("quality/valid", arrays.get("grasp/valid"))
-    update: dict[str, Any] = {
+    shard = read_shard(data, without=pictures)
+    update = {
         "sha256": hashlib.sha256(data).hexdigest(),
         "size_bytes": len(data),
-        "valid": 0 if valid is None else int(np.count_nonzero(valid)),
+        **_contents(manifest.kind, shard.arrays, shard.attributes),
     }
-    if manifest.kind == "base":
-        update["grasps"] = summarise(arrays)[1]
     return manifest.model_copy(update=update)
 
 

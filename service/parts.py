@@ -32,9 +32,8 @@ class Parts:
         from service.index.index import Index
         from service.queue.rq_queue import open_queue
 
-        return cls(
-            settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), open_queue(settings)
-        )
+        store = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
+        return cls(settings, store, Index(settings.resolved_index_url), open_queue(settings))
 
     def close(self) -> None:
         """Give all connections back."""

@@ -81,6 +81,7 @@ def plan(job: JobRecord) -> Iterator[PlannedTask]:
                 object_digest=job.object_digest,
                 batch=batch,
                 count=count,
+                revision=job.revisions[stage],
                 inputs=inputs,
             )
             yield PlannedTask(task_id(job.id, stage, batch), stage, batch, count, inputs, output)
@@ -96,6 +97,7 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
         stage=task.stage,
         batch=task.batch,
         count=task.count,
+        revision=job.revisions[task.stage],
         attempt=attempt,
         max_attempt=max(attempt, max_attempt),
         request=job.request,

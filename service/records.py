@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from service import names
 from service.clock import timestamp
 from service.domain import Digest, JobRequest, Lane, Stage
 from service.errors import StoreUnavailable
 from service.store import Store
+from service.version import STAGE_REVISIONS
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
 
@@ -22,15 +23,26 @@ class Record(BaseModel):
 
 
 class JobRecord(Record):
-    """`job.json`: a request on the very hand and object it was made for."""
+    """`job.json`: a request on the very hand and object it was made for, and the revision of each stage that its tasks
+    are planned for."""
 
-    version: Literal[1] = 1
+    version: Literal[1, 2] = 2
     id: Digest
     request: JobRequest
+    revisions: dict[str, int] = Field(default_factory=lambda: dict(STAGE_REVISIONS))
     hand_digest: Digest
     object_digest: Digest
     lane: Lane
     created: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_it_was_meant(cls, data: Any) -> Any:
+        # Records of version 1 knew neither a referee nor revisions.
+        if isinstance(data, dict) and data.get("version") == 1:
+            request = {"want": "raw", "referee": "none", **data.get("request", {})}
+            return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
+        return data
 
 
 class JobEvent(Record):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -17,11 +18,25 @@ class Settings(BaseSettings):
     data_dir: Path = Field(Path("graspd-data"), description="folder of everything graspd keeps on this machine")
     redis_url: SecretStr | None = Field(None, description="Redis of the queue; unset: `graspd up` starts one")
     store_url: str | None = Field(None, description="object store: file://, s3://, gs://, az://; unset: in data_dir")
+    store_public_endpoint: str | None = Field(
+        None, description="S3 endpoint as users reach it: downloads then come from there; unset: through the API"
+    )
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address the API binds")
     port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
     api_url: str = Field("http://127.0.0.1:8000", description="where the client commands find the API")
     api_key: SecretStr | None = Field(None, description="key the client commands send")
+    keys_file: Path | None = Field(None, description="file of the API keys; unset: keys.json in data_dir")
+    metrics_need_key: bool = Field(True, description="whether /metrics asks for a key once there are keys")
+    requests_per_minute: int = Field(1200, ge=0, description="requests of one key; 0: no limit")
+    address_requests_per_minute: int = Field(
+        120, ge=0, description="requests of one address without a key; 0: no limit"
+    )
+    concurrency: int = Field(
+        64, ge=0, description="requests of one key, or address, being answered at once; 0: no limit"
+    )
+    quota_grasps_in_flight: int = Field(0, ge=0, description="grasps in unfinished jobs of one key; 0: no limit")
+    quota_jobs_per_day: int = Field(0, ge=0, description="new jobs of one key from midnight UTC on; 0: no limit")
     device: str = Field("auto", description="Warp device of a worker: cpu, cuda:0, or auto")
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
@@ -33,10 +48,17 @@ class Settings(BaseSettings):
     queue_window: int = Field(1000, ge=1, description="tasks kept waiting in the queue; the rest waits in the index")
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
+    log_format: Literal["auto", "json", "text"] = Field(
+        "auto", description="log lines; auto: text on a terminal, else json"
+    )
 
     @cached_property
     def resolved_store_url(self) -> str:
         return self.store_url or (self.data_dir.resolve() / "store").as_uri()
+
+    @cached_property
+    def resolved_keys_file(self) -> Path:
+        return self.keys_file or self.data_dir.resolve() / "keys.json"
 
     @cached_property
     def resolved_index_url(self) -> str:

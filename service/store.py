@@ -45,8 +45,10 @@ class Entry:
 class Store:
     """Objects by key. Every method raises StoreUnavailable where the store does not answer."""
 
-    def __init__(self, backend: Any, url: str) -> None:
+    def __init__(self, backend: Any, url: str, *, signer: Any = None) -> None:
+        """`signer` is the same store as clients reach it; None where they do not."""
         self._backend = backend
+        self._signer = signer
         self.url = url
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
@@ -104,9 +106,15 @@ class Store:
 
     def sign(self, key: str, *, seconds: int = 3600) -> str | None:
         """URL from which anybody may read the object for a while; None where the store cannot make one."""
+        check_key(key)
         try:
-            return str(obstore.sign(self._backend, "GET", check_key(key), timedelta(seconds=seconds)))
-        except (ValueError, TypeError, NotImplementedError):
+            return (
+                None
+                if self._signer is None
+                else str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
+            )
+        except (BaseError, ValueError, TypeError, NotImplementedError, OSError):
+            # Credentials that may read but not sign: the API hands the file out itself.
             return None
 
     def probe(self) -> float:
@@ -117,10 +125,14 @@ class Store:
         return time.perf_counter() - start
 
 
-def open_store(url: str) -> Store:
+def open_store(url: str, *, public_endpoint: str | None = None) -> Store:
     """The store behind a URL: `file:///folder` (made if absent), `memory://`, `s3://`, `gs://`, `az://`.
 
     Credentials and endpoints of the remote ones come from the usual variables (AWS_ACCESS_KEY_ID, ...).
+
+    Args:
+        public_endpoint: S3 endpoint as clients reach it. Without it, one given by AWS_ENDPOINT_URL is taken for an
+            address of the service's own network: then no download is signed, and files go through the API.
 
     Raises:
         InputError: the URL names no known store.
@@ -136,7 +148,14 @@ def open_store(url: str) -> Store:
     if parts.scheme not in ("s3", "gs", "az"):
         raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")
     with _mapped(url, url):
-        return Store(from_url(url, **_remote_options(parts.scheme)), url)
+        endpoint = _endpoint() if parts.scheme == "s3" else None
+        backend: Any = from_url(url, **_remote_options(endpoint))
+        signer: Any
+        if public_endpoint and parts.scheme == "s3":
+            signer = from_url(url, **_remote_options(public_endpoint), endpoint=public_endpoint)
+        else:
+            signer = None if endpoint else backend
+        return Store(backend, url, signer=signer)
 
 
 def check_key(key: str) -> str:
@@ -146,10 +165,14 @@ def check_key(key: str) -> str:
     return key
 
 
-def _remote_options(scheme: str) -> dict[str, Any]:
+def _endpoint() -> str | None:
+    """An S3 endpoint other than Amazon's own."""
+    return os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
+
+
+def _remote_options(endpoint: str | None) -> dict[str, Any]:
     options: dict[str, Any] = {key: dict(value) for key, value in _REMOTE.items()}
-    endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or ""
-    if scheme == "s3" and endpoint.startswith("http://"):
+    if endpoint is not None and endpoint.startswith("http://"):
         options["client_options"]["allow_http"] = True
     return options
 

@@ -206,6 +206,7 @@ class Supervisor:
 
 _PASSED_ON: Final = (
     "store_url",
+    "store_public_endpoint",
     "index_url",
     "device",
     "threads",

@@ -7,7 +7,7 @@ from typing import Final
 PACKAGE_VERSION: Final = "0.1.0"
 
 #: Version of the task message a worker accepts; a worker refuses any other.
-TASK_SCHEMA: Final = 1
+TASK_SCHEMA: Final = 2
 
 #: Revision of each stage's algorithm. Part of the digest of a result, so results of two revisions never collide.
-STAGE_REVISIONS: Final = {"synthesize": 1, "scene": 1, "render": 1}
+STAGE_REVISIONS: Final = {"synthesize": 2, "scene": 1, "render": 1}

@@ -17,7 +17,7 @@ from service.errors import InputError, TaskCancelled, TaskRefused, UnavailableEr
 from service.manifests import publish_shard, shard_exists
 from service.queue.port import Event, EventKind, Message
 from service.records import AttemptRecord, put_record
-from service.version import TASK_SCHEMA
+from service.version import STAGE_REVISIONS, TASK_SCHEMA
 from worker.context import StopReason, TaskContext
 from worker.stages.output import Output, shard_of
 
@@ -57,6 +57,11 @@ class Runner:
                 raise TaskRefused(
                     f"the task has schema {raw.get('schema')} and this worker knows {TASK_SCHEMA}; "
                     "run workers and API of one version"
+                )
+            if isinstance(message, TaskMessage) and message.revision != STAGE_REVISIONS[message.stage]:
+                raise TaskRefused(
+                    f"the job was planned for revision {message.revision} of {message.stage} and this worker makes "
+                    f"revision {STAGE_REVISIONS[message.stage]}; submit the job again"
                 )
             return self._do(message, context)
         except TaskCancelled:

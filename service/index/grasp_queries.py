@@ -40,6 +40,15 @@ class GraspQueries(Database):
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
 
+    def grasp(self, shard_id: str, row: int) -> GraspView:
+        """One grasp by its shard and row; NotFoundError if there is none."""
+        query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
+        with self.reading() as connection:
+            found = connection.execute(query).mappings().first()
+        if found is None:
+            raise NotFoundError(f"there is no grasp {row} in shard {shard_id!r}")
+        return GraspView(**{name: found[name] for name in GraspView.model_fields})
+
     def grasp_count(self, where: GraspFilter | None = None) -> int:
         """Number of grasps that match."""
         with self.reading() as connection:

@@ -103,8 +103,7 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
         JobView(
             **{name: row[name] for name in JobView.model_fields if name in row},
             stages=progress[row["id"]],
-            grasps=made.get(row["id"], (0, 0))[0],
-            valid=made.get(row["id"], (0, 0))[1],
+            **made.get(row["id"], {}),
         )
         for row in rows
     ]
@@ -140,14 +139,16 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
     }
 
 
-def _made(connection: Connection, ids: Sequence[str]) -> dict[str, tuple[int, int]]:
+def _made(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
+    columns = {"grasps": "count", "valid": "valid", "tried": "tried", "audited": "audited", "audit_held": "audit_held"}
     query = (
-        select(tasks.c.job_id, func.sum(shards.c.count), func.sum(shards.c.valid))
+        select(tasks.c.job_id, *(func.sum(shards.c[column]).label(name) for name, column in columns.items()))
         .join(shards, shards.c.id == tasks.c.shard_id)
         .where(tasks.c.job_id.in_(ids), tasks.c.stage == Stage.SYNTHESIZE.value)
         .group_by(tasks.c.job_id)
     )
-    return {job: (int(count), int(valid)) for job, count, valid in connection.execute(query)}
+    rows = connection.execute(query).mappings()
+    return {row["job_id"]: {name: int(row[name]) for name in columns} for row in rows}
 
 
 def _task_view(row: Any) -> TaskView:

@@ -144,21 +144,21 @@ class ServiceQueries(Database):
             .order_by(*pair)
         )
         made = (
-            select(shards.c.hand, shards.c.object, func.sum(shards.c.count), func.sum(shards.c.valid))
+            select(shards.c.hand, shards.c.object, *_MADE)
             .where(shards.c.stage == Stage.SYNTHESIZE.value)
             .group_by(shards.c.hand, shards.c.object)
         )
         with self.reading() as connection:
-            yields = {(hand, obj): (int(n), int(v)) for hand, obj, n, v in connection.execute(made)}
+            yields = {(row[0], row[1]): [int(value) for value in row[2:]] for row in connection.execute(made)}
             rows = connection.execute(work).mappings().all()
+        found = [yields.get((row["hand"], row["object"]), (0, 0, 0)) for row in rows]
         return [
-            MatrixCell(
-                **row,
-                grasps=yields.get((row["hand"], row["object"]), (0, 0))[0],
-                valid=yields.get((row["hand"], row["object"]), (0, 0))[1],
-            )
-            for row in rows
+            MatrixCell(**row, grasps=kept, valid=valid, tried=tried)
+            for row, (kept, valid, tried) in zip(rows, found, strict=True)
         ]
+
+
+_MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried))
 
 
 def _by_state(rows: Any) -> dict[State, int]:

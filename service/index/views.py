@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from service.domain import AssetKind, JobRequest, Lane, Stage, State
 
@@ -49,8 +49,23 @@ class JobView(View):
     finished: str | None
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
-    grasps: int = Field(0, description="grasps made so far")
-    valid: int = Field(0, description="of these, past the geometric gate")
+    grasps: int = Field(0, description="grasps kept so far")
+    valid: int = Field(0, description="of these, valid: past the geometric gate, and the referee where it judged")
+    tried: int = Field(0, description="grasps planned for them, kept or not")
+    audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
+    audit_held: int = Field(0, description="of these, grasps that held")
+
+    @computed_field(description="what a reader of the numbers should know")  # type: ignore[prop-decorator]
+    @property
+    def note(self) -> str | None:
+        """Says so where a job ended with fewer valid grasps than it was asked for."""
+        request = self.request
+        if self.state is not State.SUCCEEDED or request.want != "valid" or self.valid >= request.grasps:
+            return None
+        return (
+            f"found {self.valid} of {request.grasps} valid grasps in {self.tried} tries: the budget of "
+            f"{request.budget:g} tries for each ended first"
+        )
 
 
 class TaskView(View):
@@ -127,6 +142,8 @@ class GraspView(View):
     contact_links: int | None
     valid: bool
     success: bool | None = Field(description="verdict of the referee; None: not tested")
+    verdict_level: str | None = Field(description="level of the referee that gave it")
+    robustness: float | None = Field(description="share of verdicts that survive 1 mm and 1 degree of noise")
     created: str
 
 
@@ -204,3 +221,4 @@ class MatrixCell(View):
     failed: int
     grasps: int
     valid: int
+    tried: int

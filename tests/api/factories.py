@@ -56,7 +56,7 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
     data = write_shard(kind, arrays, attributes)
     message = message_of(record, task, attempt=1, max_attempt=3)
     manifest = manifest_of(
-        message, data, arrays, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
+        message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
     )
     publish_shard(parts.store, manifest, data)
     parts.index.add_manifest(manifest)

@@ -53,7 +53,15 @@ def shard_of(
     counts = check_columns(kind, output.arrays)  # type: ignore[arg-type]
     data = write_shard(kind, output.arrays, attributes)  # type: ignore[arg-type]
     manifest = manifest_of(
-        message, data, output.arrays, counts, device=device, seconds=seconds, worker=worker, info=output.info
+        message,
+        data,
+        output.arrays,
+        attributes,
+        counts,
+        device=device,
+        seconds=seconds,
+        worker=worker,
+        info=output.info,
     )
     return manifest, data
 

@@ -213,7 +213,7 @@ def test_channels_are_named_in_any_order_and_kept_in_one():
 def test_a_jobs_channels_move_its_pictures_and_nothing_else():
     def address(stage: Stage, *channels: str) -> str:
         request = JobRequest(hand="h", object="o", scenes=1, views=1, channels=channels)
-        return shard_id(stage, request=request, hand_digest="a", object_digest="b", batch=0, count=1)
+        return shard_id(stage, request=request, hand_digest="a", object_digest="b", batch=0, count=1, revision=1)
 
     assert address(Stage.RENDER, "occlusion", "distance") == address(Stage.RENDER, "distance", "occlusion")
     assert address(Stage.RENDER, "distance") != address(Stage.RENDER)
