@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
+from api.grasp_files import GraspFiles
 from api.idempotency import Idempotency
-from api.models import GraspQuery, Health, Histogram, Job, JobDetail, MeanMetrics, Part, Shard
+from api.models import GraspDetail, GraspQuery, Health, Histogram, Job, JobDetail, MeanMetrics, Part, Shard
 from api.progress import Paces, eta_of_job, progress_of_job, stage_statuses
 from service import library, pipeline
 from service.digests import digest_files
@@ -53,6 +54,7 @@ class Catalog:
         self._idempotency = Idempotency(parts.settings)
         self._paces = Paces()
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
+        self._grasp_files = GraspFiles(parts.store)
         self._health: tuple[float, Health] | None = None
 
     @property
@@ -105,6 +107,12 @@ class Catalog:
         """Grasps that pass every filter."""
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
         return self._parts.index.grasps(grasp_filter(query), sort=sort, limit=limit, cursor=cursor)
+
+    def grasp(self, shard_id: str, row: int) -> GraspDetail:
+        """One grasp with all that its shard says of it."""
+        index = self._parts.index
+        grasp, shard = index.grasp(shard_id, row), index.shard(shard_id)
+        return self._grasp_files.detail(grasp, shard)
 
     def shards(
         self,

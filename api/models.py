@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.domain import JobRequest, Stage, State
-from service.index.views import AttemptView, ShardView, StageProgress
+from service.index.views import AttemptView, GraspView, ShardView, StageProgress
 
 
 class StageStatus(StageProgress):
@@ -82,6 +82,35 @@ class GraspQuery(BaseModel):
     max_penetration_depth_mm: float | None = Field(None, ge=0, allow_inf_nan=False)
     sort: Literal["epsilon", "contact_area_cm2", "intersection_volume_cm3", "penetration_depth_mm"] = "epsilon"
     order: Literal["asc", "desc"] = "desc"
+
+
+class Posture(BaseModel):
+    """A hand posture in the object's frame."""
+
+    hand_pose: list[float] = Field(description="root link: x y z [m], quaternion w x y z")
+    joint_positions: list[float] = Field(description="order of joint_names [rad or m]")
+
+
+class Push(BaseModel):
+    """What one push of the referee did to a grasp."""
+
+    direction: str
+    outcome: str
+
+
+class GraspDetail(GraspView):
+    """One grasp with its postures and all that its shard says of it."""
+
+    hand_digest: str
+    object_digest: str
+    joint_names: list[str]
+    postures: dict[str, Posture] = Field(description="pregrasp, grasp, squeeze")
+    thresholds_m: list[float] = Field(description="contact thresholds of the sweep")
+    sweep: dict[str, list[float | None]] = Field(description="metric at each of the thresholds")
+    pushes: list[Push] = Field(description="verdict per direction of push; empty: the referee did not judge")
+    verdict_margin: float | None = Field(None, description="worst motion over its limit; below 1: held")
+    audit: bool | None = Field(None, description="verdict by the letter of the protocol; None: not audited")
+    friction: float | None = Field(None, description="Coulomb coefficient of the metrics")
 
 
 class GraspPageQuery(GraspQuery):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
 from starlette.datastructures import UploadFile as AnyUpload
@@ -12,9 +12,12 @@ from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
 from api.problems import responses
 from api.uploads import files_of_upload, name_of_upload
+from service import names
 from service.domain import AssetKind, Name
 from service.errors import LimitError
 from service.index.views import AssetView, Page
+
+_GLB: Final = "model/gltf-binary"
 
 
 def asset_router(kind: AssetKind) -> APIRouter:
@@ -36,6 +39,21 @@ def asset_router(kind: AssetKind) -> APIRouter:
     def get_asset(name: str, catalog: CatalogOf) -> AssetView:
         """One of them, with what the check found."""
         return catalog.asset(kind, name)
+
+    @router.get(
+        "/{name}/model",
+        dependencies=[Depends(may_read)],
+        response_class=Response,
+        responses=responses(401, 403, 404, 503, others={200: {"content": {_GLB: {}}, "description": "Binary glTF"}}),
+        name=f"get_{kind}_model",
+    )
+    def get_model(name: str, catalog: CatalogOf) -> Response:
+        """The prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
+        asset = catalog.asset(kind, name)
+        # Under a digest it never changes; a name may come to stand for something else.
+        lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
+        data = catalog.store.get(names.asset_model(kind, asset.digest))
+        return Response(data, media_type=_GLB, headers={"Cache-Control": lasting})
 
     @router.post(
         "",

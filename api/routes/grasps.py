@@ -7,12 +7,19 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from api.dependencies import CatalogOf, may_read
-from api.models import GraspPageQuery
+from api.models import GraspDetail, GraspPageQuery
 from api.paging import link_next
 from api.problems import responses
 from service.index.views import GraspView, Page
 
 router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
+
+
+@router.get("/{shard_id}/{row}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
+def get_grasp(shard_id: str, row: int, response: Response, catalog: CatalogOf) -> GraspDetail:
+    """One grasp whole: its postures, and its quality at every contact threshold."""
+    response.headers["Cache-Control"] = "private, max-age=86400"
+    return catalog.grasp(shard_id, row)
 
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
