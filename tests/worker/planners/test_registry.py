@@ -1,0 +1,63 @@
+"""The plug-in point: names, options, and planners of other packages."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from service.errors import InputError
+from worker.planners import PLANNERS, method, method_names, planner, registry
+from worker.planners.port import Method
+from worker.planners.registry import parsed_options
+
+
+@pytest.mark.parametrize("name", sorted(PLANNERS))
+def test_every_method_of_graspds_own_says_what_it_is_and_where_it_is_published(name: str) -> None:
+    found = method(name)
+    assert found.summary and found.source
+    assert callable(planner(name))
+
+
+def test_options_of_a_method_are_read_from_text() -> None:
+    assert planner("autograsp", {"standoff_m": "0.01"}).options.standoff_m == 0.01  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"speed": "9"}, "its options: standoff_m"),
+        ({"standoff_m": "far"}, "standoff_m"),
+        ({"standoff_m": -1}, "greater"),
+    ],
+)
+def test_a_wrong_option_is_refused_with_those_there_are(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        planner("autograsp", options)
+
+
+def test_an_option_without_a_value_is_refused() -> None:
+    with pytest.raises(InputError, match="name=value"):
+        parsed_options(["steps"])
+
+
+def offer(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint(name, value, group)])
+
+
+def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    offer(monkeypatch, "theirs", "worker.planners.autograsp.planner:METHOD")
+    assert "theirs" in method_names()
+    assert isinstance(method("theirs"), Method)
+
+
+def test_another_package_cannot_take_the_name_of_a_method_of_graspds_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    offer(monkeypatch, "fast_graspd", "worker.planners.autograsp.planner:METHOD")
+    assert "Fast-Grasp'D" in method("fast_graspd").source
+
+
+@pytest.mark.parametrize("value", ["no.such.module:METHOD", "worker.planners:GROUP"])
+def test_an_entry_point_that_is_no_method_is_named_in_the_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    offer(monkeypatch, "theirs", value)
+    with pytest.raises(InputError, match="theirs"):
+        method("theirs")

@@ -1,0 +1,174 @@
+"""Approach and closing of a batch of hands by conservative advancement: no step is longer than the gap it crosses.
+
+GraspIt! closes joints in small steps and goes back when something is hit; here steps follow from distances, which gives
+the same end, contact within `TOUCH_M`, without tunnelling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.hands.jacobian import ancestors
+from worker.hands.model import HandModel, JointType, SurfacePoints
+from worker.planners.autograsp import kernels
+from worker.planners.fast_graspd.pairs import Pair
+from worker.simulation.kernels import kinematics
+from worker.simulation.simulation import HandState, Simulation
+from worker.transforms import quat_rotate
+
+Floats = NDArray[np.float64]
+
+#: Contact: GraspIt!'s threshold layer [m].
+TOUCH_M: Final = 2e-4
+#: Distances beyond this are not asked for [m].
+REACH_M: Final = 0.03
+#: Gap between fingers beyond which they do not slow each other [m].
+MARGIN_M: Final = 0.005
+#: Share of a gap crossed in one step: far distances come from a grid that may be off by a third.
+SHARE: Final = 0.6
+#: Longest closing step [rad], and most steps.
+LARGEST: Final = 0.1
+STEPS: Final = 400
+#: Most advances of the root: each crosses more than half of what is left.
+ADVANCES: Final = 40
+
+
+def levers(hand: HandModel, points: SurfacePoints) -> Floats:
+    """(D, L) bound on how far a point of body l moves per unit of dof d, by chain lengths [m/rad]."""
+    radius = np.zeros(hand.bodies)
+    np.maximum.at(radius, points.body, np.linalg.norm(points.position, axis=1))
+    length = np.linalg.norm(hand.origin[:, :3], axis=1)
+    moved = ancestors(hand)
+    out = np.zeros((hand.dofs, hand.bodies))
+    for joint in range(1, hand.bodies):
+        for body in np.flatnonzero(moved[:, joint]):
+            between = [k for k in range(1, hand.bodies) if moved[body, k] and moved[k, joint] and k != joint]
+            turning = hand.joint_type[joint] == JointType.REVOLUTE
+            reach = length[between].sum() + radius[body] if turning else 1.0
+            out[hand.dof[joint], body] += abs(hand.multiplier[joint]) * reach
+    return out
+
+
+def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(D,) a common number for dofs that move a common body, from (D, L)."""
+    group = np.arange(len(moves))
+    for d in range(len(moves)):
+        for e in range(d):
+            if (moves[d] & moves[e]).any():
+                group[group == group[d]] = group[e]
+    return group.astype(np.int32)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Hands after closing, and what stopped each dof: (B, D) 0 nothing, 1 contact, 2 its limit."""
+
+    state: HandState
+    stopped: NDArray[np.int32]
+
+
+class Closer:
+    """Approach and closing of up to `capacity` hands."""
+
+    def __init__(self, pair: Pair, capacity: int) -> None:
+        self.pair, self.capacity = pair, capacity
+        self.hand = pair.hand.model
+        # A simulation holds poses, points and states; only its kinematics is run.
+        self.simulation = Simulation(
+            pair.hand, pair.fine.obj, pair.fine.points, pair.coarse.own, capacity=capacity, options=pair.options
+        )
+        self.closing = self._closing()
+        with wp.ScopedDevice(self.simulation.device):
+            self.near = wp.zeros((capacity, self.hand.bodies), dtype=wp.float32)
+            self.pairs = wp.zeros((capacity, self.hand.bodies, self.hand.bodies), dtype=wp.float32)
+            self.stopped = wp.zeros((capacity, self.hand.dofs), dtype=wp.int32)
+
+    def _closing(self) -> Any:
+        hand, points = self.hand, self.pair.fine.points
+        lever = levers(hand, points)
+        moves = lever > 0
+        out = kernels.Closing()
+        with wp.ScopedDevice(self.simulation.device):
+            out.direction = wp.array(hand.closing, dtype=wp.float32)
+            out.moves = wp.array(moves.astype(np.int32), dtype=wp.int32)
+            out.lever = wp.array(lever, dtype=wp.float32)
+            out.finger = wp.array(finger_groups(moves), dtype=wp.int32)
+            out.lower = wp.array(hand.lower, dtype=wp.float32)
+            out.upper = wp.array(hand.upper, dtype=wp.float32)
+        return out
+
+    def approach(self, state: HandState, standoff: float) -> HandState:
+        """Hands moved along the palm's approach until their nearest body is `standoff` [m] from the object."""
+        n = len(state.pivot)
+        direction = np.zeros((self.capacity, 3))
+        direction[:n] = quat_rotate(state.rotation, self.hand.palm.approach)
+        self.simulation.set_state(state)
+        active, near = self.simulation.active, self.near
+        with wp.ScopedDevice(self.simulation.device):
+            along = wp.array(direction, dtype=wp.vec3)
+        for _ in range(ADVANCES):
+            self._measure()
+            wp.launch(
+                kernels.advance, self.capacity,
+                inputs=[standoff, SHARE, along, active, near, self.simulation.pivot], device=self.simulation.device,
+            )  # fmt: skip
+            if not active.numpy().any():
+                break
+        return self.simulation.state(n)
+
+    def close(self, state: HandState) -> Closed:
+        """Fingers closed until contact or limits; the root and dofs that do not close (spreads) stay."""
+        n, simulation = len(state.pivot), self.simulation
+        simulation.set_state(state)
+        idle = np.tile((self.hand.closing == 0).astype(np.int32) * 2, (self.capacity, 1))
+        self.stopped.assign(idle)
+        for _ in range(STEPS):
+            self._measure(fingers=True)
+            wp.launch(
+                kernels.close, self.capacity,
+                inputs=[self.closing, TOUCH_M, SHARE, LARGEST, simulation.active, self.near, self.pairs, self.stopped,
+                        simulation.q],
+                device=simulation.device,
+            )  # fmt: skip
+            if not simulation.active.numpy().any():
+                break
+        return Closed(simulation.state(n), self.stopped.numpy()[:n].astype(np.int32))
+
+    def distances(self, state: HandState) -> Floats:
+        """(n, L) least distance of each body from the object, at most `REACH_M` [m]."""
+        self.simulation.set_state(state)
+        self._measure()
+        return self.near.numpy()[: len(state.pivot)].astype(float)
+
+    def _measure(self, *, fingers: bool = False) -> None:
+        s, obj, device = self.simulation, self.pair.fine.obj, self.simulation.device
+        wp.launch(
+            kinematics.forward, self.capacity,
+            inputs=[s.hand.tree, s.active, s.pivot, s.rotation, s.q, s.body_p, s.body_q, s.axis, s.force, s.torque,
+                    s.contacts, s.point_depth, s.object_depth, s.self_depth],
+            device=device,
+        )  # fmt: skip
+        pose = [s.body_p, s.body_q]
+        wp.launch(kernels.clear, self.near.shape, inputs=[self.near, self.pairs, REACH_M], device=device)
+        wp.launch(
+            kernels.points_to_object, (self.capacity, s.count),
+            inputs=[obj.surface, REACH_M, s.options.exact_below, s.active, s.point_body, s.point_position, *pose,
+                    self.near],
+            device=device,
+        )  # fmt: skip
+        shape = (self.capacity, len(self.hand.pieces))
+        wp.launch(
+            kernels.object_to_pieces, shape,
+            inputs=[self.pair.hand.pieces, obj.bvh.id, obj.samples, MARGIN_M, s.active, *pose, self.near],
+            device=device,
+        )  # fmt: skip
+        if fingers:
+            wp.launch(
+                kernels.bodies_to_pieces, shape,
+                inputs=[self.pair.hand.pieces, s.body_points, MARGIN_M, s.active, *pose, self.pairs], device=device,
+            )  # fmt: skip
