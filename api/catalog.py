@@ -212,6 +212,9 @@ class Catalog:
         return JobDetail(
             **self._job(job, self._running(job.id)).model_dump(),
             request=job.request,
+            note=job.note,
+            audited=job.audited,
+            audit_held=job.audit_held,
             hand_digest=job.hand_digest,
             object_digest=job.object_digest,
             attempts=self._parts.index.attempts(job=job.id, limit=50),
@@ -234,6 +237,7 @@ class Catalog:
             requested=job.request.grasps,
             grasps=job.grasps,
             valid=job.valid,
+            tried=job.tried,
             progress=progress_of_job(job),
             eta_s=eta_of_job(job, stages),
             created=job.created,

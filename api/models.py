@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -30,8 +30,9 @@ class Job(BaseModel):
     method: str
     fidelity: str
     requested: int = Field(description="grasps asked for")
-    grasps: int = Field(description="grasps made so far")
-    valid: int = Field(description="of these, past the geometric gate")
+    grasps: int = Field(description="grasps kept so far")
+    valid: int = Field(description="of these, past the geometric gate, and the referee where it judged")
+    tried: int = Field(0, description="grasps planned for them, kept or not")
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
     created: str
@@ -61,9 +62,15 @@ class JobDetail(Job):
     request: JobRequest
     hand_digest: str
     object_digest: str
+    note: str | None = Field(None, description="what a reader of the numbers should know")
+    audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
+    audit_held: int = Field(0, description="of these, grasps that held")
     attempts: list[AttemptView]
     mean: MeanMetrics
     shards: list[Shard]
+
+
+Bound = Annotated[float | None, Field(ge=0, allow_inf_nan=False)]
 
 
 class GraspQuery(BaseModel):
@@ -76,10 +83,14 @@ class GraspQuery(BaseModel):
     object: str | None = Field(None, max_length=64)
     valid: bool | None = None
     success: bool | None = None
-    min_epsilon: float | None = Field(None, ge=0, allow_inf_nan=False)
-    min_contact_area_cm2: float | None = Field(None, ge=0, allow_inf_nan=False)
-    max_intersection_volume_cm3: float | None = Field(None, ge=0, allow_inf_nan=False)
-    max_penetration_depth_mm: float | None = Field(None, ge=0, allow_inf_nan=False)
+    min_epsilon: Bound = None
+    max_epsilon: Bound = None
+    min_contact_area_cm2: Bound = None
+    max_contact_area_cm2: Bound = None
+    min_intersection_volume_cm3: Bound = None
+    max_intersection_volume_cm3: Bound = None
+    min_penetration_depth_mm: Bound = None
+    max_penetration_depth_mm: Bound = None
     sort: Literal["epsilon", "contact_area_cm2", "intersection_volume_cm3", "penetration_depth_mm"] = "epsilon"
     order: Literal["asc", "desc"] = "desc"
 

@@ -1,19 +1,34 @@
-"""Thumbnails of rendered views: one picture of a views shard as a PNG."""
+"""Pictures of rendered views as PNG: colour, depth, segmentation; whole or as thumbnails."""
 
 from __future__ import annotations
 
 import io
 from functools import lru_cache
+from typing import Any, Final, Literal
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from service.errors import NotFoundError
 from service.store import Store
 
+Channel = Literal["rgb", "depth", "segmentation"]
+
 #: A views shard of 48 pictures is a few megabytes; a page asks for several pictures of the same one.
-_KEPT_SHARDS = 2
+_KEPT_SHARDS: Final = 2
+#: Near to far: light and warm to dark and cool, with lightness falling all the way.
+_DEPTH_COLOURS: Final = np.array(
+    [(252, 244, 190), (250, 203, 116), (240, 148, 87), (205, 92, 103), (142, 58, 121), (78, 38, 108), (24, 18, 56)],
+    np.float64,
+)
+_NOTHING: Final = (12, 15, 20)
+#: Background, table, object, then the neighbours.
+_CLASSES: Final = np.array(
+    [(24, 29, 33), (96, 108, 118), (23, 163, 152), (227, 171, 98), (88, 134, 214), (190, 98, 160), (150, 178, 82)],
+    np.uint8,
+)
 
 
 class Pictures:
@@ -22,19 +37,46 @@ class Pictures:
     def __init__(self, store: Store) -> None:
         self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(store.get)
 
-    def png(self, key: str, index: int) -> bytes:
-        """PNG of the colour picture at row `index` of /image/rgb (V, H, W, 3).
+    def png(self, key: str, index: int, channel: Channel = "rgb", width: int | None = None) -> bytes:
+        """PNG of the picture at row `index` of a channel, no wider than `width` pixels.
 
         Raises:
-            NotFoundError: the shard holds fewer pictures.
+            NotFoundError: the shard holds fewer pictures, or none of this channel.
         """
         with h5py.File(io.BytesIO(self._fetch(key)), "r") as file:
-            if "image/rgb" not in file:
+            path = f"image/{channel}"
+            if path not in file:
                 raise NotFoundError("the shard holds no pictures; only a views shard does")
-            pictures = file["image/rgb"]
+            pictures = file[path]
             if not 0 <= index < len(pictures):
                 raise NotFoundError(f"the shard holds {len(pictures)} pictures; there is no picture {index}")
-            pixels = np.asarray(pictures[index])
+            pixels = _PAINTERS[channel](np.asarray(pictures[index]))
+        image = Image.fromarray(pixels)
+        if width is not None and width < image.width:
+            kind = Image.Resampling.NEAREST if channel == "segmentation" else Image.Resampling.LANCZOS
+            image = image.resize((width, max(1, round(image.height * width / image.width))), kind)
         buffer = io.BytesIO()
-        Image.fromarray(pixels).save(buffer, "PNG", compress_level=3)
+        image.save(buffer, "PNG", compress_level=3)
         return buffer.getvalue()
+
+
+def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
+    """Depth (H, W) [m] as colours (H, W, 3) over the range that this picture has; dark where there is nothing."""
+    seen = np.isfinite(depth)
+    painted = np.empty((*depth.shape, 3), np.uint8)
+    painted[:] = _NOTHING
+    if seen.any():
+        low, high = np.percentile(depth[seen], (1, 99))
+        place = np.clip((depth[seen] - low) / max(high - low, 1e-6), 0, 1) * (len(_DEPTH_COLOURS) - 1)
+        below = np.minimum(place.astype(int), len(_DEPTH_COLOURS) - 2)
+        share = (place - below)[:, None]
+        painted[seen] = _DEPTH_COLOURS[below] * (1 - share) + _DEPTH_COLOURS[below + 1] * share
+    return painted
+
+
+def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Labels (H, W) as colours (H, W, 3); neighbours beyond the palette share its last colours."""
+    return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
+
+
+_PAINTERS: Final = {"rgb": lambda pixels: pixels, "depth": paint_depth, "segmentation": paint_segmentation}

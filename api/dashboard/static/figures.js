@@ -1,0 +1,102 @@
+// A hand that takes postures and an object, as three.js groups. Metres; poses are x y z, then quaternion w x y z.
+import { Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
+
+const COLOURS = { palm: 0x4a535d, finger: 0x6b7682, tip: 0x17a398, object: 0xe3ab62 };
+
+function material(color, metalness = 0) {
+  return new MeshStandardMaterial({ color, roughness: metalness ? 0.45 : 0.62, metalness });
+}
+
+function solid(geometry, look) {
+  const mesh = new Mesh(geometry, look);
+  mesh.castShadow = mesh.receiveShadow = true;
+  return mesh;
+}
+
+/** A hand: `pose` moves it; `group` is what to draw. */
+export class Hand {
+  constructor(model) {
+    const looks = { palm: material(COLOURS.palm, 0.3), finger: material(COLOURS.finger, 0.3), tip: material(COLOURS.tip) };
+    this.looks = Object.values(looks);
+    this.extras = model.extras;
+    this.joints = new Map();
+    this.bodies = model.nodes.map((node, index) => {
+      const group = new Group();
+      const rest = new Quaternion(...node.rotation);
+      group.position.fromArray(node.translation);
+      group.quaternion.copy(rest);
+      const look = index === 0 ? looks.palm : node.extras.fingertip ? looks.tip : looks.finger;
+      if (node.solid) group.add(solid(node.solid, look));
+      if (node.extras.joint) {
+        const at = new Vector3(...node.translation);
+        this.joints.set(node.extras.joint, { group, rest, at, axis: new Vector3(...node.extras.axis), slides: node.extras.type === "prismatic" });
+      }
+      return { group, points: node.points };
+    });
+    model.nodes.forEach((node, index) => node.children.forEach((child) => this.bodies[index].group.add(this.bodies[child].group)));
+    this.group = new Group();
+    this.group.add(this.bodies[0].group);
+  }
+
+  /** Take a posture: pose of the root link, and joint positions by name. */
+  pose(rootPose, positions) {
+    const [x, y, z, qw, qx, qy, qz] = rootPose;
+    this.group.position.set(x, y, z);
+    this.group.quaternion.set(qx, qy, qz, qw);
+    const turn = new Quaternion();
+    for (const [name, joint] of this.joints) {
+      const value = positions[name] ?? 0;
+      if (joint.slides) {
+        joint.group.position.copy(joint.axis).multiplyScalar(value).applyQuaternion(joint.rest).add(joint.at);
+      } else {
+        joint.group.quaternion.copy(joint.rest).multiply(turn.setFromAxisAngle(joint.axis, value));
+      }
+    }
+    this.group.updateMatrixWorld(true);
+  }
+
+  /** Glass lets one see what happens behind a finger. */
+  setGlass(on) {
+    for (const look of this.looks) {
+      look.transparent = on;
+      look.opacity = on ? 0.32 : 1;
+      look.depthWrite = !on;
+      look.needsUpdate = true;
+    }
+  }
+
+  /** Calls back with each surface point in the frame of the group's parent. */
+  eachPoint(callback) {
+    const point = new Vector3();
+    for (const { group, points } of this.bodies) {
+      for (let i = 0; points && i < points.length; i += 3) {
+        callback(point.fromArray(points, i).applyMatrix4(group.matrixWorld));
+      }
+    }
+  }
+}
+
+/** The object's mesh; `setWire` shows its triangles. */
+export class Thing {
+  constructor(model) {
+    this.geometry = model.nodes[0].solid;
+    this.look = material(COLOURS.object);
+    this.group = new Group();
+    this.group.add(solid(this.geometry, this.look));
+  }
+
+  setWire(on) {
+    this.look.wireframe = on;
+  }
+}
+
+/** The posture between two, 0 to 1: straight for positions and joints, by the shorter arc for the rotation. */
+export function between(first, second, share, names) {
+  const mix = (a, b) => a + (b - a) * share;
+  const [ax, ay, az, aw, ai, aj, ak] = first.hand_pose;
+  const [bx, by, bz, bw, bi, bj, bk] = second.hand_pose;
+  const turn = new Quaternion(ai, aj, ak, aw).slerp(new Quaternion(bi, bj, bk, bw), share);
+  const positions = {};
+  names.forEach((name, i) => { positions[name] = mix(first.joint_positions[i], second.joint_positions[i]); });
+  return { pose: [mix(ax, bx), mix(ay, by), mix(az, bz), turn.w, turn.x, turn.y, turn.z], positions };
+}

@@ -1,0 +1,60 @@
+// Reads the binary glTF that graspd writes (worker/stages/glb.py): nodes, triangles with normals, points. Nothing more.
+import { BufferAttribute, BufferGeometry } from "./vendor/three.min.js";
+
+const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
+const WIDTHS = { SCALAR: 1, VEC3: 3 };
+const POINTS = 0;
+
+/** The document of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, points}]}`. */
+export function readGlb(buffer) {
+  const view = new DataView(buffer);
+  if (view.getUint32(0, true) !== 0x46546c67) throw new Error("the model is no binary glTF");
+  const length = view.getUint32(12, true);
+  const json = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, length)));
+  const base = 20 + length + 8;
+  const attribute = (index) => {
+    const accessor = json.accessors[index];
+    const span = json.bufferViews[accessor.bufferView];
+    const Type = TYPES[accessor.componentType];
+    const width = WIDTHS[accessor.type];
+    const stride = (span.byteStride ?? width * Type.BYTES_PER_ELEMENT) / Type.BYTES_PER_ELEMENT;
+    const raw = new Type(buffer, base + span.byteOffset, accessor.count * stride);
+    if (stride === width) return new BufferAttribute(raw, width, accessor.normalized ?? false);
+    const packed = new Type(accessor.count * width);
+    for (let i = 0; i < accessor.count; i++) {
+      for (let k = 0; k < width; k++) packed[i * width + k] = raw[i * stride + k];
+    }
+    return new BufferAttribute(packed, width, accessor.normalized ?? false);
+  };
+  const nodes = json.nodes.map((node) => {
+    const made = { translation: [0, 0, 0], rotation: [0, 0, 0, 1], extras: {}, children: [], ...node, solid: null, points: null };
+    for (const primitive of node.mesh === undefined ? [] : json.meshes[node.mesh].primitives) {
+      const position = attribute(primitive.attributes.POSITION);
+      if (primitive.mode === POINTS) {
+        made.points = position.array;
+        continue;
+      }
+      made.solid = new BufferGeometry();
+      made.solid.setAttribute("position", position);
+      made.solid.setAttribute("normal", attribute(primitive.attributes.NORMAL));
+      made.solid.setIndex(attribute(primitive.indices));
+    }
+    return made;
+  });
+  return { extras: json.asset.extras, nodes };
+}
+
+const loading = new Map();
+
+/** The document behind an address, fetched once. */
+export function loadGlb(address) {
+  if (!loading.has(address)) {
+    const promise = fetch(address).then(async (answer) => {
+      if (!answer.ok) throw new Error(answer.status === 404 ? "the model is not made yet" : `the model cannot be read (HTTP ${answer.status})`);
+      return readGlb(await answer.arrayBuffer());
+    });
+    promise.catch(() => loading.delete(address));
+    loading.set(address, promise);
+  }
+  return loading.get(address);
+}

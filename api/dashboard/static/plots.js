@@ -1,0 +1,66 @@
+// Line and bar charts by uPlot over the SVG that the page brings: the same numbers, with a reading under the pointer.
+(() => {
+  "use strict";
+  const made = new Map();
+
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  // Canvas does not know light-dark(): let the browser resolve it.
+  function resolved(name) {
+    const probe = document.createElement("i");
+    probe.className = `probe-${name}`;
+    document.body.append(probe);
+    const value = getComputedStyle(probe).color;
+    probe.remove();
+    return value;
+  }
+
+  function options(figure, data, width) {
+    const { kind, x, y, unit, log } = data;
+    const ink = resolved("ink"), line = resolved("line"), accent = resolved("accent"), soft = resolved("soft");
+    const font = `12px ${colour("--sans")}`;
+    const axis = { stroke: ink, font, grid: { stroke: line, width: 1 }, ticks: { show: false } };
+    return {
+      width, height: Number(figure.dataset.height ?? 180), padding: [8, 8, 0, 0],
+      cursor: { points: { size: 7 }, drag: { x: kind === "line", y: false } },
+      legend: { live: true },
+      scales: { x: { time: kind === "bars" }, y: log ? { distr: 3 } : { range: (_, low, high) => [0, Math.max(high, 1) * 1.08] } },
+      axes: [
+        { ...axis, grid: { show: false }, values: kind === "bars" ? (_, ticks) => ticks.map((t) => new Date(1000 * t).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" })) : undefined },
+        { ...axis, size: 52 },
+      ],
+      series: [
+        { label: x, value: (_, v) => (v === null || v === undefined ? "–" : kind === "bars" ? new Date(1000 * v).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" }) : String(v)) },
+        {
+          label: y, stroke: accent, fill: soft, width: kind === "bars" ? 0 : 2, points: { show: false },
+          paths: kind === "bars" ? uPlot.paths.bars({ size: [0.82, 40], radius: 0.15 }) : undefined,
+          value: (_, v) => (v === null || v === undefined ? "–" : `${Number(v.toPrecision(4))} ${unit}`.trim()),
+        },
+      ],
+    };
+  }
+
+  function plot(figure) {
+    const data = JSON.parse(figure.dataset.plot);
+    const width = Math.floor(figure.clientWidth);
+    if (!width) return;
+    const text = figure.dataset.plot + width + matchMedia("(prefers-color-scheme: dark)").matches;
+    if (made.get(figure)?.text === text) return;
+    made.get(figure)?.chart.destroy();
+    const fallback = figure.querySelector("svg");
+    if (fallback) fallback.setAttribute("hidden", "");
+    const chart = new uPlot(options(figure, data, width), [data.xs, data.ys], figure);
+    chart.root.setAttribute("aria-hidden", "true");
+    made.set(figure, { chart, text });
+  }
+
+  function all() {
+    for (const figure of made.keys()) if (!figure.isConnected) made.delete(figure);
+    document.querySelectorAll("[data-plot]").forEach(plot);
+  }
+
+  all();
+  addEventListener("resize", all);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", all);
+  document.addEventListener("graspd:swapped", all);
+  document.addEventListener("htmx:after:swap", all);
+})();

@@ -1,0 +1,160 @@
+// A lit stage with a camera that orbits. Draws only when something changed, so an idle page costs nothing.
+import {
+  ACESFilmicToneMapping, Box3, DirectionalLight, HemisphereLight, PCFSoftShadowMap, PerspectiveCamera, Scene, Sphere,
+  Vector3, WebGLRenderer, OrbitControls,
+} from "./vendor/three.min.js";
+
+const FIELD_DEG = 32;
+const TURN = Math.PI / 24;
+
+function lit(scene) {
+  scene.add(new HemisphereLight(0xf4f7ff, 0x8a8378, 1.5));
+  const key = new DirectionalLight(0xfff4e6, 2.6);
+  key.castShadow = true;
+  key.shadow.mapSize.set(1024, 1024);
+  key.shadow.bias = -0.0006;
+  key.shadow.normalBias = 0.0012;
+  const rim = new DirectionalLight(0xcfe3ff, 1.1);
+  scene.add(key, key.target, rim, rim.target);
+  return { key, rim };
+}
+
+/** Everything needed to draw figures; without `canvas` it draws into one of its own (for thumbnails). */
+export class Stage {
+  constructor(canvas) {
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: !canvas });
+    this.renderer.toneMapping = ACESFilmicToneMapping;
+    this.renderer.toneMappingExposure = 1.05;
+    this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.type = PCFSoftShadowMap;
+    this.scene = new Scene();
+    this.lights = lit(this.scene);
+    this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01, 10);
+    this.camera.up.set(0, 0, 1);
+    this.sphere = new Sphere(new Vector3(), 0.1);
+  }
+
+  /** Fill the view with a group, seen from a direction that points from it to the camera. */
+  frame(group, direction, margin = 1.0) {
+    group.updateMatrixWorld(true);
+    new Box3().setFromObject(group).getBoundingSphere(this.sphere);
+    const half = (Math.min(1, this.camera.aspect) * FIELD_DEG * Math.PI) / 360;
+    const distance = (margin * this.sphere.radius) / Math.sin(half);
+    this.camera.position.copy(direction).normalize().multiplyScalar(distance).add(this.sphere.center);
+    this.camera.near = distance / 50;
+    this.camera.far = distance * 10;
+    this.camera.lookAt(this.sphere.center);
+    this.camera.updateProjectionMatrix();
+    this.light();
+  }
+
+  /** Keep the lamps over the viewer's shoulder. */
+  light() {
+    const { center, radius } = this.sphere;
+    const right = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0);
+    const up = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 1);
+    const back = this.camera.position.clone().sub(center).normalize();
+    const place = (lamp, x, y, z) => {
+      lamp.position.copy(center).addScaledVector(right, x * radius).addScaledVector(up, y * radius).addScaledVector(back, z * radius);
+      lamp.target.position.copy(center);
+      lamp.target.updateMatrixWorld();
+    };
+    place(this.lights.key, -1.6, 2.6, 2.4);
+    place(this.lights.rim, 2.2, 0.6, -2.2);
+    const eye = this.lights.key.shadow.camera;
+    eye.left = eye.bottom = -1.2 * radius;
+    eye.right = eye.top = 1.2 * radius;
+    eye.near = 0.1 * radius;
+    eye.far = 8 * radius;
+    eye.updateProjectionMatrix();
+  }
+
+  size(width, height, ratio) {
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+  }
+
+  draw() {
+    this.camera.updateMatrixWorld();
+    this.light();
+    this.renderer.render(this.scene, this.camera);
+  }
+}
+
+/** A stage on the page: follows its canvas's size, mouse, touch and arrow keys. */
+export class LiveStage extends Stage {
+  constructor(canvas) {
+    super(canvas);
+    this.canvas = canvas;
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = false;
+    this.controls.addEventListener("change", () => this.invalidate());
+    canvas.addEventListener("keydown", (event) => this.#key(event));
+    new ResizeObserver(() => this.#resize()).observe(canvas);
+    this.#resize();
+  }
+
+  frame(group, direction, margin) {
+    super.frame(group, direction, margin);
+    this.home = { at: this.camera.position.clone(), to: this.sphere.center.clone() };
+    this.controls.target.copy(this.sphere.center);
+    this.controls.minDistance = this.sphere.radius * 0.4;
+    this.controls.maxDistance = this.sphere.radius * 12;
+    this.controls.update();
+    this.invalidate();
+  }
+
+  reset() {
+    this.camera.position.copy(this.home.at);
+    this.controls.target.copy(this.home.to);
+    this.controls.update();
+    this.invalidate();
+  }
+
+  invalidate() {
+    this.waiting ??= requestAnimationFrame(() => {
+      this.waiting = null;
+      this.draw();
+    });
+  }
+
+  #resize() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (!width || !height) return;
+    this.size(width, height, Math.min(devicePixelRatio, 2));
+    this.invalidate();
+  }
+
+  #key(event) {
+    const turns = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] };
+    const zooms = { "+": 0.88, "=": 0.88, "-": 1.14 };
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    if (turns[event.key]) {
+      const [around, over] = turns[event.key];
+      const radius = offset.length();
+      const polar = Math.min(Math.max(Math.acos(offset.z / radius) + over, 0.05), Math.PI - 0.05);
+      const azimuth = Math.atan2(offset.y, offset.x) + around;
+      offset.set(radius * Math.sin(polar) * Math.cos(azimuth), radius * Math.sin(polar) * Math.sin(azimuth), radius * Math.cos(polar));
+    } else if (zooms[event.key]) {
+      offset.multiplyScalar(zooms[event.key]);
+    } else {
+      return;
+    }
+    event.preventDefault();
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.controls.update();
+    this.invalidate();
+  }
+}
+
+/** Where to stand to see a grasp: beside the hand, a little above and behind it. */
+export function besideHand(hand) {
+  const approach = new Vector3(...(hand.extras.palm?.approach ?? [0, 0, 1])).applyQuaternion(hand.group.quaternion);
+  const up = new Vector3(0, 0, 1);
+  const side = new Vector3().crossVectors(up, approach);
+  if (side.length() < 0.2) side.set(1, 0.4, 0);
+  side.normalize();
+  return side.multiplyScalar(1).addScaledVector(up, 0.55).addScaledVector(approach, -0.35);
+}

@@ -1,0 +1,58 @@
+// Pictures of grasps in lists: one small stage draws them one after another as they come into view.
+import { Group } from "./vendor/three.min.js";
+import { loadGlb } from "./glb.js";
+import { between, Hand, Thing } from "./figures.js";
+import { besideHand, Stage } from "./stage.js";
+
+const SIDE = 220;
+let stage = null;
+const figures = new Map();
+let queue = Promise.resolve();
+
+function keep(address, Kind) {
+  if (!figures.has(address)) figures.set(address, loadGlb(address).then((model) => new Kind(model)));
+  return figures.get(address);
+}
+
+async function draw(canvas) {
+  const [grasp, hand, thing] = await Promise.all([
+    fetch(canvas.dataset.grasp).then((answer) => (answer.ok ? answer.json() : Promise.reject(new Error(answer.status)))),
+    keep(canvas.dataset.hand, Hand),
+    keep(canvas.dataset.object, Thing),
+  ]);
+  stage ??= new Stage();
+  const ratio = Math.min(devicePixelRatio, 2);
+  const { pose, positions } = between(grasp.postures.grasp, grasp.postures.grasp, 0, grasp.joint_names);
+  hand.pose(pose, positions);
+  const all = new Group();
+  all.add(hand.group, thing.group);
+  stage.scene.add(all);
+  stage.size(SIDE, SIDE * 0.8, ratio);
+  stage.frame(all, besideHand(hand), 0.86);
+  stage.draw();
+  canvas.width = stage.renderer.domElement.width;
+  canvas.height = stage.renderer.domElement.height;
+  canvas.getContext("2d").drawImage(stage.renderer.domElement, 0, 0);
+  stage.scene.remove(all);
+  canvas.dataset.state = "ready";
+}
+
+const seen = new IntersectionObserver((entries) => {
+  for (const { isIntersecting, target } of entries) {
+    if (!isIntersecting) continue;
+    seen.unobserve(target);
+    // One after another, with a breath between, so that scrolling stays smooth.
+    queue = queue.then(() => draw(target)).catch(() => { target.dataset.state = "failed"; }).then(() => new Promise(requestAnimationFrame));
+  }
+}, { rootMargin: "300px" });
+
+function watch(root) {
+  for (const canvas of root.querySelectorAll("canvas[data-grasp]:not([data-state])")) {
+    canvas.dataset.state = "waiting";
+    seen.observe(canvas);
+  }
+}
+
+watch(document);
+document.addEventListener("htmx:after:swap", () => watch(document));
+document.addEventListener("graspd:swapped", () => watch(document));
