@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Final
 
 import typer
@@ -49,6 +50,13 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("objects", "check", "worker.objects.commands", "Say whether a mesh can be used, and what was repaired."),
 )
 
+#: What a room cannot work without, and the extra that brings it: an image has only the rooms it needs.
+ROOMS: Final[dict[str, tuple[str, str]]] = {
+    "api": ("fastapi", "api"),
+    "worker": ("warp", "worker"),
+    "graspd_demo": ("warp", "all"),
+}
+
 
 class LazyGroup(TyperGroup):
     """A group whose overview needs no import: a command's room is imported when the command is called."""
@@ -74,7 +82,12 @@ class Deferred(TyperCommand):
 
 
 def load(module: str, name: str, ctx: Any = None) -> Any:
-    """The command of a room, imported now."""
+    """The command of a room, imported now; one line and exit code 1 where that room is not installed."""
+    if missing := missing_extra(module):
+        typer.echo(
+            f"graspd: `graspd {name}` is not part of this install; run pip install 'graspd[{missing}]'", err=True
+        )
+        raise typer.Exit(1)
     group: Any = typer.main.get_command(import_module(module).app)
     # A Typer with a single command is that command itself, not a group.
     command = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
@@ -83,6 +96,12 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
             if parent == name:
                 command.add_command(Deferred(child, room, text))
     return command
+
+
+def missing_extra(module: str) -> str | None:
+    """The extra to install before a module can be used; None if it can be used now."""
+    needed, extra = ROOMS.get(module.partition(".")[0], ("", ""))
+    return extra if needed and find_spec(needed) is None else None
 
 
 def build() -> typer.Typer:
