@@ -37,6 +37,11 @@ def asset_model(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/model.glb"
 
 
+def object_pieces(digest: str, key: str) -> str:
+    """Convex pieces of an object as the referee knows it; `key` is a digest of how they were made."""
+    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
+
+
 def job_record(job: str) -> str:
     """The request with the digests of hand and object."""
     return f"{JOBS}/{job}/job.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +23,10 @@ class Posture:
     def __len__(self) -> int:
         return len(self.hand_pose)
 
+    def take(self, rows: NDArray[np.intp] | slice) -> Posture:
+        """Some of the postures, in the order of `rows`."""
+        return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
+
 
 @dataclass
 class GraspSet:
@@ -38,3 +43,24 @@ class GraspSet:
 
     def __len__(self) -> int:
         return len(self.grasp)
+
+    def take(self, rows: NDArray[np.intp] | slice) -> GraspSet:
+        """Some of the grasps, in the order of `rows`; what the planner said of the whole set stays."""
+        loss = np.asarray(self.stability_loss, float)[rows]
+        grasp, pregrasp, squeeze = (part.take(rows) for part in (self.grasp, self.pregrasp, self.squeeze))
+        return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info)
+
+
+def joined(sets: Sequence[GraspSet]) -> GraspSet:
+    """Several sets of one hand on one object as one; of the planner's remarks, those on the first set."""
+    grasp, pregrasp, squeeze = (
+        _joined([getattr(part, name) for part in sets]) for name in ("grasp", "pregrasp", "squeeze")
+    )
+    loss = np.concatenate([np.asarray(part.stability_loss, float) for part in sets])
+    return GraspSet(grasp, pregrasp, squeeze, loss, sum(part.seconds for part in sets), dict(sets[0].info))
+
+
+def _joined(parts: Sequence[Posture]) -> Posture:
+    return Posture(
+        np.concatenate([part.hand_pose for part in parts]), np.concatenate([part.joint_positions for part in parts])
+    )

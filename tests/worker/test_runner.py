@@ -166,12 +166,20 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
 
 def test_a_task_of_another_schema_is_refused_with_the_mend(bench: Bench) -> None:
     message = message_for()
-    outcome = bench.run(message, schema=2, something_new=True)
+    outcome = bench.run(message, schema=99, something_new=True)
     assert outcome is not None
     assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
-    assert "schema 2" in outcome.message
+    assert "schema 99" in outcome.message
     assert "one version" in outcome.message
     assert bench.calls == 0
+
+
+def test_a_job_planned_for_another_revision_is_refused_with_the_mend(bench: Bench) -> None:
+    message = message_for()
+    outcome = bench.run(message, revision=message.revision + 1)
+    assert outcome is not None
+    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
+    assert "submit the job again" in outcome.message
 
 
 def test_what_is_no_message_is_refused(bench: Bench) -> None:

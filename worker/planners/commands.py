@@ -25,8 +25,8 @@ from worker.objects.prepare import object_from_path
 from worker.planners import PLANNERS, planner, synthesize
 from worker.planners import Progress as Report
 from worker.planners.registry import parsed_options
+from worker.quality.gate import passes
 from worker.quality.table import measure
-from worker.stages.gate import passes
 from worker.stages.synthesize import postures
 
 Arrays = dict[str, NDArray[Any]]

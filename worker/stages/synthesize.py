@@ -3,56 +3,53 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
 from service.domain import TaskMessage
 from service.shards import Attribute
+from worker.certified import Certified, certified_grasps
 from worker.context import TaskContext
 from worker.grasps import GraspSet
-from worker.planners import synthesize
-from worker.quality.table import measure
+from worker.hands.model import HandModel
 from worker.stages.assets import hand_of, object_of
-from worker.stages.gate import passes
 from worker.stages.output import Output
-
-#: Share of the progress bar that ends with the planner; the rest is the quality table.
-_PLANNED: Final = 0.85
+from worker.stages.pieces import pieces_of
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Synthesize and measure `message.count` grasps."""
+    """Grasps of one batch with quality and verdict: `message.count` valid ones, as far as the job's budget goes."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
-    request = message.request
-    grasps = synthesize(
+    found = certified_grasps(
         hand,
         obj,
+        message.request,
         count=message.count,
-        method=request.method,
-        fidelity=request.knobs,
-        seed=request.seed,
         batch=message.batch,
         threads=context.threads,
         device=context.device,
-        progress=context.part(0.0, _PLANNED),
+        pieces=lambda prepared: pieces_of(context.store, prepared),
+        progress=context.part(0.0, 1.0),
         cancelled=context.cancelled,
     )
-    quality = measure(
-        hand,
-        obj,
-        grasps,
-        friction=request.friction,
-        threads=context.threads,
-        progress=context.part(_PLANNED, 1.0),
-        cancelled=context.cancelled,
-    )
-    arrays: dict[str, Any] = {**postures(grasps), **quality, "quality/valid": passes(quality)}
+    seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
+    info = {**seconds, "rejected": found.rejected, **_json(found.grasps.info)}
+    return Output({**postures(found.grasps), **found.columns}, attributes_of(hand, message, found), info)
+
+
+def attributes_of(hand: HandModel, message: TaskMessage, found: Certified) -> dict[str, Attribute]:
+    """Root attributes of the base shard of a batch."""
+    request = message.request
     attributes: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),
         "mu": request.friction,
         "root_link": hand.root_link,
+        "want": request.want,
+        "tried": found.tried,
     }
-    return Output(arrays, attributes, {"planner_seconds": round(grasps.seconds, 4), **_json(grasps.info)})
+    if found.verdict_key is not None:
+        attributes |= {"verdict_level": request.referee, "verdict_key": found.verdict_key}
+    return attributes
 
 
 def postures(grasps: GraspSet) -> dict[str, Any]:

@@ -104,6 +104,11 @@ def default_cache() -> Path:
     return (Path(home) if home else Path.home() / ".cache") / "graspd" / "convex"
 
 
+def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
+    """Where `decompose` keeps the pieces of an object; its stem is a digest of all that they follow from."""
+    return _file(_Key(obj), cache or default_cache())
+
+
 class _Key:
     """An object with the digest of all that its pieces follow from."""
 
@@ -122,7 +127,7 @@ class _Key:
 
 @lru_cache(maxsize=64)
 def _load_or_make(key: _Key, cache: Path) -> ConvexPieces:
-    file = cache / f"{key.digest}.npz"
+    file = _file(key, cache)
     if file.is_file():
         with np.load(file) as stored:
             parts = tuple(stored[name] for name in sorted(stored.files))
@@ -131,6 +136,10 @@ def _load_or_make(key: _Key, cache: Path) -> ConvexPieces:
         _store(file, parts)
     volume = union_volume(parts)
     return ConvexPieces(parts, volume / key.obj.volume, _excess(volume, key.obj), _digest(parts))
+
+
+def _file(key: _Key, cache: Path) -> Path:
+    return cache / f"{key.digest}.npz"
 
 
 def _excess(volume: float, obj: ObjectModel) -> float:

@@ -1,4 +1,4 @@
-"""The geometric gate: which grasps are worth a scene. The referee's verdict comes later and is stricter."""
+"""The geometric gate: grasps that no verdict can save, because the hand is inside the object or inside itself."""
 
 from __future__ import annotations
 

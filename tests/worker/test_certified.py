@@ -1,0 +1,117 @@
+"""Batches of valid grasps: rounds, budgets, audits."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.domain import JobRequest
+from worker import certified
+from worker.certified import Certified, certified_grasps, next_round
+from worker.grasps import GraspSet, Posture
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+
+COUNT = 6
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    return hand_from_path("allegro")
+
+
+@pytest.fixture(scope="module")
+def block() -> ObjectModel:
+    return object_from_path("block")
+
+
+def wish(**changes: Any) -> JobRequest:
+    return JobRequest(**{"hand": "allegro", "object": "block", "grasps": COUNT, "fidelity": "draft", **changes})
+
+
+@pytest.fixture(scope="module")
+def valid(hand: HandModel, block: ObjectModel) -> Certified:
+    return certified_grasps(hand, block, wish(audits=2), count=COUNT)
+
+
+def test_a_batch_of_valid_grasps_holds_nothing_else(valid: Certified) -> None:
+    assert len(valid.grasps) == COUNT
+    assert (valid.columns["quality/valid"] == 1).all()
+    assert (valid.columns["quality/success"] == 1).all()
+    assert all(len(array) == COUNT for path, array in valid.columns.items() if path != "quality/thresholds_m")
+
+
+def test_every_grasp_that_was_tried_is_accounted_for(valid: Certified) -> None:
+    assert valid.tried == COUNT + sum(valid.rejected.values())
+
+
+def test_only_as_many_grasps_are_audited_as_were_asked_for(valid: Certified) -> None:
+    assert (valid.columns["quality/audit"] >= 0).tolist() == [True] * 2 + [False] * (COUNT - 2)
+
+
+def test_the_same_batch_is_the_same_grasps(hand: HandModel, block: ObjectModel, valid: Certified) -> None:
+    again = certified_grasps(hand, block, wish(audits=2), count=COUNT)
+    np.testing.assert_array_equal(again.grasps.squeeze.joint_positions, valid.grasps.squeeze.joint_positions)
+    assert again.tried == valid.tried
+
+
+def test_raw_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
+    found = certified_grasps(hand, block, wish(want="raw", audits=0), count=COUNT)
+    assert (len(found.grasps), found.tried, found.rejected) == (COUNT, COUNT, {"dropped": 0, "gate": 0, "surplus": 0})
+    assert set(np.unique(found.columns["quality/success"])) <= {0, 1}
+    assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()
+
+
+def test_without_a_referee_nobody_judges(hand: HandModel, block: ObjectModel) -> None:
+    found = certified_grasps(hand, block, wish(referee="none"), count=COUNT)
+    assert found.verdict_key is None
+    assert "quality/success" not in found.columns
+
+
+def test_a_budget_that_finds_nothing_ends_with_nothing(
+    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned: list[int] = []
+
+    def plan(*_: Any, count: int, batch: int, **__: Any) -> GraspSet:
+        planned.append(batch)
+        posture = Posture(np.tile([0.0, 0, 1, 1, 0, 0, 0], (count, 1)), np.zeros((count, len(hand.joint_names))))
+        return GraspSet(posture, posture, posture, np.full(count, np.nan))
+
+    def drop(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
+        n = len(grasps)
+        outcome, nothing = np.full((n, 6), 4, np.uint8), np.zeros(n, np.int8)
+        return SimpleNamespace(success=nothing, outcome=outcome, margin=np.full(n, 9.0), seconds=0.0)
+
+    monkeypatch.setattr(certified, "synthesize", plan)
+    monkeypatch.setattr(certified, "judge", drop)
+    found = certified_grasps(hand, block, wish(budget=3.0), count=COUNT)
+    assert (len(found.grasps), found.tried) == (0, 3 * COUNT)
+    assert len(set(planned)) == len(planned), "each round draws other grasps"
+    assert found.columns["quality/valid"].shape == (0,)
+
+
+@given(
+    wanted=st.integers(1, 32),
+    factor=st.floats(1, 100),
+    rates=st.lists(st.floats(0, 1), min_size=1, max_size=8),
+)
+def test_rounds_end_with_enough_grasps_or_with_the_budget_used_up(
+    wanted: int, factor: float, rates: list[float]
+) -> None:
+    budget = int(np.ceil(wanted * factor))
+    valid = tried = number = 0
+    while size := next_round(wanted, valid, tried, budget):
+        tried += size
+        valid += int(size * rates[number % len(rates)])
+        number += 1
+        assert size > 0
+    assert tried <= budget
+    assert valid >= wanted or tried == budget

@@ -1,0 +1,261 @@
+"""Grasps with their quality and verdict: planned in rounds until enough are valid or the budget ends.
+
+A grasp is valid if the referee says that it holds and it passes the geometric gate. The dear steps come last: a grasp
+that the referee drops is not measured.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.domain import BATCH_SIZE, JobRequest
+from worker.grasps import GraspSet, joined
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners import Cancelled, Progress, synthesize
+from worker.quality.gate import passes
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.judge import judge
+from worker.quality.referee.key import verdict_key
+from worker.quality.referee.protocol import DIRECTIONS
+from worker.quality.referee.robustness import robustness
+from worker.quality.table import measure
+
+Arrays = dict[str, NDArray[Any]]
+
+#: Rounds of one batch draw their grasps where no batch of a job does: a job has at most 31,250 batches.
+ROUND_STRIDE: Final = 1 << 20
+#: Fewest grasps worth a round.
+SMALLEST_ROUND: Final = 8
+#: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
+_LEAST_RATE: Final = 0.1
+#: Shares of a round's progress: planned, judged, measured.
+_PARTS: Final = (0.6, 0.8, 1.0)
+
+
+@dataclass(frozen=True)
+class Certified:
+    """What came of a batch."""
+
+    grasps: GraspSet
+    columns: Arrays
+    """The `quality/...` columns of a base shard."""
+    tried: int
+    """Grasps planned, kept or not."""
+    rejected: dict[str, int]
+    """Grasps that were not kept, by the reason: dropped, gate, surplus."""
+    verdict_key: str | None
+    """Digest of the terms of the verdicts; None: nobody judged."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of planning, judging and measuring [s]."""
+
+
+@dataclass
+class _Round:
+    """Grasps of one round that are worth keeping."""
+
+    grasps: GraspSet
+    columns: Arrays
+    rejected: dict[str, int]
+
+
+def certified_grasps(
+    hand: HandModel,
+    obj: ObjectModel,
+    request: JobRequest,
+    *,
+    count: int,
+    batch: int = 0,
+    threads: int = 0,
+    device: str = "cpu",
+    pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
+    progress: Progress = lambda done, total, message: None,
+    cancelled: Cancelled = lambda: False,
+) -> Certified:
+    """A batch of a job: `count` valid grasps, or as many as the budget finds; or `count` grasps of any kind.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        request: method, fidelity, seed, friction; whether valid grasps are wanted, at which level, and the budget.
+        count: grasps wanted.
+        batch: number of the batch within its job.
+        threads: 0: all cores.
+        device: of the planner.
+        pieces: gives the object's convex pieces; runs beside the first round's planning.
+        progress: called with the share that is done.
+        cancelled: polled often.
+
+    Raises:
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `cancelled()` answers True.
+    """
+    work = _Work(hand, obj, request, batch, threads, device, progress, cancelled)
+    with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
+        work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
+        rounds = work.until(count)
+    return work.finish(rounds, count)
+
+
+def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
+    """Grasps to plan next: as many as the rate so far promises to be enough, and a tenth more.
+
+    Args:
+        wanted: valid grasps wanted in all.
+        valid: found so far.
+        tried: planned so far.
+        budget: planned at most.
+
+    Returns:
+        0 when enough are found or the budget is used up.
+    """
+    if valid >= wanted or tried >= budget:
+        return 0
+    if tried == 0:
+        return min(wanted, budget)
+    need = 1.1 * (wanted - valid) / max(valid / tried, _LEAST_RATE)
+    return min(max(SMALLEST_ROUND, math.ceil(need)), BATCH_SIZE, budget - tried)
+
+
+class _Work:
+    """One batch in the making."""
+
+    def __init__(
+        self, hand: HandModel, obj: ObjectModel, request: JobRequest, batch: int, threads: int, device: str,
+        progress: Progress, cancelled: Cancelled,
+    ) -> None:  # fmt: skip
+        self.hand, self.obj, self.request, self.batch = hand, obj, request, batch
+        self.threads, self.device, self.cancelled = threads, device, cancelled
+        self.pieces: Future[ConvexPieces] | None = None
+        self.tried = 0
+        self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
+        self._progress = progress
+        self._span = (0.0, 1.0)
+
+    def until(self, count: int) -> list[_Round]:
+        """Rounds until `count` grasps are there or the budget is used up."""
+        wish = self.request
+        if wish.want == "raw":
+            return [self._round(0, count)]
+        budget = math.ceil(wish.budget * count)
+        rounds: list[_Round] = []
+        while size := next_round(count, valid := sum(len(part.grasps) for part in rounds), self.tried, budget):
+            # A round brings the batch as far as the rate so far lets hope.
+            begun = valid / count
+            self._span = (begun, begun + (1 - begun) * min(1.0, size / max(1, count - valid)) * 0.9)
+            rounds.append(self._round(len(rounds), size))
+        return rounds
+
+    def finish(self, rounds: list[_Round], count: int) -> Certified:
+        """The rounds as one batch, cut to `count`, with audits and robustness."""
+        grasps = joined([part.grasps for part in rounds])
+        columns = _joined_columns([part.columns for part in rounds])
+        rejected = {name: sum(part.rejected[name] for part in rounds) for name in rounds[0].rejected}
+        rejected["surplus"] = max(0, len(grasps) - count)
+        kept = np.arange(min(count, len(grasps)))
+        grasps = grasps.take(kept)
+        columns = {path: array if path == _THRESHOLDS else array[kept] for path, array in columns.items()}
+        if self.pieces is None:
+            return Certified(grasps, columns, self.tried, rejected, None, self.seconds)
+        columns |= self._second_opinions(grasps, columns["quality/valid"])
+        key = verdict_key(self.hand, self.obj, self._level, False, pieces=self.pieces.result())
+        return Certified(grasps, columns, self.tried, rejected, key, self.seconds)
+
+    @property
+    def _level(self) -> Any:
+        return self.request.referee
+
+    def _round(self, number: int, size: int) -> _Round:
+        request = self.request
+        planned = synthesize(
+            self.hand, self.obj, count=size, method=request.method, fidelity=request.knobs, seed=request.seed,
+            batch=self.batch + number * ROUND_STRIDE, threads=self.threads, device=self.device,
+            progress=self._part(0), cancelled=self.cancelled,
+        )  # fmt: skip
+        self.tried += size
+        self.seconds["planner"] += planned.seconds
+        every = request.want == "raw"
+        columns = self._judged(planned)
+        rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
+        grasps = planned.take(rows)
+        columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps)
+        held = columns.get("quality/success", np.ones(len(rows)))
+        valid = (passes(columns) == 1) & (held == 1)
+        columns["quality/valid"] = valid.astype(np.uint8)
+        rejected = {"dropped": size - len(rows), "gate": 0 if every else int(np.count_nonzero(~valid))}
+        if not every:
+            grasps = grasps.take(np.flatnonzero(valid))
+            columns = {path: array if path == _THRESHOLDS else array[valid] for path, array in columns.items()}
+        return _Round(grasps, columns, rejected)
+
+    def _judged(self, grasps: GraspSet) -> Arrays:
+        if self.pieces is None:
+            return {}
+        verdicts = judge(
+            self.hand, self.obj, grasps, level=self._level, threads=self.threads, pieces=self.pieces.result(),
+            progress=self._part(1), cancelled=self.cancelled,
+        )  # fmt: skip
+        self.seconds["referee"] += verdicts.seconds
+        return {
+            "quality/success": verdicts.success,
+            "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
+            "quality/verdict_margin": verdicts.margin,
+        }
+
+    def _measured(self, grasps: GraspSet) -> Arrays:
+        began = time.perf_counter()
+        columns = measure(
+            self.hand, self.obj, grasps, friction=self.request.friction, threads=self.threads,
+            progress=self._part(2), cancelled=self.cancelled,
+        )  # fmt: skip
+        self.seconds["quality"] += time.perf_counter() - began
+        return dict(columns)
+
+    def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
+        """Audits by the letter of the first valid grasps, and the robustness of all of them, as far as wished."""
+        assert self.pieces is not None
+        columns: Arrays = {}
+        common: dict[str, Any] = {"threads": self.threads, "pieces": self.pieces.result(), "cancelled": self.cancelled}
+        began = time.perf_counter()
+        audited = np.flatnonzero(valid)[: self.request.audits_of(self.batch)]
+        audit = np.full(len(grasps), -1, np.int8)
+        if len(audited):
+            audit[audited] = judge(self.hand, self.obj, grasps.take(audited), level="letter", **common).success
+        if self.request.audits_of(self.batch):
+            columns["quality/audit"] = audit
+        if repeats := self.request.robustness:
+            columns["quality/robustness"] = robustness(
+                self.hand, self.obj, grasps, held=valid, repeats=repeats, seed=self.request.seed, **common
+            )
+        self.seconds["referee"] += time.perf_counter() - began
+        return columns
+
+    def _part(self, number: int) -> Progress:
+        """Progress of one part of the present round within the whole batch."""
+        first, last = self._span
+        low, high = (0.0, *_PARTS)[number], _PARTS[number]
+
+        def tell(done: float, total: float, message: str) -> None:
+            share = low + (high - low) * (done / total if total > 0 else 0.0)
+            self._progress(first + (last - first) * share, 1.0, message)
+
+        return tell
+
+
+_THRESHOLDS: Final = "quality/thresholds_m"
+
+
+def _joined_columns(parts: list[Mapping[str, NDArray[Any]]]) -> Arrays:
+    """Columns of several rounds as one; the thresholds are common to all."""
+    return {
+        path: parts[0][path] if path == _THRESHOLDS else np.concatenate([part[path] for part in parts])
+        for path in parts[0]
+    }

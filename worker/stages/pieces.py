@@ -1,0 +1,44 @@
+"""Convex pieces of objects, shared by all workers through the store: they move verdicts, and cost up to minutes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from service import names
+from service.errors import NotFoundError
+from service.store import Store
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import ConvexPieces, decompose, piece_file
+
+
+def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
+    """The pieces of an object: this machine's, else those in the store, else made now and put there.
+
+    Raises:
+        MeshError: the object has no usable pieces.
+        StoreUnavailable: the store does not answer.
+    """
+    file = piece_file(obj, cache)
+    key = names.object_pieces(obj.digest, file.stem)
+    if not file.is_file():
+        _fetch(store, key, file)
+    pieces = decompose(obj, cache=cache)
+    if file.is_file() and not store.exists(key):
+        store.put(key, file.read_bytes())
+    return pieces
+
+
+def _fetch(store: Store, key: str, file: Path) -> None:
+    try:
+        data = store.get(key)
+    except NotFoundError:
+        return
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        partial = file.with_suffix(f".{os.getpid()}.part")
+        partial.write_bytes(data)
+        partial.replace(file)
+    except OSError:
+        # A folder that cannot be written only costs time.
+        return
