@@ -12,16 +12,19 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 
 from api import problems
-from api.auth import KeyFile
 from api.catalog import Catalog
 from api.dashboard import pages
 from api.dashboard.rendering import STATIC, problem_page
 from api.guard import RequestContext, SameOrigin, host_name, is_loopback
+from api.keys import KeyFile
 from api.limits import BodyLimit
 from api.metrics import Metrics
+from api.rates import Rates
 from api.routes import grasps, jobs, shards, system
 from api.routes.assets import asset_router
+from api.turnstile import Turnstile
 from service.domain import AssetKind
+from service.embedded import redis_url
 from service.errors import InputError
 from service.parts import Parts
 from service.settings import Settings
@@ -38,13 +41,15 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         InputError: the address to bind is reachable from elsewhere and no key exists.
         StoreUnavailable, IndexUnavailable: where the parts cannot be opened.
     """
-    keys = KeyFile(settings.data_dir / "keys.json")
+    keys = KeyFile(settings.resolved_keys_file)
     check_exposure(settings.host, keys)
     opened = parts or Parts.open(settings)
+    rates = Rates(redis_url(settings))
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         yield
+        await rates.close()
         if parts is None:
             opened.close()
 
@@ -65,24 +70,25 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         app.include_router(router)
     pages.install(app)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    _add_middleware(app, settings, keys)
+    _add_middleware(app, settings, keys, rates)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 
 
 def check_exposure(host: str, keys: KeyFile) -> None:
-    """InputError if strangers could reach a service that asks for no key."""
-    if keys.is_open and not is_loopback(host):
+    """InputError if strangers could reach a service that has no key to ask for."""
+    if not keys.has_live_key and not is_loopback(host):
         raise InputError(
-            f"{host} is reachable from other machines and no key exists; "
+            f"{host} is reachable from other machines and there is no live key; "
             "make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1"
         )
 
 
-def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile) -> None:
-    """Innermost first: limits on bodies, then foreign web pages, then request ids around everything."""
+def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, rates: Rates) -> None:
+    """Innermost first: limits on bodies, who asks and how often, foreign web pages, request ids around everything."""
     uploads = frozenset({"/v1/hands", "/v1/objects", "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
+    app.add_middleware(Turnstile, keys=keys, settings=settings, rates=rates)
     allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None
     app.add_middleware(SameOrigin, allowed_hosts=allowed)
     app.add_middleware(RequestContext, metrics=app.state.metrics)

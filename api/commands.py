@@ -31,6 +31,11 @@ def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
     grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    budget: Annotated[float, typer.Option(help="Tries for each valid grasp, at most.")] = 4.0,
+    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
+    audits: Annotated[int, typer.Option(help="Valid grasps judged again by the letter.")] = 8,
+    robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
     method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
     fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
     seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
@@ -52,6 +57,11 @@ def submit(
                 "hand": _uploaded(client, AssetKind.HAND, hand),
                 "object": _uploaded(client, AssetKind.OBJECT, object),
                 "grasps": grasps,
+                "want": want,
+                "budget": budget,
+                "referee": referee,
+                "audits": audits,
+                "robustness": robustness,
                 "method": method,
                 "fidelity": fidelity,
                 "seed": seed,
@@ -86,7 +96,7 @@ def jobs(
         return
     table = Table("job", "state", "hand", "object", "progress", "valid", "created", box=None, header_style="bold")
     for job in page.items:
-        done = f"{count(job.valid)} of {count(job.grasps)}"
+        done = f"{count(job.valid)} of {count(job.requested)}"
         table.add_row(job.id[:12], job.state, job.hand, job.object, percent(job.progress), done, job.created)
     Console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
 
@@ -196,7 +206,7 @@ def api(
     from api.server import serve
 
     settings = load_settings(host=host, port=port)
-    log_to_stderr(settings)
+    log_to_stderr(settings, "api")
     serve(settings)
 
 

@@ -6,8 +6,9 @@ from typing import Annotated
 
 from fastapi import Depends, Query, Request
 
-from api.auth import Scope, authorize
+from api.auth import authorize
 from api.catalog import Catalog
+from api.keys import Scope
 
 MAX_LIMIT = 200
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import logging
 import re
 import time
 import uuid
@@ -15,8 +16,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.metrics import Metrics
 from api.problems import ApiError, answer, log_unforeseen
+from service.errors import GraspdError
+from service.logs import bind
 
+_access = logging.getLogger("graspd.access")
+#: Asked every few seconds by whatever watches the service.
+_QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 _SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+_METHODS: Final = _SAFE_METHODS | {"POST", "PUT", "PATCH", "DELETE"}
 _REQUEST_ID: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 CONTENT_SECURITY_POLICY: Final = (
@@ -48,6 +55,10 @@ class RequestContext:
             return
         request_id = _request_id(Headers(scope=scope).get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = request_id
+        with bind(request=request_id):
+            await self._answer(scope, receive, send, request_id)
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
         started = time.perf_counter()
         status = 0
 
@@ -59,20 +70,34 @@ class RequestContext:
                 headers["X-Request-Id"] = request_id
                 for name, value in _SECURITY_HEADERS.items():
                     headers.setdefault(name, value)
+                if scope["scheme"] == "https":
+                    headers.setdefault("Strict-Transport-Security", "max-age=31536000")
+                if scope["path"].startswith("/v1/"):
+                    headers.setdefault("Cache-Control", "no-store")
             await send(message)
 
         try:
             await self.app(scope, receive, with_headers)
         except Exception as error:
-            log_unforeseen(scope["path"], request_id, error)
+            if not isinstance(error, GraspdError):
+                log_unforeseen(scope["path"], request_id, error)
             if status:
                 raise
             await answer(Request(scope), error)(scope, receive, with_headers)
         finally:
-            route = scope.get("route")
-            self.metrics.observe(
-                scope["method"], getattr(route, "path", "unmatched"), status, time.perf_counter() - started
-            )
+            self._note(scope, status, time.perf_counter() - started)
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        """Count the answer and write its line."""
+        route = getattr(scope.get("route"), "path", "unmatched")
+        # Clients may write any word for the method; only those that HTTP knows become names of series.
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        self.metrics.observe(method, route, status, seconds)
+        level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
+        key = scope["state"].get("key")
+        about = {"status": status, "ms": round(1000 * seconds, 1), "route": route, "key": key.name if key else ""}
+        about["client"] = scope["client"][0] if scope.get("client") else ""
+        _access.log(level, "%s %s %d", method, scope["path"], status, extra=about)
 
 
 class SameOrigin:

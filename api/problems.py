@@ -54,6 +54,7 @@ HTTP_SLUGS: Final[dict[int, str]] = {
     404: "not-found",
     405: "method-not-allowed",
     406: "not-acceptable",
+    408: "request-timeout",
     411: "length-required",
     413: "too-large",
     415: "unsupported-media-type",

@@ -29,7 +29,7 @@ def worker(
     from worker.main import run_worker
 
     settings = load_settings(device=device, threads=threads, data_dir=data_dir)
-    log_to_stderr(settings)
+    log_to_stderr(settings, "worker")
     ended_well = run_worker(
         settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
     )

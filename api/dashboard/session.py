@@ -7,8 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from api.auth import SESSION_COOKIE, SESSION_S, KeyFile
+from api.auth import SESSION_COOKIE
 from api.dashboard.rendering import render
+from api.keys import SESSION_S, KeyFile
 
 router = APIRouter(include_in_schema=False)
 

@@ -9,7 +9,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.app import create_app
-from api.auth import KeyFile, Scope
+from api.keys import KeyFile, Scope
 from service.errors import ConflictError, InputError, NotFoundError
 from service.parts import Parts
 from service.settings import Settings

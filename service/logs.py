@@ -1,0 +1,101 @@
+"""Log lines of every process: JSON for machines, text on a terminal, each with the request, job and task it is about.
+
+`bind` says what a piece of work is about; every line written within carries that, whichever module writes it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from types import MappingProxyType
+from typing import Any, Final
+
+from service.settings import Settings
+
+#: What a line can be about, in the order in which it is shown.
+SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
+_bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
+_ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
+#: Alembic tells of every migration check, RQ of every idle poll, httpx of every request.
+_TALKATIVE: Final = ("alembic", "rq.worker", "rq.job", "rq.queue", "httpx")
+
+
+@contextmanager
+def bind(**subjects: Any) -> Iterator[None]:
+    """Lines written within are about these; empty values are left out. Threads begun within do not inherit it."""
+    token = _bound.set({**_bound.get(), **{name: value for name, value in subjects.items() if value}})
+    try:
+        yield
+    finally:
+        _bound.reset(token)
+
+
+def bound(subject: str) -> str:
+    """What the present work is about, e.g. `bound("request")`; empty if it was not said."""
+    return str(_bound.get().get(subject, ""))
+
+
+def set_up(settings: Settings, process: str = "graspd") -> None:
+    """Send the lines of this process to stderr.
+
+    Args:
+        process: its name in every JSON line, e.g. api, keeper, worker.
+    """
+    is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_TextLines() if is_text else JsonLines(process))
+    logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
+    logging.captureWarnings(True)
+    for name in _TALKATIVE:
+        logging.getLogger(name).setLevel(logging.WARNING)
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line: time, level, process, pid, logger, message, subjects, what was given as `extra`."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = process
+
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "time": _time(record),
+            "level": record.levelname,
+            "process": self._process,
+            "pid": os.getpid(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_subjects(record),
+            **{name: value for name, value in vars(record).items() if name not in _ORDINARY and name not in SUBJECTS},
+        }
+        if record.exc_info:
+            line["trace"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str, ensure_ascii=False)
+
+
+class _TextLines(logging.Formatter):
+    """Time, level, module, message, and in brackets what it is about."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
+        trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
+        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {record.getMessage()}"
+        return f"{text} [{about}]{trace}" if about else f"{text}{trace}"
+
+
+def _subjects(record: logging.LogRecord) -> dict[str, Any]:
+    """Those bound where the line was written, and those given with the line itself."""
+    found = dict(_bound.get())
+    found.update((name, vars(record)[name]) for name in SUBJECTS if name in vars(record))
+    return {name: found[name] for name in SUBJECTS if found.get(name)}
+
+
+def _time(record: logging.LogRecord) -> str:
+    when = datetime.fromtimestamp(record.created, UTC)
+    return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
