@@ -122,7 +122,7 @@ def main() -> None:
     from worker.main import run_worker
 
     settings = Settings()
-    log_to_stderr(settings)
+    log_to_stderr(settings, "worker")
     table = fake_stages()
     poison = os.environ.get("FAKE_POISON")
 
