@@ -12,6 +12,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from service import names
+from service.datasets.planner import Planner
 from service.domain import AssetKind, Lane
 from service.errors import UnavailableError
 from service.index.rebuild import rebuild
@@ -38,10 +39,12 @@ class Keeper:
         self._parts = parts
         self._indexer = Indexer(parts)
         self._reaper = Reaper(parts, self._indexer, clock=clock)
+        self._planner = Planner(parts, clock=clock)
+        self._has_plans = False
         self._backlog: deque[tuple[str, Event]] = deque()
         self._started = False
         self._clock = clock
-        self._look_again = self._tell_again = -math.inf
+        self._look_again = self._plan_again = self._tell_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -67,11 +70,14 @@ class Keeper:
         """
         if not self._started:
             self._start()
-        news = self._index_events(wait_s)
+        news = self._index_events(0.0 if self._has_plans else wait_s)
         now = self._clock()
         if news or now >= self._look_again:
             self._look_after_queue()
             self._look_again = now + self._parts.settings.keeper_interval_s
+        if self._has_plans or now >= self._plan_again:
+            self._has_plans = self._planner.advance()
+            self._plan_again = now + self._parts.settings.keeper_interval_s
         if now >= self._tell_again:
             self._look_after_workers()
             self._tell_again = now + _WORKERS_EVERY_S

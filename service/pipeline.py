@@ -30,16 +30,25 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
         the job, and whether it is new. A failed or cancelled job is returned as it is: `retry` starts it again.
 
     Raises:
+        what `prepare` raises; nothing was recorded then.
+    """
+    return enter(parts, prepare(parts, request, lane=lane))
+
+
+def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> JobRecord:
+    """The job that a request stands for, of a hand and an object that may be used.
+
+    Raises:
         NotFoundError: unknown hand or object.
         InputError: the hand or object was refused when it was checked.
         ConflictError: the check of the hand or object is still running.
-        QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
+        QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
-    hand = _usable(parts, AssetKind.HAND, request.hand)
-    obj = _usable(parts, AssetKind.OBJECT, request.object)
+    hand = usable(parts, AssetKind.HAND, request.hand)
+    obj = usable(parts, AssetKind.OBJECT, request.object)
     parts.queue.ping()
     request = request.model_copy(update={"hand": hand.name, "object": obj.name})
-    record = JobRecord(
+    return JobRecord(
         id=job_id(request, hand.digest, obj.digest),
         request=request,
         hand_digest=hand.digest,
@@ -47,7 +56,6 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
         lane=lane or lane_of(request),
         created=timestamp(),
     )
-    return enter(parts, record)
 
 
 def enter(parts: Parts, record: JobRecord) -> tuple[JobView, bool]:
@@ -150,7 +158,14 @@ def _told(parts: Parts, job_id: str) -> JobView:
     return job
 
 
-def _usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
+def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
+    """A hand or object by name or digest that jobs may use.
+
+    Raises:
+        NotFoundError: there is none.
+        InputError: it was refused when it was checked.
+        ConflictError: its check is still running.
+    """
     asset = parts.index.asset(kind, name)
     if asset.verdict == "refuse":
         raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from service.digests import digest_json, shard_id
-from service.domain import BATCH_SIZE, AssetKind, IngestMessage, JobRequest, Lane, Stage, State, TaskMessage
+from service.domain import BATCH_SIZE, AssetKind, IngestMessage, JobOptions, JobRequest, Lane, Stage, State, TaskMessage
 from service.records import JobRecord
 from service.version import TASK_SCHEMA
 
@@ -57,7 +57,7 @@ def lane_of(request: JobRequest) -> Lane:
     return Lane.INTERACTIVE if request.grasps <= INTERACTIVE_GRASPS else Lane.BULK
 
 
-def stages_of(request: JobRequest) -> tuple[Stage, ...]:
+def stages_of(request: JobOptions) -> tuple[Stage, ...]:
     """The stages each batch of the job passes through."""
     return CHAIN[: 1 + bool(request.scenes) + bool(request.views)]
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from service.index.changes import Changes
+from service.index.dataset_changes import DatasetChanges
+from service.index.dataset_queries import DatasetQueries
 from service.index.feed import Feed
 from service.index.grasp_queries import GraspQueries
 from service.index.job_queries import JobQueries
@@ -10,7 +12,7 @@ from service.index.service_queries import ServiceQueries
 from service.index.summaries import Summaries
 
 
-class Index(JobQueries, GraspQueries, Summaries, ServiceQueries, Feed, Changes):
+class Index(JobQueries, GraspQueries, Summaries, ServiceQueries, DatasetQueries, Feed, Changes, DatasetChanges):
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
     Reads answer the API; writes come from the API and the keeper only. Every method raises IndexUnavailable when the

@@ -11,6 +11,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, Table, delete, select
 
 from service import names
+from service.datasets.records import DatasetRecord, ObjectSet, Snapshot, dataset_events
 from service.domain import AssetKind, State
 from service.index.index import Index
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
@@ -31,9 +32,9 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         progress: called with what is being read and how many of it there were so far.
 
     Returns:
-        number of jobs, attempts, shards and assets read.
+        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read.
     """
-    counts = {"assets": 0, "jobs": 0, "attempts": 0, "shards": 0}
+    counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
 
     def count(what: str) -> None:
         counts[what] += 1
@@ -60,7 +61,23 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         for manifest in _records(ShardManifest, store, names.SHARDS, ".json"):
             index.add_manifests([manifest], within=connection)
             count("shards")
+        _rebuild_datasets(index, store, connection, count)
     return counts
+
+
+def _rebuild_datasets(index: Index, store: Store, connection: Connection, count: Callable[[str], None]) -> None:
+    for record in _records(DatasetRecord, store, names.DATASETS, "/dataset.json"):
+        index.add_dataset(record, within=connection)
+        if events := dataset_events(store, record.name):
+            index.set_dataset_events(record.name, events, within=connection)
+        count("datasets")
+    for entry in list(store.list(names.DATASETS)):
+        if "/snapshots/" in entry.key:
+            index.add_snapshot(parse_record(Snapshot, store.get(entry.key), entry.key), within=connection)
+            count("snapshots")
+    for found in _records(ObjectSet, store, names.OBJECT_SETS, ".json"):
+        index.add_object_set(found, within=connection)
+        count("object_sets")
 
 
 def differences(index: Index, store: Store) -> list[str]:

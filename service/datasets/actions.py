@@ -1,0 +1,178 @@
+"""What a user does to datasets: create, cancel, retry, snapshot. The planner carries it out, job by job."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from typing import Literal
+
+from service import names
+from service.clock import timestamp
+from service.datasets.records import (
+    DatasetRecord,
+    Member,
+    Snapshot,
+    add_dataset_event,
+    dataset_events,
+    load_dataset,
+    load_snapshot,
+    object_set_of,
+)
+from service.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
+from service.digests import digest_json
+from service.domain import AssetKind, State
+from service.errors import ConflictError, InputError, LimitError, NotFoundError
+from service.index.dataset_views import DatasetView, ObjectSetView
+from service.parts import Parts
+from service.pipeline import usable
+from service.records import put_record
+
+
+def create(parts: Parts, request: DatasetRequest) -> tuple[DatasetView, bool]:
+    """Record a dataset; the keeper plans its jobs. The same hands, objects and options again are the same dataset.
+
+    Returns:
+        the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
+
+    Raises:
+        NotFoundError: unknown hand, object or set.
+        InputError: a hand or object was refused when it was checked.
+        ConflictError: a check is still running, or the name stands for another dataset.
+        LimitError: more than `MAX_CELLS` cells.
+        QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
+    """
+    record = describe(request.name, *members(parts, request), request.options)
+    parts.queue.ping()
+    new = put_record(parts.store, names.dataset_record(record.name), record)
+    if not new:
+        known = load_dataset(parts.store, record.name)
+        if known.digest != record.digest:
+            raise ConflictError(
+                f"there is another dataset named {record.name!r} ({_difference(known, record)}); take another name"
+            )
+        record = known
+    parts.index.add_dataset(record)
+    return parts.index.dataset(record.name), new
+
+
+def cancel(parts: Parts, name: str) -> DatasetView:
+    """Stop a dataset: what is not planned never is, and its unfinished jobs are cancelled. Finished shards stay.
+
+    A job that another dataset waits for as well goes on.
+
+    Raises:
+        NotFoundError: unknown dataset.
+        ConflictError: it is finished or cancelled already.
+    """
+    dataset = parts.index.dataset(name)
+    if dataset.cancelled or dataset.state.is_final:
+        raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
+    return _add_event(parts, name, "cancelled")
+
+
+def retry(parts: Parts, name: str) -> DatasetView:
+    """Start the failed and cancelled cells of a dataset again, with fresh attempts; what is made is not made twice.
+
+    Raises:
+        NotFoundError: unknown dataset.
+        ConflictError: no cell failed or was cancelled.
+    """
+    dataset = parts.index.dataset(name)
+    if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
+        raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
+    return _add_event(parts, name, "retried")
+
+
+def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
+    """Write down which shards a dataset holds now. The same shards again are the same snapshot.
+
+    Returns:
+        the snapshot, and whether it is new.
+
+    Raises:
+        NotFoundError: unknown dataset.
+        ConflictError: the dataset has no shard yet.
+    """
+    dataset = parts.index.dataset(name)
+    held = tuple(parts.index.dataset_shards(name))
+    if not held:
+        raise ConflictError(f"dataset {name!r} has no shard yet; wait until a cell is done")
+    base = [shard for shard in held if shard.kind == "base"]
+    taken = Snapshot(
+        dataset=name,
+        dataset_digest=dataset.digest,
+        digest=digest_json({"dataset": dataset.digest, "shards": sorted([s.id, s.sha256] for s in held)}),
+        complete=dataset.state is State.SUCCEEDED,
+        grasps=sum(shard.count for shard in base),
+        valid=sum(shard.valid for shard in base),
+        size_bytes=sum(shard.size_bytes for shard in held),
+        created=timestamp(),
+        shards=held,
+    )
+    new = put_record(parts.store, names.dataset_snapshot(name, taken.digest), taken)
+    if not new:
+        taken = load_snapshot(parts.store, name, taken.digest)
+    parts.index.add_snapshot(taken)
+    return taken, new
+
+
+def add_object_set(parts: Parts, name: str, objects: Iterable[str]) -> ObjectSetView:
+    """Give objects a name together. The same objects again change nothing; others make a new version.
+
+    Raises:
+        NotFoundError: unknown object.
+        InputError: an object was refused when it was checked, or there is none.
+        ConflictError: a check is still running.
+    """
+    wanted = tuple(usable(parts, AssetKind.OBJECT, one).name for one in objects)
+    if not wanted:
+        raise InputError(f"the set {name!r} holds no object; name some")
+    after = ""
+    with contextlib.suppress(NotFoundError):
+        present = parts.index.object_set(name)
+        if set(present.objects) == set(wanted):
+            return present
+        after = present.digest
+    found = object_set_of(name, wanted, after=after)
+    put_record(parts.store, names.object_set(name, found.digest), found)
+    parts.index.add_object_set(found)
+    return parts.index.object_set(name)
+
+
+def members(parts: Parts, matrix: Matrix) -> tuple[list[Member], list[Member]]:
+    """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
+    objects = dict.fromkeys(matrix.objects)
+    for name in matrix.sets:
+        objects |= dict.fromkeys(parts.index.object_set(name).objects)
+    if len(matrix.hands) * len(objects) > MAX_CELLS:
+        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    return _members(parts, AssetKind.HAND, matrix.hands), _members(parts, AssetKind.OBJECT, objects)
+
+
+def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str]) -> list[Member]:
+    assets = [usable(parts, kind, name) for name in wanted]
+    found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
+    return list(dict.fromkeys(found))
+
+
+def _add_event(parts: Parts, name: str, what: Literal["cancelled", "retried"]) -> DatasetView:
+    add_dataset_event(parts.store, name, what)
+    parts.index.set_dataset_events(name, dataset_events(parts.store, name))
+    return parts.index.dataset(name)
+
+
+def _difference(known: DatasetRecord, wanted: DatasetRecord) -> str:
+    """What another dataset of the same name has that this one has not, in a few words."""
+    words = []
+    for what, ours, theirs in (("hands", wanted.hands, known.hands), ("objects", wanted.objects, known.objects)):
+        if ours != theirs:
+            words.append(f"its {what} are {_named(theirs)}")
+    mine, other = wanted.options.model_dump(), known.options.model_dump()
+    words += [f"its {name} is {other[name]!r}" for name in mine if mine[name] != other[name]]
+    return "; ".join(words)
+
+
+def _named(members: Iterable[Member]) -> str:
+    found = [member.name for member in members]
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    return ", ".join(found[:5]) + more

@@ -1,0 +1,161 @@
+"""Records of datasets in the store: the matrix and its jobs, what users did later, snapshots, sets of objects.
+
+`datasets/{name}/dataset.json` names the jobs of its cells, so that a dataset stays what it was when graspd's
+algorithms, or the meaning of a name, change later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from service import names
+from service.clock import timestamp
+from service.digests import digest_json
+from service.domain import Digest, JobOptions, JobRequest, Lane, Name
+from service.records import JobRecord, Record, put_record, read_record
+from service.store import Store
+
+
+class Member(Record):
+    """A hand or object of a dataset: the very version that it was created with."""
+
+    name: Name
+    digest: Digest
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One hand x object of a dataset, and its job."""
+
+    position: int
+    hand: Member
+    object: Member
+    job_id: str
+
+
+class DatasetRecord(Record):
+    """`dataset.json`. `jobs` are those of the cells, hand by hand, and in each hand object by object."""
+
+    version: Literal[1] = 1
+    name: Name
+    digest: Digest
+    hands: tuple[Member, ...]
+    objects: tuple[Member, ...]
+    options: JobOptions
+    revisions: dict[str, int]
+    jobs: tuple[Digest, ...]
+    created: str
+
+    @model_validator(mode="after")
+    def _a_job_a_cell(self) -> DatasetRecord:
+        if len(self.jobs) != len(self.hands) * len(self.objects):
+            raise ValueError("a dataset has a job for each hand and object")
+        return self
+
+    def cells(self) -> Iterator[Cell]:
+        """The cells in their order."""
+        pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
+        for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
+            yield Cell(position, hand, obj, job)
+
+
+class DatasetEvent(Record):
+    """What a user did to a dataset later. The last one decides whether it is cancelled."""
+
+    number: int = Field(ge=1)
+    what: Literal["cancelled", "retried"]
+    at: str
+
+
+class SnapshotShard(Record):
+    """A file of a snapshot."""
+
+    id: Digest
+    kind: str
+    key: str
+    sha256: str
+    size_bytes: int
+    count: int
+    valid: int
+    hand: str
+    object: str
+    batch: int
+
+
+class Snapshot(Record):
+    """An immutable list of shards: what a dataset held at one moment."""
+
+    version: Literal[1] = 1
+    dataset: Name
+    dataset_digest: Digest
+    digest: Digest = Field(description="follows from the shards: the same files are the same snapshot")
+    complete: bool = Field(description="every cell had succeeded")
+    grasps: int
+    valid: int
+    size_bytes: int
+    created: str
+    shards: tuple[SnapshotShard, ...]
+
+
+class ObjectSet(Record):
+    """A version of a named set of objects; the newest counts."""
+
+    version: Literal[1] = 1
+    name: Name
+    digest: Digest
+    objects: tuple[Name, ...]
+    created: str
+
+
+def request_of(options: JobOptions, hand: str, obj: str) -> JobRequest:
+    """The request of one cell."""
+    shared = {name: getattr(options, name) for name in JobOptions.model_fields}
+    return JobRequest(hand=hand, object=obj, **shared)
+
+
+def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int]) -> JobRecord:
+    """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk."""
+    return JobRecord(
+        id=cell.job_id,
+        request=request_of(options, cell.hand.name, cell.object.name),
+        revisions=revisions,
+        hand_digest=cell.hand.digest,
+        object_digest=cell.object.digest,
+        lane=Lane.BULK,
+        created=timestamp(),
+    )
+
+
+def load_dataset(store: Store, name: str) -> DatasetRecord:
+    """The record of a dataset; NotFoundError if there is none."""
+    return read_record(DatasetRecord, store, names.dataset_record(name))
+
+
+def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
+    """What users did to a dataset, in order."""
+    keys = sorted(entry.key for entry in store.list(names.dataset_events(name)))
+    return [read_record(DatasetEvent, store, key) for key in keys]
+
+
+def add_dataset_event(store: Store, name: str, what: Literal["cancelled", "retried"]) -> DatasetEvent:
+    """Append an event after those there are."""
+    while True:
+        taken = [event.number for event in dataset_events(store, name)]
+        event = DatasetEvent(number=max(taken, default=0) + 1, what=what, at=timestamp())
+        if put_record(store, names.dataset_event(name, event.number, what), event):
+            return event
+
+
+def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
+    """A snapshot; NotFoundError if there is none."""
+    return read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
+
+
+def object_set_of(name: str, objects: Iterable[str], *, after: str = "") -> ObjectSet:
+    """The version of a set that follows the one with digest `after`; the order of the objects does not matter."""
+    members = tuple(sorted(set(objects)))
+    return ObjectSet(name=name, digest=digest_json([after, *members]), objects=members, created=timestamp())

@@ -1,0 +1,81 @@
+"""What the index answers on datasets. Times are RFC 3339 in UTC."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from service.domain import JobOptions, State
+from service.index.views import View
+
+
+class DatasetView(View):
+    """A dataset in numbers. `grasps`, `valid` and `tried` count what base shards hold so far."""
+
+    name: str
+    digest: str = Field(description="equal hands, objects and options have the same digest")
+    state: State
+    hands: list[str]
+    objects: list[str]
+    options: JobOptions = Field(description="what each cell asks for")
+    cells: int
+    states: dict[State, int] = Field(description="cells by state; a cell whose job is not planned yet is queued")
+    asked: int = Field(description="grasps asked for, over all cells")
+    grasps: int
+    valid: int
+    tried: int = Field(description="grasps that were computed to get these")
+    tasks: int
+    tasks_done: int
+    tasks_failed: int
+    progress: float = Field(ge=0, le=1)
+    seconds: float = Field(description="time that workers spent on it [s]")
+    eta_s: float | None = Field(description="expected time until it ends with as many tasks at work as now [s]")
+    shards: int
+    size_bytes: int
+    created: str
+    finished: str | None
+    cancelled: bool = Field(description="cancelled by its user; `retry` lifts it")
+
+
+class CellView(View):
+    """One hand x object of a dataset: an ordinary job, or one that is still to be planned."""
+
+    position: int = Field(description="hand by hand, and in each hand object by object, from 0")
+    hand: str
+    object: str
+    job_id: str
+    planned: bool = Field(description="whether the job exists yet")
+    state: State
+    asked: int = Field(description="grasps asked for")
+    grasps: int
+    valid: int
+    tried: int
+    valid_yield: float | None = Field(description="valid grasps per grasp tried; None while none was tried")
+    tasks: int
+    tasks_done: int
+    tasks_failed: int
+    attempts_failed: int = Field(description="attempts that failed, those that were repeated with success too")
+    progress: float = Field(ge=0, le=1)
+    seconds: float = Field(description="time that workers spent on it [s]")
+    reason: str | None = Field(description="why it failed")
+
+
+class SnapshotView(View):
+    """A snapshot of a dataset, without its list of shards."""
+
+    dataset: str
+    digest: str
+    created: str
+    complete: bool = Field(description="every cell had succeeded")
+    shards: int
+    grasps: int
+    valid: int
+    size_bytes: int
+
+
+class ObjectSetView(View):
+    """The newest version of a named set of objects."""
+
+    name: str
+    digest: str
+    objects: list[str]
+    created: str
