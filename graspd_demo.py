@@ -15,7 +15,7 @@ from rich.table import Table
 from api.client import Client
 from api.dashboard.filters import count, duration, metric
 from api.models import GraspQuery, JobDetail
-from api.reports import job_request, job_summary
+from api.reports import job_request, job_summary, means_of, yield_of
 from api.watching import JobDisplay
 from service.assets import builtin_files
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
@@ -122,11 +122,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
         )  # fmt: skip
         table.add_row(str(rank), *(metric(value) for value in values), f"{grasp.shard_id[:8]}:{grasp.row}")
     console.print(table)
-    mean = job.mean
-    console.print(
-        f"\n{count(job.valid)} of {count(job.grasps)} grasps valid; mean ε {metric(mean.epsilon)}, contact "
-        f"{metric(mean.contact_area_cm2)} cm², intersection {metric(mean.intersection_volume_cm3)} cm³"
-    )
+    console.print(f"\n{yield_of(job)}; {means_of(job)}")
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()
@@ -176,7 +172,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The sheet's typeface has neither Greek letters nor a multiplication sign.
     title = f"{job.hand} on {job.object}"
-    subtitle = f"the best {len(rows)} of {job.grasps} grasps by epsilon; {job.valid} are valid"
+    subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.tried} tried"
     return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
 
 
@@ -187,7 +183,7 @@ def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Pat
         f'<figure><a href="{p.name}"><img src="{p.name}" alt="{_ALT[p.stem]}"></a></figure>' for p in pictures
     )
     files = "".join(f"<li><a href='{p.relative_to(out)}'>{p.relative_to(out)}</a></li>" for p in shards)
-    return _HTML.format(title=title, valid=job.valid, grasps=job.grasps, job=job.id, images=images, files=files)
+    return _HTML.format(title=title, yields=escape(yield_of(job)), job=job.id, images=images, files=files)
 
 
 def _write(path: Path, data: bytes) -> Path:
@@ -204,7 +200,7 @@ body {{ max-width: 1180px; margin: 40px auto; padding: 0 20px; }}
 figure {{ margin: 24px 0; }} img {{ max-width: 100%; border-radius: 8px; }} code {{ overflow-wrap: anywhere; }}
 </style>
 <h1>{title}</h1>
-<p>{valid} of {grasps} grasps are valid. Job <code>{job}</code>.</p>
+<p>{yields}. Job <code>{job}</code>.</p>
 {images}
 <h2>Files</h2><ul>{files}</ul>
 </html>

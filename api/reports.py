@@ -64,6 +64,10 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "object": job.object,
         "grasps": job.grasps,
         "valid": job.valid,
+        "tried": job.tried,
+        "audited": job.audited,
+        "audit_held": job.audit_held,
+        "note": job.note,
         "progress": job.progress,
         "reason": job.reason,
         "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
@@ -92,11 +96,30 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
 
+def yield_of(job: JobDetail) -> str:
+    """What was found among how many tries, and what the audit says, in a line."""
+    level = job.request.referee
+    judged = "" if level == "none" else f", {level} level"
+    audit = f"; {job.audit_held} of {job.audited} audited hold by the letter" if job.audited else ""
+    return f"{count(job.valid)} valid grasps in {count(job.tried)} tries{judged}{audit}"
+
+
+def means_of(job: JobDetail) -> str:
+    """Means over the valid grasps, in a line."""
+    mean = job.mean
+    return (
+        f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
+        f"intersection {metric(mean.intersection_volume_cm3)} cm³"
+    )
+
+
 def _print_job(job: JobDetail, url: str) -> None:
     console = Console(highlight=False)
     console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
     if job.reason:
         console.print(f"reason: {job.reason}", markup=False)
+    if job.note:
+        console.print(f"note: {job.note}", markup=False)
     table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
     for stage in job.stages:
         done = f"{stage.succeeded} of {stage.tasks}"
@@ -105,9 +128,4 @@ def _print_job(job: JobDetail, url: str) -> None:
         )
     console.print(table)
     if job.grasps:
-        mean = job.mean
-        console.print(
-            f"{count(job.valid)} of {count(job.grasps)} grasps valid; mean ε {metric(mean.epsilon)}, "
-            f"contact {metric(mean.contact_area_cm2)} cm², intersection {metric(mean.intersection_volume_cm3)} cm³",
-            markup=False,
-        )
+        console.print(f"{yield_of(job)}; {means_of(job)}", markup=False)
