@@ -12,6 +12,8 @@ import typer
 from rich.console import Console
 
 from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
+from service.errors import UnavailableError
+from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)
 index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store.")
@@ -54,13 +56,19 @@ def up(
 
 @app.command(epilog="graspd keeper")
 @reporting_errors
-def keeper(data_dir: DataDir = None) -> None:
+def keeper(
+    check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
+    data_dir: DataDir = None,
+) -> None:
     """Reaper, delayed retries and indexer. One runs in a service; `graspd up` starts it."""
+    settings = load_settings(data_dir=data_dir)
+    log_to_stderr(settings, "keeper")
+    if check:
+        check_keeper(settings)
+        return
     from service.keeper import Keeper
     from service.parts import Parts
 
-    settings = load_settings(data_dir=data_dir)
-    log_to_stderr(settings, "keeper")
     stop = stop_on_signals()
     parts = Parts.open(settings)
     try:
@@ -104,6 +112,19 @@ def path(data_dir: DataDir = None) -> None:
     from sqlalchemy import make_url
 
     typer.echo(make_url(load_settings(data_dir=data_dir).resolved_index_url).render_as_string(hide_password=True))
+
+
+def check_keeper(settings: Settings) -> None:
+    """UnavailableError if no keeper gave a sign of life lately."""
+    from service.keeper import PART
+    from service.queue.rq_queue import open_queue
+
+    queue = open_queue(settings, patience=0)
+    try:
+        if not queue.announced(PART):
+            raise UnavailableError("no keeper gave a sign of life lately; start `graspd keeper`")
+    finally:
+        queue.close()
 
 
 def stop_on_signals() -> threading.Event:

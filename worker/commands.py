@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,8 @@ import typer
 
 from service.cli import load_settings, log_to_stderr, reporting_errors
 from service.domain import Stage
-from service.errors import InputError
+from service.errors import InputError, UnavailableError
+from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -35,6 +37,19 @@ def worker(
     )
     if not ended_well:
         raise typer.Exit(1)
+
+
+def check_worker(settings: Settings) -> None:
+    """UnavailableError if no worker of this host gave a sign of life within its lease."""
+    from service.queue.rq_queue import open_queue
+
+    host = socket.gethostname()
+    queue = open_queue(settings, patience=0)
+    try:
+        if not any(beat.host == host for beat in queue.workers()):
+            raise UnavailableError(f"no worker on {host} gave a sign of life lately; start `graspd worker`")
+    finally:
+        queue.close()
 
 
 def _parse_stages(text: str | None) -> tuple[Stage, ...]:
