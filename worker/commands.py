@@ -25,13 +25,19 @@ def worker(
     burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
     once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
     max_tasks: Annotated[int | None, typer.Option(min=1, help="End after this many tasks.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Start none; exit code 1 says that none lives on this host.")
+    ] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
 ) -> None:
     """One worker on one device: takes tasks from the queue until it is told to stop."""
-    from worker.main import run_worker
-
     settings = load_settings(device=device, threads=threads, data_dir=data_dir)
     log_to_stderr(settings, "worker")
+    if check:
+        check_worker(settings)
+        return
+    from worker.main import run_worker
+
     ended_well = run_worker(
         settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
     )
