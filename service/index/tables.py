@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from sqlalchemy import JSON, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text
+from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text
 
 metadata: Final = MetaData()
 
@@ -94,7 +94,7 @@ shards: Final = Table(
     Column("stage", String(12), nullable=False),
     Column("key", String(128), nullable=False),
     Column("sha256", String(64), nullable=False),
-    Column("size_bytes", Integer, nullable=False),
+    Column("size_bytes", BigInteger, nullable=False),
     Column("count", Integer, nullable=False),
     Column("valid", Integer, nullable=False),
     Column("tried", Integer, nullable=False, server_default="0"),
@@ -114,7 +114,10 @@ shards: Final = Table(
     Column("manifest", JSON, nullable=False),
     Index("shards_newest", "created", "id"),
     Index("shards_by_kind", "kind", "created", "id"),
-    Index("shards_by_pair", "hand", "object", "kind"),
+    # These hold all that sums over shards need: a row itself is as long as its manifest.
+    Index("shards_sums", "kind", "hand", "object", "count", "valid", "tried", "size_bytes"),
+    Index("shards_of_task", "id", "count", "valid", "tried", "audited", "audit_held"),
+    Index("shards_made", "created", "kind", "count", "valid", "seconds"),
 )
 
 METRICS: Final = (

@@ -7,7 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import delete, inspect, update
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from pydantic import SecretStr
+from sqlalchemy import delete, update
 
 from service import names, pipeline
 from service.clock import timestamp
@@ -21,15 +24,37 @@ from service.index.tables import metadata
 from service.index.views import GraspView
 from service.parts import Parts
 from service.planning import message_of, plan
+from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, put_record, read_record
-from tests.fakes import make_shard, request
+from service.settings import Settings
+from service.store import open_store
+from tests.fakes import add_assets, make_shard, request
+from tests.servers import PostgresServer
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database of each kind in turn."""
+    if request.param == "postgres":
+        server: PostgresServer = request.getfixturevalue("postgres_server")
+        return server.database()
+    return f"sqlite:///{tmp_path / 'index.sqlite'}"
 
 
 @pytest.fixture
-def index(tmp_path: Path) -> Iterator[Index]:
-    made = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+def index(index_url: str) -> Iterator[Index]:
+    made = Index(index_url)
     yield made
     made.close()
+
+
+@pytest.fixture
+def parts(tmp_path: Path, index: Index, index_url: str) -> Parts:
+    """A service without processes on an index of each kind: a hand `gripper` and an object `ball`."""
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, index_url=SecretStr(index_url))
+    made = Parts(settings, open_store("memory://"), index, MemoryQueue())
+    add_assets(made)
+    return made
 
 
 def run_all(parts: Parts, job: str, *, batches: int | None = None, stages: int | None = None) -> None:
@@ -60,12 +85,8 @@ def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None
 
 def test_the_migrations_make_the_tables_that_the_code_uses(index: Index) -> None:
     with index.reading() as connection:
-        inspector = inspect(connection)
-        for table in metadata.tables.values():
-            made = {(c["name"], str(c["type"]), c["nullable"]) for c in inspector.get_columns(table.name)}
-            assert made == {(c.name, str(c.type), bool(c.nullable)) for c in table.columns}
-            indexes = {(i["name"], tuple(i["column_names"])) for i in inspector.get_indexes(table.name)}
-            assert indexes == {(i.name, tuple(c.name for c in i.columns)) for i in table.indexes}
+        made = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(made, metadata) == []
 
 
 def test_opening_a_migrated_index_again_changes_nothing(parts: Parts) -> None:
