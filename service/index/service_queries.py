@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import and_, case, func, select, tuple_
 
-from service.domain import AssetKind, Stage, State
+from service.domain import AssetKind, State
 from service.errors import NotFoundError
 from service.index import cursors
 from service.index.database import Database
@@ -61,40 +61,42 @@ class ServiceQueries(Database):
     def stats(self) -> Stats:
         """The whole service in a few numbers."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
+        sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.size_bytes))
         with self.reading() as connection:
             of_jobs = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
             of_tasks = connection.execute(select(tasks.c.state, func.count()).group_by(tasks.c.state)).all()
-            count, size = connection.execute(
-                select(func.count(), func.sum(shards.c.size_bytes)).select_from(shards)
-            ).one()
-            base = shards.c.kind == "base"
-            made, valid = connection.execute(
-                select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(base)
-            ).one()
+            of_shards = {
+                kind: tuple(map(int, row))
+                for kind, *row in connection.execute(select(shards.c.kind, *sums).group_by(shards.c.kind))
+            }
             living = connection.scalar(alive)
+        _, made, valid, _ = of_shards.get("base", (0, 0, 0, 0))
         return Stats(
             jobs=_by_state(of_jobs),
             tasks=_by_state(of_tasks),
-            grasps=int(made or 0),
-            valid=int(valid or 0),
-            shards=count,
-            bytes=int(size or 0),
+            grasps=made,
+            valid=valid,
+            shards=sum(row[0] for row in of_shards.values()),
+            bytes=sum(row[3] for row in of_shards.values()),
             workers=int(living or 0),
         )
 
     def throughput(self, *, since: str, bucket_s: int = 60) -> list[Throughput]:
         """What was made since a time, in intervals of `bucket_s`; intervals without a shard are left out."""
-        query = select(shards.c.created, shards.c.kind, shards.c.count, shards.c.valid, shards.c.seconds)
-        sums: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
+        # The database adds up by the finest unit of time that divides the interval; what is left is little.
+        unit = func.substr(shards.c.created, 1, next(n for s, n in _UNITS if bucket_s % s == 0)).label("unit")
+        sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
+        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since).group_by(unit, shards.c.kind)
+        made: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
         with self.reading() as connection:
-            for row in connection.execute(query.where(shards.c.created >= since)).mappings():
-                bucket = sums[_bucket(row["created"], bucket_s)]
-                bucket["tasks"] += 1
-                bucket["seconds"] += row["seconds"]
-                if row["kind"] == "base":
-                    bucket["grasps"] += row["count"]
-                    bucket["valid"] += row["valid"]
-        return [Throughput.model_validate({"start": start, **sums[start]}) for start in sorted(sums)]
+            for start, kind, number, count, valid, seconds in connection.execute(query):
+                bucket = made[_bucket(start + _REST_OF_TIME[len(start) :], bucket_s)]
+                bucket["tasks"] += int(number)
+                bucket["seconds"] += float(seconds)
+                if kind == "base":
+                    bucket["grasps"] += int(count)
+                    bucket["valid"] += int(valid)
+        return [Throughput.model_validate({"start": start, **made[start]}) for start in sorted(made)]
 
     def failures(self, *, limit: int = 20) -> list[FailureGroup]:
         """Failed attempts by stage and error, the most frequent first."""
@@ -132,32 +134,32 @@ class ServiceQueries(Database):
 
     def matrix(self) -> list[MatrixCell]:
         """Jobs, task states and yield of each hand x object."""
-        states = {
-            name: func.sum(case((tasks.c.state == name, 1), else_=0)).label(name)
-            for name in (State.QUEUED.value, State.RUNNING.value, State.FAILED.value)
-        }
-        pair = (jobs.c.hand, jobs.c.object)
-        work = (
-            select(*pair, func.count(jobs.c.id.distinct()).label("jobs"), *states.values())
-            .join(tasks, tasks.c.job_id == jobs.c.id)
-            .group_by(*pair)
-            .order_by(*pair)
-        )
+        of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.stage == Stage.SYNTHESIZE.value)
+            .where(shards.c.kind == "base")
             .group_by(shards.c.hand, shards.c.object)
         )
+        cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.reading() as connection:
-            yields = {(row[0], row[1]): [int(value) for value in row[2:]] for row in connection.execute(made)}
-            rows = connection.execute(work).mappings().all()
-        found = [yields.get((row["hand"], row["object"]), (0, 0, 0)) for row in rows]
-        return [
-            MatrixCell(**row, grasps=kept, valid=valid, tried=tried)
-            for row, (kept, valid, tried) in zip(rows, found, strict=True)
-        ]
+            pairs = {}
+            for job, *pair in connection.execute(select(jobs.c.id, jobs.c.hand, jobs.c.object)):
+                cell = cells.setdefault((pair[0], pair[1]), dict.fromkeys(_CELL, 0))
+                cell["jobs"] += 1
+                pairs[job] = cell
+            for job, state, number in connection.execute(of_tasks):
+                if state in _CELL and job in pairs:
+                    pairs[job][state] += int(number)
+            for hand, obj, *sums in connection.execute(made):
+                if (hand, obj) in cells:
+                    cells[hand, obj] |= zip(("grasps", "valid", "tried"), map(int, sums), strict=True)
+        return [MatrixCell(hand=hand, object=obj, **cells[hand, obj]) for hand, obj in sorted(cells)]
 
 
+_CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "tried")
+#: Seconds of an interval, and how many characters of a time tell such intervals apart.
+_UNITS: Final = ((3600, 13), (60, 16), (1, 19))
+_REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
 _MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried))
 
 
