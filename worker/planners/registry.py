@@ -19,6 +19,7 @@ GROUP: Final = "graspd.planners"
 #: Method name -> module and attribute of its `Method`. Modules are imported when used.
 PLANNERS: Final[dict[str, tuple[str, str]]] = {
     "fast_graspd": ("worker.planners.fast_graspd.method", "METHOD"),
+    "graspit": ("worker.planners.graspit.planner", "METHOD"),
     "autograsp": ("worker.planners.autograsp.planner", "METHOD"),
 }
 

@@ -98,7 +98,7 @@ def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
     return np.array(rows)
 
 
-def _body_points(points: SurfacePoints, bodies: int) -> Any:
+def body_points(points: SurfacePoints, bodies: int) -> Any:
     """The points sorted by body, with bounding spheres."""
     order = np.argsort(points.body, kind="stable")
     body, position = points.body[order], points.position[order]
@@ -139,7 +139,7 @@ class Simulation:
         self.point_body = wp.array(points.body, dtype=wp.int32)
         self.point_position = wp.array(points.position, dtype=wp.vec3)
         self.point_weight = wp.array(weight, dtype=wp.float32)
-        self.body_points = _body_points(self_points, self.bodies)
+        self.body_points = body_points(self_points, self.bodies)
         self.self_scale = REFERENCE_SELF_POINTS / max(len(self_points), 1)
 
     def _allocate(self) -> None:

@@ -17,6 +17,7 @@ from worker.planners import synthesize
 #: Peers with options that make them quick.
 PEERS: dict[str, dict[str, object]] = {
     "autograsp": {},
+    "graspit": {"steps": 30_400},
 }
 EACH = pytest.mark.parametrize("method", sorted(PEERS))
 
