@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from service.index.changes import Changes
+from service.index.cost_queries import CostQueries
 from service.index.dataset_changes import DatasetChanges
 from service.index.dataset_queries import DatasetQueries
 from service.index.feed import Feed
@@ -12,7 +13,9 @@ from service.index.service_queries import ServiceQueries
 from service.index.summaries import Summaries
 
 
-class Index(JobQueries, GraspQueries, Summaries, ServiceQueries, DatasetQueries, Feed, Changes, DatasetChanges):
+class Index(
+    JobQueries, GraspQueries, Summaries, ServiceQueries, DatasetQueries, CostQueries, Feed, Changes, DatasetChanges
+):
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
     Reads answer the API; writes come from the API and the keeper only. Every method raises IndexUnavailable when the
