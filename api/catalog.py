@@ -6,18 +6,22 @@ Nothing is kept here between two requests but what may be lost, so any number of
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
+from api.auth import caller
 from api.grasp_files import GraspFiles
 from api.idempotency import Idempotency
-from api.models import GraspDetail, GraspQuery, Health, Histogram, Job, JobDetail, MeanMetrics, Part, Shard
+from api.models import GraspDetail, GraspQuery, Health, Histogram, Job, JobDetail, LossCurve, MeanMetrics, Part, Shard
 from api.progress import Paces, eta_of_job, progress_of_job, stage_statuses
+from api.quotas import Quotas
 from service import library, pipeline
 from service.digests import digest_files
 from service.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.embedded import redis_url
 from service.errors import ConflictError, GraspdError, NotFoundError
 from service.index.filters import GraspFilter, GraspSort, Metric
 from service.index.views import (
@@ -31,13 +35,17 @@ from service.index.views import (
     TaskView,
     WorkerView,
 )
+from service.logs import bind
 from service.parts import Parts
+from service.queue.rq_queue import connect
 from service.store import Store
 
+log = logging.getLogger(__name__)
 _HEALTH_S: Final = 2.0
 _PAGE: Final = 200
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_HISTOGRAMS: Final = 256
+_LOSS_BATCHES: Final = 8
 MEAN_METRICS: Final[tuple[Metric, ...]] = (
     "epsilon",
     "contact_area_cm2",
@@ -51,9 +59,12 @@ class Catalog:
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
-        self._idempotency = Idempotency(parts.settings)
+        redis = connect(redis_url(parts.settings), patience=1)
+        self._idempotency = Idempotency(redis)
+        self._quotas = Quotas(parts.settings, redis, parts.index.unfinished_of)
         self._paces = Paces()
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
+        self._losses: dict[str, tuple[int, list[float]] | None] = {}
         self._grasp_files = GraspFiles(parts.store)
         self._health: tuple[float, Health] | None = None
 
@@ -66,22 +77,41 @@ class Catalog:
     def parts(self) -> Parts:
         return self._parts
 
-    def submit(self, request: JobRequest, *, idempotency_key: str | None = None, owner: str = "") -> JobDetail:
+    def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
         """Record a job, or find the same one.
 
         Raises:
             InputError: the idempotency key came with another request before.
+            QuotaError: the caller's key has all it may have.
         """
+        key = caller.get()
         if idempotency_key is not None:
-            self._idempotency.claim(owner, idempotency_key, request)
-        job, _ = pipeline.submit(self._parts, request)
+            self._idempotency.claim(key.name if key else "", idempotency_key, request)
+        record = pipeline.prepare(self._parts, request)
+        with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
+            job, is_new = pipeline.enter(self._parts, record)
+            claim.counts = is_new
+            log.info("job submitted" if is_new else "job was there already")
         return self._detail(job)
 
     def cancel(self, job_id: str) -> JobDetail:
-        return self._detail(pipeline.cancel(self._parts, job_id))
+        """Stop a job."""
+        with bind(job=job_id):
+            job = pipeline.cancel(self._parts, job_id)
+            log.info("job cancelled")
+        return self._detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
-        return self._detail(pipeline.retry(self._parts, job_id))
+        """Run again what failed or was cancelled.
+
+        Raises:
+            QuotaError: the caller's key has all it may have.
+        """
+        grasps = self._parts.index.job(job_id).request.grasps
+        with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
+            job = pipeline.retry(self._parts, job_id)
+            log.info("job retried")
+        return self._detail(job)
 
     def jobs(
         self,
@@ -206,6 +236,27 @@ class Catalog:
                 self._histograms.clear()
             self._histograms[key] = found
         return found
+
+    def loss_curve(self, job: JobDetail) -> LossCurve | None:
+        """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
+        batches = [shard.id for shard in job.shards if shard.kind == "base"][:_LOSS_BATCHES]
+        kept = [self._loss(shard) for shard in batches]
+        curves = [curve for curve in kept if curve is not None]
+        if not curves:
+            return None
+        length = min(len(losses) for _, losses in curves)
+        means = [sum(losses[i] for _, losses in curves) / len(curves) for i in range(length)]
+        return LossCurve(iterations=[(i + 1) * curves[0][0] for i in range(length)], losses=means)
+
+    def _loss(self, shard_id: str) -> tuple[int, list[float]] | None:
+        """Iterations between two values, and the values; a shard never changes, so its answer is kept."""
+        if shard_id not in self._losses:
+            info = self._parts.index.shard(shard_id).manifest.get("info", {})
+            curve = [value for value in info.get("loss_curve") or [] if value is not None]
+            if len(self._losses) >= _KEPT_HISTOGRAMS:
+                self._losses.clear()
+            self._losses[shard_id] = (int(info.get("chunk", 1)), curve) if curve else None
+        return self._losses[shard_id]
 
     def _detail(self, job: JobView) -> JobDetail:
         mean = {data.metric: data.mean for data in self.histograms(job.id, job.valid)} if job.valid else {}

@@ -6,28 +6,28 @@ kept, only which content a key stood for. That lies in Redis for a day: losing i
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
-import redis
+from redis.exceptions import RedisError
 
 from service.digests import digest_bytes, digest_json
 from service.domain import JobRequest
-from service.embedded import redis_url
 from service.errors import InputError, QueueUnavailable
-from service.settings import Settings
 
 KEPT_S: Final = 24 * 3600
 
 
 class Idempotency:
-    """Which request a key stood for."""
+    """Which request a key stood for; in Redis, so that all API processes know."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._client: redis.Redis | None = None
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
 
     def claim(self, owner: str, key: str, request: JobRequest) -> None:
         """Bind a key to a request.
+
+        Args:
+            owner: name of the API key that the request showed: others may use the same words.
 
         Raises:
             InputError: the key is bound to another request.
@@ -36,16 +36,10 @@ class Idempotency:
         name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
         content = digest_json(request.model_dump(mode="json")).encode()
         try:
-            client = self._connect()
-            if client.set(name, content, ex=KEPT_S, nx=True):
+            if self._connection.set(name, content, ex=KEPT_S, nx=True):
                 return
-            bound = client.get(name)
-        except redis.RedisError as error:
+            bound = self._connection.get(name)
+        except RedisError as error:
             raise QueueUnavailable(f"Redis does not answer: {error}") from None
         if bound not in (None, content):
             raise InputError("this Idempotency-Key came with another request before; take a new key")
-
-    def _connect(self) -> redis.Redis:
-        if self._client is None:
-            self._client = redis.Redis.from_url(redis_url(self._settings), socket_timeout=5)
-        return self._client

@@ -146,6 +146,13 @@ class Health(BaseModel):
     parts: dict[str, Part]
 
 
+class LossCurve(BaseModel):
+    """The planner's loss as it went down."""
+
+    iterations: list[int]
+    losses: list[float]
+
+
 class Histogram(BaseModel):
     """Distribution of one metric over valid grasps."""
 

@@ -25,6 +25,8 @@ from service.errors import (
     MeshError,
     NotFoundError,
     QueueUnavailable,
+    QuotaError,
+    RateError,
     StoreUnavailable,
     TaskCancelled,
     TaskError,
@@ -41,8 +43,9 @@ _log = logging.getLogger("graspd.api")
 ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
-        InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, UnavailableError, QueueUnavailable,
-        StoreUnavailable, IndexUnavailable, BusyError, TaskError, TaskCancelled, TaskRefused, GraspdError,
+        InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
+        QueueUnavailable, StoreUnavailable, IndexUnavailable, RateError, BusyError, TaskError, TaskCancelled,
+        TaskRefused, GraspdError,
     )
 }  # fmt: skip
 
@@ -61,7 +64,7 @@ HTTP_SLUGS: Final[dict[int, str]] = {
     416: "range-not-satisfiable",
     421: "misdirected-request",
     422: "invalid-input",
-    429: "too-many-requests",
+    429: RateError.slug,
 }
 
 

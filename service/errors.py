@@ -6,11 +6,13 @@
     │   ├── ConflictError         the request clashes with what is there: exit 2, HTTP 409
     │   ├── MeshError             an object mesh that cannot be used
     │   ├── HandError             a hand description that cannot be used
-    │   └── LimitError            too large, too many: exit 2, HTTP 413
+    │   ├── LimitError            too large, too many: exit 2, HTTP 413
+    │   └── QuotaError            the key has all it may have: exit 2, HTTP 429
     ├── UnavailableError          a part of the service does not answer: exit 1, HTTP 503
     │   ├── QueueUnavailable
     │   ├── StoreUnavailable
-    │   └── IndexUnavailable
+    │   ├── IndexUnavailable
+    │   └── RateError             too many requests: exit 1, HTTP 429
     ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
     └── TaskError                 a task ended without a result: exit 1, HTTP 500
         ├── TaskCancelled
@@ -70,6 +72,16 @@ class LimitError(InputError):
     slug, status, title = "too-large", 413, "Over the limit"
 
 
+class QuotaError(InputError):
+    """The key has as much in work as it may have."""
+
+    slug, status, title = "quota-exceeded", 429, "The quota of the key is used up"
+
+    def __init__(self, message: str = "", *, retry_after_s: int = 60) -> None:
+        super().__init__(message)
+        self.headers = {"Retry-After": str(retry_after_s)}
+
+
 class UnavailableError(GraspdError):
     """A part of the service does not answer; the same request may succeed later."""
 
@@ -92,6 +104,12 @@ class IndexUnavailable(UnavailableError):
     """The index database does not answer."""
 
     slug, title = "index-unavailable", "The index does not answer"
+
+
+class RateError(UnavailableError):
+    """More requests than the service answers."""
+
+    slug, status, title = "too-many-requests", 429, "Too many requests"
 
 
 class BusyError(GraspdError):

@@ -204,28 +204,14 @@ class Supervisor:
         self._locks = []
 
 
-_PASSED_ON: Final = (
-    "store_url",
-    "store_public_endpoint",
-    "index_url",
-    "device",
-    "threads",
-    "lease_s",
-    "keeper_interval_s",
-    "task_attempts",
-    "task_timeout_s",
-    "retry_backoff_s",
-    "queue_window",
-    "stop_grace_s",
-    "max_upload_bytes",
-    "log_level",
-)
+#: Those that `start` finds out for the children itself.
+_SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"})
 
 
 def _stated(settings: Settings) -> dict[str, str]:
     """Settings that were given in Python, for the environment of the children."""
     found = {}
-    for name in _PASSED_ON:
+    for name in Settings.model_fields.keys() - _SETTLED:
         value = getattr(settings, name)
         if name in settings.model_fields_set and value is not None:
             found[f"GRASPD_{name.upper()}"] = str(getattr(value, "get_secret_value", lambda v=value: v)())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, select, tuple_
@@ -50,6 +50,15 @@ class JobQueries(Database):
             if not rows:
                 raise NotFoundError(f"there is no job {job_id!r}")
             return _job_views(connection, rows)[0]
+
+    def unfinished_of(self, ids: Collection[str]) -> set[str]:
+        """Of these job ids, those whose job has not ended."""
+        wanted, found = sorted(ids), set[str]()
+        with self.reading() as connection:
+            for start in range(0, len(wanted), 500):
+                some = jobs.c.id.in_(wanted[start : start + 500])
+                found |= set(connection.scalars(select(jobs.c.id).where(some, jobs.c.finished.is_(None))))
+        return found
 
     def tasks(
         self,
