@@ -20,8 +20,9 @@ from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, hold
 from worker.transforms import quat_rotate
 
-#: Fingers open until this far from the object [m] (BODex).
-CLEARANCE_M: Final = 0.010
+#: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
+#: comes back faster and kicks the object away more often.
+CLEARANCE_M: Final = 0.005
 #: A finger that cannot get this far along its contact normals opens plainly [m].
 STUCK_M: Final = 0.003
 #: The root retreats only where the open hand is nearer than this [m]: a palm left in touch kicks the object, but so
@@ -33,6 +34,11 @@ PLAIN_OPENING: Final = 0.3
 #: Opening steps of each finger [rad, or m for prismatic dofs], and their number.
 OPENING_STEP: Final = 0.05
 OPENING_STEPS: Final = 24
+#: A finger may run into the rest of the hand by this much more than it does in the grasp [m]; it is looked at in these
+#: shares of its way, and one that jams opens half as far, at the last of so many looks not at all.
+JAM_M: Final = 5e-4
+WAY: Final = (1 / 3, 2 / 3, 1.0)
+JAM_LOOKS: Final = 4
 RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
 #: Hand points within this of the object press on it [m].
@@ -50,7 +56,8 @@ def pregrasp(hand: HandModel, obj: ObjectModel, grasp: Posture) -> Posture:
     """N postures from which the hand closes.
 
     Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away, or as far as it
-    can get; then the root moves back along the palm's approach if the hand is still in touch.
+    can get without running into other fingers; then the root moves back along the palm's approach if the hand is still
+    in touch.
     """
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     parts = [_pregrasp(probe, _rows(grasp, i)) for i in range(0, len(grasp), _CHUNK)]
@@ -121,7 +128,7 @@ def _pregrasp(probe: Probe, grasp: Posture) -> Posture:
     opened = q.copy()
     for d in np.flatnonzero(finger >= 0):
         opened[:, d] = paths[np.arange(len(q)), chosen[:, finger[d]], d]
-    return _retreat(probe, grasp.hand_pose, opened)
+    return _retreat(probe, grasp.hand_pose, _without_jams(probe, grasp.hand_pose, q, opened))
 
 
 def _finger_of_dof(hand: HandModel) -> NDArray[np.int32]:
@@ -182,6 +189,41 @@ def _first_clear(clearance: Floats, wanted: float) -> NDArray[np.intp]:
     """Index along axis 1 of the first clearance that is enough, or of the greatest."""
     enough = clearance >= wanted
     return np.where(enough.any(axis=1), enough.argmax(axis=1), clearance.argmax(axis=1))
+
+
+def _without_jams(probe: Probe, hand_pose: Floats, q: Floats, opened: Floats) -> Floats:
+    """(B, D) the postures `opened`, fingers held back towards the grasp q where they would run into one another.
+
+    Fingers that jam never reach the grasp when they close again.
+    """
+    finger = _finger_of_dof(probe.hand)
+    limit = _finger_depth(probe, hand_pose, q[:, None]) + JAM_M
+    share = np.ones_like(limit)
+    rows = np.arange(len(q))
+    for look in range(JAM_LOOKS):
+        move = (opened - q)[rows] * np.where(finger >= 0, share[rows][:, finger], 1.0)
+        way = q[rows, None] + np.array(WAY)[None, :, None] * move[:, None]
+        jammed = _finger_depth(probe, hand_pose[rows], way) > limit[rows]
+        if not jammed.any():
+            break
+        share[rows] *= np.where(jammed, 0.5 if look < JAM_LOOKS - 1 else 0.0, 1.0)
+        rows = rows[jammed.any(axis=1)]
+    return q + (opened - q) * np.where(finger >= 0, share[:, finger], 1.0)
+
+
+def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
+    """(B, fingers) deepest that each finger is in the rest of the hand, or it in the finger, on paths (B, K, D)."""
+    count, steps, _ = paths.shape
+    finger = finger_of_body(probe.hand)
+    joints = probe.hand.expand(paths).reshape(count * steps, -1)
+    bodies = body_poses(probe.hand, np.repeat(hand_pose, steps, axis=0), joints)
+    depth = probe.self_depth(bodies, probe.posed_points(bodies)).reshape(count, steps, -1).max(axis=1)
+    out = np.zeros((count, max(1, len(probe.hand.fingertips))))
+    for f in range(out.shape[1]):
+        mine = finger == f
+        if mine.any():
+            out[:, f] = depth[:, mine].max(axis=1)
+    return out
 
 
 def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:

@@ -137,7 +137,7 @@ class Probe:
         points = self.posed_points(bodies)
         shape = points.shape[:2]
         distance, closest, normal = self.signed_distance(points.reshape(-1, 3))
-        pieces, depth = self._piece_distances(bodies, points)
+        pieces = self._piece_distances(bodies)
         return Distances(
             bodies=bodies,
             hand_points=points,
@@ -146,7 +146,7 @@ class Probe:
             closest=closest.reshape(*shape, 3),
             normal=normal.reshape(*shape, 3),
             piece_distance=pieces,
-            self_depth=depth,
+            self_depth=self.self_depth(bodies, points).max(axis=1),
         )
 
     def facing(self, found: Distances) -> NDArray[np.bool_]:
@@ -167,22 +167,30 @@ class Probe:
                 least[:, body] = np.minimum(least[:, body], found.piece_distance[:, own].min(axis=1))
         return least
 
-    def _piece_distances(self, bodies: Floats, points: Floats) -> tuple[Floats, Floats]:
+    def self_depth(self, bodies: Floats, points: Floats) -> Floats:
+        """(B, L) depth of each body in others whose contact counts, or of others in it [m]."""
+        with wp.ScopedDevice("cpu"):
+            own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
+            depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)
+            inputs = [*self._posed_pieces(bodies), self._body, own, depth]
+            wp.launch(kernels.self_distance, points.shape[:2], inputs=inputs, device="cpu")
+        return depth.numpy().astype(float)
+
+    def _piece_distances(self, bodies: Floats) -> Floats:
+        with wp.ScopedDevice("cpu"):
+            least = wp.full((len(bodies), len(self._piece_body)), REACH_M, dtype=wp.float32)
+            inputs = [*self._posed_pieces(bodies), REACH_M, self._samples]
+            dim = (len(bodies), len(self.samples))
+            wp.launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least], device="cpu")
+        return least.numpy().astype(float)
+
+    def _posed_pieces(self, bodies: Floats) -> list[Any]:
+        """The pieces with their positions and rotations, as the kernels take them."""
         frames = compose(bodies[:, self._piece_body], self._piece_frame[None])
-        count = len(bodies)
         with wp.ScopedDevice("cpu"):
             position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
             rotation: Any = wp.array(to_xyzw(frames[..., 3:]), dtype=wp.quat)
-            own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
-            least = wp.full((count, len(self._piece_body)), REACH_M, dtype=wp.float32)
-            depth = wp.zeros(count, dtype=wp.float32)
-            posed = [self._pieces, position, rotation]
-            dim = (count, len(self.samples))
-            wp.launch(
-                kernels.pieces_distance, dim, inputs=[*posed, REACH_M, self._samples], outputs=[least], device="cpu"
-            )
-            wp.launch(kernels.self_distance, points.shape[:2], inputs=[*posed, self._body, own, depth], device="cpu")
-        return least.numpy().astype(float), depth.numpy().astype(float)
+        return [self._pieces, position, rotation]
 
 
 def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
