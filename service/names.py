@@ -92,9 +92,14 @@ def dataset_event(dataset: str, number: int, what: str) -> str:
     return f"{dataset_events(dataset)}/{number:06}-{what}.json"
 
 
+def dataset_snapshots(dataset: str) -> str:
+    """Prefix of a dataset's snapshots."""
+    return f"{DATASETS}/{dataset}/snapshots"
+
+
 def dataset_snapshot(dataset: str, digest: str) -> str:
     """An immutable list of shards."""
-    return f"{DATASETS}/{dataset}/snapshots/{digest}.json"
+    return f"{dataset_snapshots(dataset)}/{digest}.json"
 
 
 def object_set(name: str, digest: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import h5py
 import numpy as np
@@ -231,11 +231,15 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             column = SCHEMAS[kind][path]
             data = np.ascontiguousarray(array, dtype=column.dtype)
             # Pictures compress well; shuffling bytes first makes float depth compress at all.
-            options = (
-                {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-                if data.ndim >= 3 and data.nbytes > 65536
-                else {}
-            )
+            options: dict[str, Any] = {}
+            if data.ndim >= 3 and data.nbytes > 65536:
+                # One row is one picture: a reader that wants it unpacks nothing else.
+                options = {
+                    "compression": "gzip",
+                    "compression_opts": 1,
+                    "shuffle": True,
+                    "chunks": (1, *data.shape[1:]),
+                }
             dataset = file.create_dataset(path, data=data, track_times=False, **options)
             dataset.attrs["units"] = column.units
             dataset.attrs["frame"] = column.frame

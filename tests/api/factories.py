@@ -15,7 +15,8 @@ from service.parts import Parts
 from service.planning import PlannedTask, message_of, plan
 from service.queue.port import WorkerBeat
 from service.records import AttemptRecord, JobRecord, put_record
-from service.shards import check_columns, write_shard
+from service.shards import Attribute, check_columns, write_shard
+from service.transforms import pose_to_matrix
 
 JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]
@@ -50,7 +51,10 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
     random = np.random.default_rng(task.batch)
     kind = names.SHARD_KINDS[task.stage]
     arrays = _ARRAYS[task.stage](random, task.count, record.request)
-    attributes = {"hand": record.request.hand, "object": record.request.object}
+    attributes: dict[str, Attribute] = {"hand": record.request.hand, "object": record.request.object}
+    attributes |= {"shard_id": task.output, "batch": task.batch}
+    if task.inputs:
+        attributes["base_shard" if task.stage is Stage.SCENE else "scene_shard"] = task.inputs[0]
     if task.stage is Stage.SYNTHESIZE:
         attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
     data = write_shard(kind, arrays, attributes)
@@ -135,8 +139,8 @@ def _views(random: np.random.Generator, count: int, request: JobRequest) -> Arra
     shade = np.linspace(40, 220, width, dtype=np.uint8)
     return {
         "camera/intrinsics": np.tile(np.eye(3), (views, 1, 1)),
-        "camera/extrinsics": np.tile(np.eye(4), (views, 1, 1)),
-        "camera/scene_index": np.zeros(views, np.int32),
+        "camera/extrinsics": pose_to_matrix(_poses(random, views)),
+        "camera/scene_index": np.repeat(np.arange(request.scenes, dtype=np.int32), request.views * eyes),
         "camera/eye": np.resize(np.array([1, 2] if request.stereo else [0], np.uint8), views),
         "camera/stereo_baseline_m": np.full(views, 0.06),
         "image/rgb": np.broadcast_to(shade[None, None, :, None], (views, height, width, 3)).copy(),

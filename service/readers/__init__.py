@@ -1,0 +1,19 @@
+"""Reading datasets: shards from files, a folder or any store, as arrays or as samples for training.
+
+    from service.readers import Grasps, Pictures, open_shards
+
+    shards = open_shards("demo-out/shards")                                # files
+    shards = open_shards("s3://bucket/graspd", dataset="kitchen")          # a dataset's newest snapshot, cached here
+    grasps = Grasps(shards)                                                # grasps[i]: one grasp as a dictionary
+    arrays = grasps.arrays("grasp/hand_pose", "quality/epsilon")           # all of them as arrays
+    pictures = Pictures(shards)                                            # a picture with the grasps of its scene
+
+`service.readers.torch_data` wraps them for PyTorch; nothing here imports it.
+"""
+
+from service.readers.cache import ShardCache
+from service.readers.files import ShardFile, Shards, open_shards
+from service.readers.grasps import Grasps
+from service.readers.pictures import Pictures
+
+__all__ = ["Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "open_shards"]

@@ -1,0 +1,82 @@
+"""Shards of a remote store kept on this machine: checked when they come, the longest unused dropped when it is full."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from service.errors import InputError
+from service.store import Store
+
+DEFAULT_BYTES: Final = 20 << 30
+
+
+class ShardCache:
+    """Files of a store by their SHA-256. Several processes may share a folder: files appear whole or not at all."""
+
+    def __init__(self, folder: Path, *, limit_bytes: int = DEFAULT_BYTES) -> None:
+        """Raises InputError if the folder cannot be made."""
+        self.folder, self.limit_bytes = folder, limit_bytes
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"the cache folder {folder} cannot be made: {error.strerror}") from None
+
+    def fetch(self, store: Store, key: str, sha256: str) -> Path:
+        """A file of the store on this machine.
+
+        Raises:
+            NotFoundError: the store has no such file.
+            InputError: its content is not what the checksum says.
+            StoreUnavailable: the store does not answer.
+        """
+        path = self.folder / f"{sha256}.h5"
+        if path.is_file():
+            os.utime(path)  # used now: others go first
+            return path
+        self._download(store, key, sha256, path)
+        self._make_room(keep=path)
+        return path
+
+    def _download(self, store: Store, key: str, sha256: str, path: Path) -> None:
+        handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
+        partial, digest = Path(name), hashlib.sha256()
+        try:
+            with os.fdopen(handle, "wb") as file:
+                for chunk in store.stream(key):
+                    digest.update(chunk)
+                    file.write(chunk)
+            if digest.hexdigest() != sha256:
+                raise InputError(
+                    f"{store.url}/{key} has SHA-256 {digest.hexdigest()[:12]}..., expected {sha256[:12]}..."
+                )
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _make_room(self, *, keep: Path) -> None:
+        files = sorted(self._files(), reverse=True)
+        used = 0
+        for _, size, path in files:
+            used += size
+            if used > self.limit_bytes and path != keep:
+                # A process that has it open goes on reading.
+                path.unlink(missing_ok=True)
+
+    def _files(self) -> Iterator[tuple[float, int, Path]]:
+        for path in self.folder.glob("*.h5"):
+            try:
+                facts = path.stat()
+            except FileNotFoundError:
+                continue
+            yield facts.st_mtime, facts.st_size, path
+
+
+def default_folder() -> Path:
+    """`$XDG_CACHE_HOME/graspd/shards`."""
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "graspd" / "shards"

@@ -1,0 +1,179 @@
+"""Which shards there are, and where: files on this machine, or a job or snapshot in a store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import h5py
+
+from service import names
+from service.datasets.records import Snapshot
+from service.errors import InputError, NotFoundError
+from service.manifests import load_manifest, shard_exists
+from service.planning import plan
+from service.readers.cache import DEFAULT_BYTES, ShardCache, default_folder
+from service.records import JobRecord, read_record
+from service.shards import SCHEMAS
+from service.store import Store, open_store
+
+_STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
+
+
+@dataclass(frozen=True)
+class ShardFile:
+    """A shard: on this machine under `path`, or in a store under `key`."""
+
+    id: str
+    kind: str
+    """base, scene or views."""
+    hand: str
+    object: str
+    batch: int
+    path: Path | None = None
+    key: str = ""
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Shards:
+    """The shards of a dataset, in a stated order: by hand, object, batch, id."""
+
+    files: tuple[ShardFile, ...]
+    store: Store | None = None
+    cache: ShardCache | None = None
+    _by_id: dict[str, ShardFile] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self._by_id.update({file.id: file for file in self.files})
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[ShardFile]:
+        return iter(self.files)
+
+    def of(self, kind: str) -> tuple[ShardFile, ...]:
+        """Shards of one kind."""
+        return tuple(file for file in self.files if file.kind == kind)
+
+    def by_id(self, shard: str) -> ShardFile:
+        """A shard by its id; NotFoundError if it is not among these."""
+        if shard not in self._by_id:
+            raise NotFoundError(f"shard {shard[:12]} is not among the {len(self)} shards given")
+        return self._by_id[shard]
+
+    def only(self, *, hands: Iterable[str] = (), objects: Iterable[str] = ()) -> Shards:
+        """Those of some hands and objects; by default of all."""
+        of_hands, of_objects = set(hands), set(objects)
+        kept = (
+            file
+            for file in self.files
+            if (not of_hands or file.hand in of_hands) and (not of_objects or file.object in of_objects)
+        )
+        return Shards(tuple(kept), self.store, self.cache)
+
+    def path(self, file: ShardFile) -> Path:
+        """The file on this machine, fetched where it is not there yet; see `ShardCache.fetch` for errors."""
+        if file.path is not None:
+            return file.path
+        assert self.store is not None and self.cache is not None, "a shard without a path comes from a store"
+        return self.cache.fetch(self.store, file.key, file.sha256)
+
+
+def open_shards(
+    source: str | Path | Store | Iterable[str | Path],
+    *,
+    job: str | None = None,
+    dataset: str | None = None,
+    snapshot: str | None = None,
+    cache: Path | None = None,
+    cache_bytes: int = DEFAULT_BYTES,
+) -> Shards:
+    """The shards of a folder (searched whole), of files, or of a job or dataset in a store.
+
+    Args:
+        source: a folder, a file, several of them, or a store or its URL (`file://`, `s3://`, `gs://`, `az://`).
+        job: id of a job in the store: its finished shards.
+        dataset: name of a dataset in the store: the shards of its newest snapshot.
+        snapshot: digest of another snapshot of that dataset.
+        cache: folder for files of a store; by default `$XDG_CACHE_HOME/graspd/shards`.
+        cache_bytes: how much of them to keep [bytes].
+
+    Raises:
+        NotFoundError: no such file, job, dataset or snapshot.
+        InputError: neither job nor dataset is named for a store, or a file is no shard.
+        StoreUnavailable: the store does not answer.
+    """
+    if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
+        store = source if isinstance(source, Store) else open_store(source)
+        found = _of_store(store, job, dataset, snapshot)
+        return Shards(_ordered(found), store, ShardCache(cache or default_folder(), limit_bytes=cache_bytes))
+    given = [source] if isinstance(source, str | Path) else list(source)
+    return Shards(_ordered(_local(path) for entry in given for path in _paths(Path(entry))))
+
+
+def _paths(entry: Path) -> list[Path]:
+    if entry.is_dir():
+        found = sorted(entry.rglob("*.h5"))
+        if not found:
+            raise NotFoundError(f"{entry} holds no .h5 file")
+        return found
+    if not entry.is_file():
+        raise NotFoundError(f"{entry} does not exist")
+    return [entry]
+
+
+def _local(path: Path) -> ShardFile:
+    try:
+        with h5py.File(path, "r") as file:
+            said = dict(file.attrs)
+    except OSError as error:
+        raise InputError(f"{path} is not a readable HDF5 file: {error}") from None
+    schema = str(said.get("schema", ""))
+    kind = schema.removeprefix("graspd/").partition("@")[0]
+    if not schema.startswith("graspd/") or kind not in SCHEMAS:
+        raise InputError(f"{path} is no graspd shard (attribute schema is {schema!r})")
+    name = str(said.get("shard_id", path.resolve()))
+    return ShardFile(
+        name, kind, str(said.get("hand", "")), str(said.get("object", "")), int(said.get("batch", 0)), path=path
+    )
+
+
+def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
+    if (job is None) == (dataset is None):
+        raise InputError(f"name what to read of {store.url}: a job or a dataset")
+    if job is not None:
+        return _of_job(store, job)
+    assert dataset is not None
+    return _of_snapshot(store, dataset, snapshot)
+
+
+def _of_job(store: Store, job: str) -> Iterator[ShardFile]:
+    record = read_record(JobRecord, store, names.job_record(job))
+    for task in plan(record):
+        if shard_exists(store, task.stage, task.output):
+            made = load_manifest(store, task.stage, task.output)
+            yield ShardFile(
+                made.shard_id, made.kind, made.hand, made.object, made.batch, key=made.key, sha256=made.sha256
+            )
+
+
+def _of_snapshot(store: Store, dataset: str, digest: str | None) -> Iterator[ShardFile]:
+    if digest is not None:
+        taken = read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
+    else:
+        folder = names.dataset_snapshots(dataset)
+        every = [read_record(Snapshot, store, entry.key) for entry in store.list(folder)]
+        if not every:
+            raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
+        taken = max(every, key=lambda one: (one.created, one.digest))
+    for shard in taken.shards:
+        yield ShardFile(shard.id, shard.kind, shard.hand, shard.object, shard.batch, key=shard.key, sha256=shard.sha256)
+
+
+def _ordered(files: Iterable[ShardFile]) -> tuple[ShardFile, ...]:
+    order = list(_STAGES)
+    return tuple(sorted(files, key=lambda file: (file.hand, file.object, file.batch, order.index(file.kind), file.id)))

@@ -1,0 +1,153 @@
+"""Grasps one by one or as arrays, from base shards."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError
+from service.readers.files import ShardFile, Shards
+from service.shards import SCHEMAS
+
+Array = NDArray[Any]
+#: From the columns of one base shard to a mask (N,) of the grasps to keep.
+Where = Callable[[Mapping[str, Array]], Array]
+
+#: Columns of a grasp sample.
+DEFAULT_COLUMNS: Final = (
+    "grasp/hand_pose",
+    "grasp/joint_positions",
+    "pregrasp/hand_pose",
+    "pregrasp/joint_positions",
+    "squeeze/hand_pose",
+    "squeeze/joint_positions",
+    "quality/epsilon",
+    "quality/contact_area_cm2",
+    "quality/penetration_depth_mm",
+    "quality/valid",
+)
+#: Shards kept in memory: about 0.1 MB each.
+_KEPT: Final = 256
+
+
+class Grasps(Sequence[dict[str, Any]]):
+    """Grasps of base shards. `grasps[i]` is a dictionary of the columns' rows with `hand`, `object`, `shard_id`, `row`.
+
+    Columns have the names, units and frames of docs/dataset.md. Swept metrics have one value for each contact
+    threshold of the shard.
+    """
+
+    def __init__(
+        self,
+        shards: Shards,
+        columns: Sequence[str] = DEFAULT_COLUMNS,
+        *,
+        valid: bool = True,
+        where: Where | None = None,
+    ) -> None:
+        """Looks into every base shard once, for the rows to keep.
+
+        Args:
+            shards: see `open_shards`; scene and views shards among them are passed over.
+            columns: what a sample holds.
+            valid: only valid grasps.
+            where: keeps those of them for which it answers True.
+
+        Raises:
+            InputError: an unknown column, or a mask of another length.
+        """
+        if unknown := set(columns) - set(SCHEMAS["base"]):
+            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
+        self.shards, self.columns = shards, tuple(columns)
+        self._valid, self._where = valid, where
+        self._files = shards.of("base")
+        self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
+        self._rows = [self._kept(file) for file in self._files]
+        self._ends = np.cumsum([len(rows) for rows in self._rows], dtype=np.int64)
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        at = index + len(self) if index < 0 else index
+        if not 0 <= at < len(self):
+            raise IndexError(index)
+        number = int(np.searchsorted(self._ends, at, side="right"))
+        rows, file = self._rows[number], self._files[number]
+        row = int(rows[at - (int(self._ends[number]) - len(rows))])
+        return self._sample(file, row)
+
+    @property
+    def ends(self) -> NDArray[np.int64]:
+        """(shards,) index after each base shard's last grasp, for readers that keep a shard's grasps together."""
+        return self._ends
+
+    def joint_names(self, hand: str) -> list[str]:
+        """Joints of a hand in the order of `joint_positions`; InputError if no shard is of this hand."""
+        for file in self._files:
+            if file.hand == hand:
+                with h5py.File(self.shards.path(file), "r") as opened:
+                    return [str(name) for name in opened.attrs["joint_names"]]
+        raise InputError(f"none of the shards is of the hand {hand!r}")
+
+    def arrays(self, *columns: str) -> dict[str, Array]:
+        """Columns of all grasps, by default those of the samples; `hand` and `object` name each row's.
+
+        Raises:
+            InputError: hands of different numbers of joints, or different thresholds, do not fit into one array.
+        """
+        wanted = columns or self.columns
+        parts: dict[str, list[Array]] = {name: [] for name in (*wanted, "hand", "object")}
+        for file, rows in zip(self._files, self._rows, strict=True):
+            held = self._load(file, wanted)
+            for name in wanted:
+                parts[name].append(held[name][rows])
+            parts["hand"].append(np.full(len(rows), file.hand))
+            parts["object"].append(np.full(len(rows), file.object))
+        try:
+            return {name: np.concatenate(some) if some else np.empty(0) for name, some in parts.items()}
+        except ValueError as error:
+            raise InputError(
+                f"the shards do not fit into one array ({error}); read one hand: shards.only(...)"
+            ) from None
+
+    def _sample(self, file: ShardFile, row: int) -> dict[str, Any]:
+        held = self._load(file, self.columns)
+        sample: dict[str, Any] = {name: held[name][row] for name in self.columns}
+        return sample | {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row}
+
+    def _kept(self, file: ShardFile) -> NDArray[np.intp]:
+        held = self._load(file, tuple(SCHEMAS["base"]) if self._where else ("quality/valid",), keep=False)
+        mask = held["quality/valid"] == 1 if self._valid else np.ones(len(held["quality/valid"]), bool)
+        if self._where is not None:
+            found = np.asarray(self._where(held), bool)
+            if found.shape != mask.shape:
+                raise InputError(f"`where` gave a mask of shape {found.shape} for {len(mask)} grasps")
+            mask &= found
+        return np.flatnonzero(mask)
+
+    def _load(self, file: ShardFile, columns: Sequence[str], *, keep: bool = True) -> dict[str, Array]:
+        held = self._memory.get(file.id, {})
+        missing = [name for name in columns if name not in held]
+        if missing:
+            with h5py.File(self.shards.path(file), "r") as opened:
+                held = held | {name: opened[name][()] for name in missing if name in opened}
+            self._check(file, columns, held, optional=not keep)
+            if keep:
+                self._memory[file.id] = held
+                if len(self._memory) > _KEPT:
+                    self._memory.popitem(last=False)
+        return held
+
+    @staticmethod
+    def _check(file: ShardFile, columns: Sequence[str], held: Mapping[str, Array], *, optional: bool) -> None:
+        absent = [name for name in columns if name not in held and not (optional and SCHEMAS["base"][name].optional)]
+        if absent:
+            raise InputError(f"shard {file.id[:12]} of {file.hand} on {file.object} has no column {absent[0]!r}")

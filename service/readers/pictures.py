@@ -1,0 +1,133 @@
+"""Pictures with the grasps that fit their scene, from views, scene and base shards."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service import transforms
+from service.errors import InputError
+from service.readers.files import ShardFile, Shards
+from service.shards import SCHEMAS, read_shard
+
+Array = NDArray[Any]
+
+#: Columns of a picture sample.
+DEFAULT_COLUMNS: Final = (
+    "image/rgb",
+    "image/depth",
+    "image/segmentation",
+    "camera/intrinsics",
+    "camera/extrinsics",
+    "box/bounding_box_2d_tight",
+)
+_KEPT: Final = 64
+
+
+class Pictures(Sequence[dict[str, Any]]):
+    """Pictures of views shards. `pictures[i]` is a dictionary of the columns' rows and of the grasps of its scene.
+
+    The grasps of the picture's scene stand in arrays of K rows; K differs from scene to scene and may be 0:
+
+        grasp/hand_pose (K, 7) in the camera frame [m], quaternion w x y z
+        grasp/joint_positions (K, J) [rad or m]
+        grasp/base_row (K,) row in the base shard `base_id`
+        quality/epsilon and other `grasp_quality` columns (K, ...)
+
+    The left eye of a stereo pair stands before its right eye.
+    """
+
+    def __init__(
+        self,
+        shards: Shards,
+        columns: Sequence[str] = DEFAULT_COLUMNS,
+        *,
+        grasp_quality: Sequence[str] = ("quality/epsilon",),
+        clear: bool = True,
+        with_grasps_only: bool = False,
+    ) -> None:
+        """
+        Args:
+            shards: views shards, and the scene and base shards they were made of.
+            columns: what a sample holds of its picture.
+            grasp_quality: base columns of its grasps.
+            clear: only grasps that are clear of the table, and of neighbours, in this scene.
+            with_grasps_only: leave out pictures of scenes without a grasp.
+
+        Raises:
+            InputError: an unknown column.
+            NotFoundError: the scene or base shard of a views shard is not among the shards.
+        """
+        if unknown := set(columns) - set(SCHEMAS["views"]):
+            raise InputError(f"views shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
+        if unknown := set(grasp_quality) - set(SCHEMAS["base"]):
+            raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
+        self.shards, self.columns, self._quality, self._clear = shards, tuple(columns), tuple(grasp_quality), clear
+        self._scenes: OrderedDict[str, _Scenes] = OrderedDict()
+        self._places: list[tuple[ShardFile, str, int, int]] = []
+        for file in shards.of("views"):
+            self._add(file, with_grasps_only=with_grasps_only)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        file, scene_shard, scene, row = self._places[index]
+        with h5py.File(self.shards.path(file), "r") as opened:
+            sample: dict[str, Any] = {name: opened[name][row] for name in self.columns}
+            extrinsics = np.asarray(opened["camera/extrinsics"][row], float)
+        names = {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row, "scene": scene}
+        return sample | self._scenes_of(scene_shard).grasps(scene, extrinsics) | names
+
+    def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
+        with h5py.File(self.shards.path(file), "r") as opened:
+            scenes = np.asarray(opened["camera/scene_index"])
+            scene_shard = str(opened.attrs["scene_shard"])
+            if absent := [name for name in self.columns if name not in opened]:
+                raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")
+        held = self._scenes_of(scene_shard)
+        for row, scene in enumerate(scenes):
+            if not with_grasps_only or held.count(int(scene)):
+                self._places.append((file, scene_shard, int(scene), row))
+
+    def _scenes_of(self, shard: str) -> _Scenes:
+        if shard not in self._scenes:
+            self._scenes[shard] = _Scenes(self.shards, shard, self._quality, clear=self._clear)
+            if len(self._scenes) > _KEPT:
+                self._scenes.popitem(last=False)
+        return self._scenes[shard]
+
+
+class _Scenes:
+    """The scenes of one scene shard with their grasps."""
+
+    def __init__(self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool) -> None:
+        scene = read_shard(shards.path(shards.by_id(shard)), kind="scene")
+        self._base_id = str(scene.attributes["base_shard"])
+        base = read_shard(shards.path(shards.by_id(self._base_id)), kind="base")
+        kept = np.flatnonzero(np.asarray(scene["grasp/valid"]) == 1) if clear else slice(None)
+        self._scene = np.asarray(scene["grasp/scene_index"])[kept]
+        self._row = np.asarray(scene["grasp/base_index"])[kept]
+        self._pose = np.asarray(scene["grasp/hand_pose"], float)[kept]
+        self._columns = {
+            name: np.asarray(base[name])[self._row]
+            for name in ("grasp/joint_positions", *quality)
+            if name in base.arrays
+        }
+
+    def count(self, scene: int) -> int:
+        return int(np.count_nonzero(self._scene == scene))
+
+    def grasps(self, scene: int, extrinsics: NDArray[np.float64]) -> dict[str, Any]:
+        """Of one scene, in the frame of the camera with these extrinsics (4, 4)."""
+        rows = np.flatnonzero(self._scene == scene)
+        pose = transforms.compose(transforms.pose_from_matrix(extrinsics), self._pose[rows])
+        found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self._base_id}
+        return found | {name: column[rows] for name, column in self._columns.items()}

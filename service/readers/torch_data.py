@@ -1,0 +1,121 @@
+"""Shards as PyTorch datasets. Importing this module imports torch: `pip install torch`, in whatever build you need.
+
+from torch.utils.data import DataLoader
+from service.readers import Pictures, open_shards
+from service.readers.torch_data import Samples, ShuffledShards, collate
+
+shards = open_shards("demo-out/shards")
+DataLoader(Samples(Pictures(shards)), batch_size=16, shuffle=True, num_workers=4, collate_fn=collate)
+DataLoader(ShuffledShards(shards, seed=1), batch_size=256, num_workers=4)     # larger than memory
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset, IterableDataset, default_collate, get_worker_info
+
+from service.readers.files import Shards
+from service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
+
+Sample = dict[str, Any]
+
+
+def tensors(sample: Sample) -> Sample:
+    """The sample with arrays as tensors: float64 as float32, for networks; words stay words."""
+    return {name: _tensor(value) for name, value in sample.items()}
+
+
+def collate(samples: Sequence[Sample]) -> Sample:
+    """One batch: values are stacked, but the grasps of each picture's scene stay a list of tensors."""
+    pictures = "grasp/base_row" in samples[0]
+    batch: Sample = {}
+    for name in samples[0]:
+        values = [sample[name] for sample in samples]
+        # Scenes may have equally many grasps by chance; the batch must not change its kind for that.
+        listed = pictures and name.startswith(("grasp/", "quality/"))
+        batch[name] = values if listed else default_collate(values)
+    return batch
+
+
+class Samples(Dataset[Sample]):
+    """`Grasps` or `Pictures` as a map-style dataset; a `DataLoader` may shuffle it and read it in processes."""
+
+    def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = tensors) -> None:
+        self._source, self._transform = source, transform
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self._transform(self._source[index])
+
+
+class ShuffledShards(IterableDataset[Sample]):
+    """Grasps of any number of shards, in random order, read shard by shard.
+
+    The order of the shards is drawn anew each epoch, shards are dealt to the processes of a `DataLoader` and to the
+    ranks of a distributed run, and a buffer mixes what comes from several shards.
+    """
+
+    def __init__(
+        self,
+        shards: Shards,
+        columns: Sequence[str] = DEFAULT_COLUMNS,
+        *,
+        valid: bool = True,
+        where: Where | None = None,
+        buffer: int = 4096,
+        seed: int = 0,
+        rank: int = 0,
+        ranks: int = 1,
+        transform: Callable[[Sample], Sample] = tensors,
+    ) -> None:
+        """
+        Args:
+            shards: see `open_shards`.
+            columns: what a sample holds.
+            valid: only valid grasps.
+            where: keeps those of them for which it answers True.
+            buffer: grasps among which the next one is drawn.
+            seed: of the order; `epoch` changes it.
+            rank: this process's number in a distributed run.
+            ranks: processes of the distributed run.
+            transform: from a sample of arrays to what the loader should collate.
+        """
+        self.epoch = 0
+        self._shards, self._columns, self._valid, self._where = shards, tuple(columns), valid, where
+        self._buffer, self._seed, self._rank, self._ranks = max(1, buffer), seed, rank, ranks
+        self._transform = transform
+
+    def __iter__(self) -> Iterator[Sample]:
+        worker = get_worker_info()
+        number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        share, shares = self._rank * workers + number, self._ranks * workers
+        files = self._shards.of("base")
+        order = np.random.default_rng([self._seed, self.epoch]).permutation(len(files))[share::shares]
+        draw = np.random.default_rng([self._seed, self.epoch, share])
+        held: list[Sample] = []
+        for at in order:
+            one = Shards((files[at],), self._shards.store, self._shards.cache)
+            for sample in Grasps(one, self._columns, valid=self._valid, where=self._where):
+                held.append(sample)
+                if len(held) > self._buffer:
+                    yield self._transform(_draw(held, draw))
+        while held:
+            yield self._transform(_draw(held, draw))
+
+
+def _draw(held: list[Sample], draw: np.random.Generator) -> Sample:
+    at = int(draw.integers(len(held)))
+    held[at], held[-1] = held[-1], held[at]
+    return held.pop()
+
+
+def _tensor(value: Any) -> Any:
+    if not isinstance(value, np.ndarray):
+        return value.item() if isinstance(value, np.generic) else value
+    return torch.from_numpy(value.astype(np.float32) if value.dtype == np.float64 else value)

@@ -1,0 +1,114 @@
+"""Rigid transforms in NumPy. Pose: 7 numbers, position x y z then unit quaternion w x y z. All functions broadcast."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+IDENTITY_POSE: Floats = np.array([0.0, 0, 0, 1, 0, 0, 0])
+
+
+def quat_multiply(a: Floats, b: Floats) -> Floats:
+    """Hamilton product (..., 4), w x y z."""
+    w1, x1, y1, z1 = np.moveaxis(np.asarray(a, float), -1, 0)
+    w2, x2, y2, z2 = np.moveaxis(np.asarray(b, float), -1, 0)
+    return np.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        axis=-1,
+    )
+
+
+def quat_conjugate(q: Floats) -> Floats:
+    """Inverse of a unit quaternion (..., 4)."""
+    return np.asarray(q, float) * np.array([1.0, -1, -1, -1])
+
+
+def quat_rotate(q: Floats, v: Floats) -> Floats:
+    """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
+    q, v = np.asarray(q, float), np.asarray(v, float)
+    u = q[..., 1:]
+    t = 2.0 * np.cross(u, v)
+    return v + q[..., :1] * t + np.cross(u, t)
+
+
+def quat_from_axis_angle(axis: Floats, angle: Floats) -> Floats:
+    """Unit quaternion (..., 4) of a rotation by angle (...) [rad] about a unit axis (..., 3)."""
+    half = 0.5 * np.asarray(angle, float)[..., None]
+    return np.concatenate([np.cos(half), np.asarray(axis, float) * np.sin(half)], axis=-1)
+
+
+def quat_from_matrix(matrix: Floats) -> Floats:
+    """Unit quaternion (..., 4) with w >= 0 of rotation matrices (..., 3, 3), by Shepperd (1978)."""
+    m = np.asarray(matrix, float)
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    d = np.diagonal(m, axis1=-2, axis2=-1)
+    k = np.argmax(np.concatenate([trace[..., None], d], axis=-1), axis=-1)
+    # Rows of the symmetric matrix 4 q q^T: any row is parallel to q; the one with the largest diagonal is safest.
+    outer = np.empty((*m.shape[:-2], 4, 4))
+    outer[..., 0, 0] = 1 + trace
+    for i in range(3):
+        outer[..., i + 1, i + 1] = 1 + 2 * d[..., i] - trace
+    outer[..., 0, 1] = outer[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
+    outer[..., 0, 2] = outer[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
+    outer[..., 0, 3] = outer[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]
+    outer[..., 1, 2] = outer[..., 2, 1] = m[..., 0, 1] + m[..., 1, 0]
+    outer[..., 1, 3] = outer[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
+    outer[..., 2, 3] = outer[..., 3, 2] = m[..., 1, 2] + m[..., 2, 1]
+    q = np.take_along_axis(outer, k[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def quat_to_matrix(q: Floats) -> Floats:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def pose_from_matrix(matrix: Floats) -> Floats:
+    """Poses (..., 7) of homogeneous matrices (..., 4, 4)."""
+    m = np.asarray(matrix, float)
+    return np.concatenate([m[..., :3, 3], quat_from_matrix(m[..., :3, :3])], axis=-1)
+
+
+def pose_to_matrix(pose: Floats) -> Floats:
+    """Homogeneous matrices (..., 4, 4) of poses (..., 7)."""
+    p = np.asarray(pose, float)
+    m = np.zeros((*p.shape[:-1], 4, 4))
+    m[..., :3, :3] = quat_to_matrix(p[..., 3:])
+    m[..., :3, 3] = p[..., :3]
+    m[..., 3, 3] = 1.0
+    return m
+
+
+def compose(a: Floats, b: Floats) -> Floats:
+    """Pose of c in a's parent, given pose a and the pose b of c in a's frame: (..., 7)."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    position = a[..., :3] + quat_rotate(a[..., 3:], b[..., :3])
+    rotation = quat_multiply(a[..., 3:], b[..., 3:])
+    return np.concatenate([position, np.broadcast_to(rotation, (*position.shape[:-1], 4))], axis=-1)
+
+
+def invert(pose: Floats) -> Floats:
+    """Inverse poses (..., 7)."""
+    p = np.asarray(pose, float)
+    conjugate = quat_conjugate(p[..., 3:])
+    return np.concatenate([-quat_rotate(conjugate, p[..., :3]), conjugate], axis=-1)
+
+
+def apply(pose: Floats, points: Floats) -> Floats:
+    """Points (..., 3) of a frame expressed in its parent: rotated, then moved."""
+    p = np.asarray(pose, float)
+    return quat_rotate(p[..., 3:], points) + p[..., :3]

@@ -1,0 +1,59 @@
+"""PyTorch's loaders on shards; skipped where torch is not installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.parts import Parts
+from service.readers import Grasps, Pictures, Shards, open_shards
+from tests.api import factories
+
+torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
+from torch.utils.data import DataLoader  # noqa: E402
+
+from service.readers.torch_data import Samples, ShuffledShards, collate  # noqa: E402
+
+
+@pytest.fixture
+def shards(parts: Parts, tmp_path: Path) -> Shards:
+    """Three batches of a finished job."""
+    factories.add_builtins(parts)
+    record = factories.add_job(parts, grasps=80, scenes=1, views=2, width=24, height=16)
+    factories.finish_all(parts, record)
+    return open_shards(parts.store, job=record.id, cache=tmp_path / "cache")
+
+
+def rows(batches: Any) -> list[tuple[str, int]]:
+    return [(shard, int(row)) for batch in batches for shard, row in zip(batch["shard_id"], batch["row"], strict=True)]
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_every_grasp_comes_once_an_epoch(shards: Shards, processes: int) -> None:
+    loader = DataLoader(ShuffledShards(shards, buffer=16), batch_size=8, num_workers=processes)
+    seen = rows(loader)
+    assert sorted(seen) == sorted((sample["shard_id"], sample["row"]) for sample in Grasps(shards))
+
+
+def test_ranks_share_the_grasps(shards: Shards) -> None:
+    parts = [rows(DataLoader(ShuffledShards(shards, rank=rank, ranks=2), batch_size=8)) for rank in range(2)]
+    assert not set(parts[0]) & set(parts[1])
+    assert len(parts[0]) + len(parts[1]) == len(Grasps(shards))
+
+
+def test_another_epoch_has_another_order_and_the_same_epoch_the_same(shards: Shards) -> None:
+    stream = ShuffledShards(shards, seed=3)
+    first, again = rows(DataLoader(stream, batch_size=8)), rows(DataLoader(stream, batch_size=8))
+    stream.epoch = 1
+    other = rows(DataLoader(stream, batch_size=8))
+    assert first == again
+    assert first != other
+
+
+def test_pictures_are_stacked_and_their_grasps_listed(shards: Shards) -> None:
+    batch = next(iter(DataLoader(Samples(Pictures(shards)), batch_size=3, collate_fn=collate)))
+    assert batch["image/rgb"].shape == (3, 16, 24, 3)
+    assert [pose.shape[1] for pose in batch["grasp/hand_pose"]] == [7, 7, 7]
+    assert batch["camera/intrinsics"].dtype is torch.float32
