@@ -28,6 +28,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("logs", "api.commands", "Jobs", "Failed attempts of a job, with their reasons."),
     ("hands", "api.commands", "Jobs", "Check, add, list and show hands."),
     ("objects", "api.commands", "Jobs", "Check, add, list and show objects."),
+    ("datasets", "api.dataset_commands", "Jobs", "Hands x objects as one dataset: cost, status, snapshots, files."),
     ("api", "api.commands", "Parts of the service", "The HTTP API and the dashboard."),
     ("keeper", "service.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
     ("worker", "worker.commands", "Parts of the service", "One worker on one device."),

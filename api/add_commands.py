@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.add_sets import add_set, files_of_set
+from api.add_sets import add_set, files_of_set, name_of_set
 from api.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
 from service.asset_options import (
@@ -72,7 +72,7 @@ def add_object(
         units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
     )
     if files := files_of_set(file):
-        add_set(files, prefix=name, options=options, wait=wait, url=url, json=json)
+        add_set(files, name=name or name_of_set(file), prefix=name, options=options, wait=wait, url=url, json=json)
         return
     _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
 

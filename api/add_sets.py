@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from api.client import Client
+from api.dataset_client import DatasetClient
 from api.reports import open_client
-from api.uploads import UNPACK_FACTOR
+from api.uploads import UNPACK_FACTOR, name_of_upload
 from service.asset_summary import verdict_line
 from service.assets import pack
 from service.cli import emit, load_settings
@@ -38,29 +40,58 @@ def files_of_set(path: Path) -> Objects | None:
     return found if path.is_dir() or len(found) > 1 else None
 
 
+def name_of_set(path: Path) -> str:
+    """Name of the set that a folder or ZIP becomes."""
+    place = path.resolve()
+    return name_of_upload(f"{place.name}.zip" if place.is_dir() else place.name)
+
+
 def add_set(
-    objects: Objects, *, prefix: str | None, options: dict[str, Any], wait: bool, url: str | None, json: bool
+    objects: Objects, *, name: str, prefix: str | None, options: dict[str, Any], wait: bool, url: str | None, json: bool
 ) -> None:
-    """Upload all, wait for all checks; what is refused does not stop the others.
+    """Upload all, wait for all checks, give them a name together; what is refused does not stop the others.
 
     Raises:
         InputError: some were refused; each is listed before.
     """
-    told: list[dict[str, Any]] = []
     with open_client(url) as client:
-        for name, files in objects.items():
-            told.append(_upload(client, f"{prefix}-{name}" if prefix else name, files, options))
-        for one in told:
-            if wait and one["verdict"] is None:
-                asset = client.wait_checked(AssetKind.OBJECT, one["name"])
-                one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
-            if not json:
-                typer.echo(verdict_line(one))
+        told = upload_set(client, objects, prefix=prefix, options=options, wait=wait, say=None if json else typer.echo)
+        taken = [one["name"] for one in told if one["verdict"] != "refuse"]
+        if taken:
+            DatasetClient(client).add_object_set(name, taken)
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
     if json:
-        emit({"objects": told, "refused": refused})
+        emit({"objects": told, "refused": refused, "set": name if taken else None})
+    elif taken:
+        typer.echo(f"set {name}: {len(taken)} objects; `graspd datasets create NAME --hands HANDS --objects {name}`")
     if refused:
         raise InputError(f"{len(refused)} of {len(told)} objects were refused: {', '.join(refused[:5])}")
+
+
+def upload_set(
+    client: Client,
+    objects: Objects,
+    *,
+    prefix: str | None = None,
+    options: dict[str, Any] | None = None,
+    wait: bool = True,
+    say: Callable[[str], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Upload objects and wait for their checks: name, verdict, message and repairs of each.
+
+    Args:
+        say: told of each as soon as its check is done.
+    """
+    told = [
+        _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}) for name, files in objects.items()
+    ]
+    for one in told:
+        if wait and one["verdict"] is None:
+            asset = client.wait_checked(AssetKind.OBJECT, one["name"])
+            one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
+        if say is not None:
+            say(verdict_line(one))
+    return told
 
 
 def _upload(client: Client, name: str, files: dict[str, bytes], options: dict[str, Any]) -> dict[str, Any]:

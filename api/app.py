@@ -20,7 +20,7 @@ from api.keys import KeyFile
 from api.limits import BodyLimit
 from api.metrics import Metrics
 from api.rates import Rates
-from api.routes import grasps, jobs, shards, system
+from api.routes import datasets, grasps, jobs, shards, system
 from api.routes.assets import asset_router
 from api.turnstile import Turnstile
 from service.domain import AssetKind
@@ -66,7 +66,9 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     app.state.catalog = Catalog(opened)
     app.state.metrics = Metrics()
     problems.install(app, problem_page)
-    for router in (jobs.router, grasps.router, shards.router, *map(asset_router, AssetKind), system.router):
+    for routes in (jobs, grasps, shards, system):
+        app.include_router(routes.router)
+    for router in (*map(asset_router, AssetKind), *datasets.routers):
         app.include_router(router)
     pages.install(app)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

@@ -58,32 +58,32 @@ class Client:
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
         """Submit a job; the same request gives the same job."""
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
-        answer = self._send("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
+        answer = self.send("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
         return JobDetail.model_validate_json(answer.content)
 
     def job(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self._send("GET", f"/v1/jobs/{job_id}").content)
+        return JobDetail.model_validate_json(self.send("GET", f"/v1/jobs/{job_id}").content)
 
     def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
         """Jobs, newest first."""
         params = {"state": state, "limit": limit, "cursor": cursor}
-        return Page[Job].model_validate_json(self._send("GET", "/v1/jobs", params=params).content)
+        return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
 
     def cancel(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self._send("POST", f"/v1/jobs/{job_id}/cancel").content)
+        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/cancel").content)
 
     def retry(self, job_id: str) -> JobDetail:
-        return JobDetail.model_validate_json(self._send("POST", f"/v1/jobs/{job_id}/retry").content)
+        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/retry").content)
 
     def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
-        return Page[GraspView].model_validate_json(self._send("GET", "/v1/grasps", params=params).content)
+        return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
 
     def assets(self, kind: AssetKind) -> Iterator[AssetView]:
         """All hands or objects."""
         cursor: str | None = None
         while True:
-            answer = self._send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor})
+            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor})
             page = Page[AssetView].model_validate_json(answer.content)
             yield from page.items
             cursor = page.next
@@ -91,7 +91,7 @@ class Client:
                 return
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return AssetView.model_validate_json(self._send("GET", f"/v1/{kind.value}s/{name}").content)
+        return AssetView.model_validate_json(self.send("GET", f"/v1/{kind.value}s/{name}").content)
 
     def upload(
         self, kind: AssetKind, path: Path, *, name: str | None = None, options: dict[str, Any] | None = None
@@ -100,7 +100,7 @@ class Client:
         fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
         try:
             with path.open("rb") as file:
-                answer = self._send(
+                answer = self.send(
                     "POST",
                     f"/v1/{kind.value}s",
                     files={"file": (path.name, file)},
@@ -119,15 +119,19 @@ class Client:
             time.sleep(_POLL_S)
         return asset
 
+    def fetch(self, path: str) -> Iterator[bytes]:
+        """Chunks of a file of the API."""
+        with _Translated(self.url), self._http.stream("GET", path) as answer:
+            _raise_for(answer)
+            yield from answer.iter_bytes()
+
     def download(self, shard: Shard, path: Path) -> Path:
         """Fetch a shard's file; the name appears once it is whole."""
         draft = path.with_name(f".{path.name}.part")
         try:
-            with _Translated(self.url), self._http.stream("GET", shard.file) as answer:
-                _raise_for(answer)
-                with draft.open("wb") as file:
-                    for chunk in answer.iter_bytes():
-                        file.write(chunk)
+            with draft.open("wb") as file:
+                for chunk in self.fetch(shard.file):
+                    file.write(chunk)
             draft.replace(path)
         finally:
             draft.unlink(missing_ok=True)
@@ -163,7 +167,7 @@ class Client:
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             try:
-                self._send("GET", "/healthz")
+                self.send("GET", "/healthz")
             except UnavailableError:
                 time.sleep(_POLL_S)
             else:
@@ -175,7 +179,8 @@ class Client:
             _raise_for(answer)
             yield from parse_events(answer.iter_lines())
 
-    def _send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
+    def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
+        """The answer to a request; the error behind a problem document is raised."""
         given = {name: value for name, value in (params or {}).items() if value is not None}
         with _Translated(self.url):
             answer = self._http.request(method, path, params=given or None, **options)

@@ -13,6 +13,7 @@ from api import key_commands
 from api.add_commands import add_hand, add_object
 from api.client import Client
 from api.dashboard.filters import count, percent, size
+from api.dataset_client import DatasetClient
 from api.models import Job
 from api.reports import UrlOption, job_request, open_client, show_asset, show_job, watch
 from api.uploads import MAIN_SUFFIXES, name_of_upload
@@ -191,6 +192,25 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
 hands_app, objects_app = asset_commands(AssetKind.HAND), asset_commands(AssetKind.OBJECT)
 hands_app.command("add", epilog="graspd hands add my_hand.zip --palm base_link --approach 0,0,1")(add_hand)
 objects_app.command("add", epilog="graspd objects add banana.stl --units mm --density 950")(add_object)
+
+
+@objects_app.command("sets", epilog="graspd objects sets")
+@reporting_errors
+def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Sets of objects; `graspd objects add FOLDER` makes one."""
+    with open_client(url) as client:
+        found = DatasetClient(client).object_sets()
+    if json:
+        emit({"sets": [one.model_dump(mode="json") for one in found]})
+        return
+    table = Table("set", "objects", "", box=None, header_style="bold")
+    for one in found:
+        table.add_row(
+            one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + (", ..." * (len(one.objects) > 5))
+        )
+    Console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
+
+
 app.add_typer(hands_app, name="hands")
 app.add_typer(objects_app, name="objects")
 app.add_typer(key_commands.app, name="keys")

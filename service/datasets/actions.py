@@ -124,7 +124,8 @@ def add_object_set(parts: Parts, name: str, objects: Iterable[str]) -> ObjectSet
         InputError: an object was refused when it was checked, or there is none.
         ConflictError: a check is still running.
     """
-    wanted = tuple(usable(parts, AssetKind.OBJECT, one).name for one in objects)
+    assets = [parts.index.asset(AssetKind.OBJECT, one) for one in objects]
+    wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
     after = ""

@@ -75,14 +75,14 @@ class SnapshotShard(Record):
     """A file of a snapshot."""
 
     id: Digest
-    kind: str
+    kind: Literal["base", "scene", "views"]
     key: str
     sha256: str
     size_bytes: int
     count: int
     valid: int
-    hand: str
-    object: str
+    hand: Name
+    object: Name
     batch: int
 
 

@@ -134,6 +134,8 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     options = JobOptions.model_validate(row["options"])
     states = _states(connection, row)
     state = job_state(state for state, count in states.items() if count)
+    if state.is_final and not row["cancelled"] and row["applied"] < row["events"]:
+        state = State.QUEUED  # a retry that is not yet passed on to the jobs
     work = _work(connection, dataset_cells.c.dataset == row["name"])
     made = _made(connection, dataset_cells.c.dataset == row["name"])
     tasks_asked = max(work["tasks"], row["cells"] * _tasks_of_cell(options))

@@ -177,7 +177,7 @@ def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(parts
         actions.retry(parts, "other")
     actions.cancel(parts, "grasps")
     plan_all(parts)
-    actions.retry(parts, "grasps")
+    assert actions.retry(parts, "grasps").state is State.QUEUED
     plan_all(parts)
     found = status(parts.index, "grasps")
     assert [cell.state for cell in found.cells] == ["succeeded", "running", "queued", "queued"]

@@ -1,0 +1,73 @@
+"""The fields of `JobOptions` as options of a command: a new field is a new option, with its type, default and words."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any, Final, Literal, get_origin
+
+import typer
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from service.domain import OFFERED, JobOptions
+from service.errors import InputError
+
+_HELP: Final = {
+    "grasps": "Grasps for each hand and object.",
+    "fidelity": f"{', '.join(OFFERED[:-1])} or {OFFERED[-1]}.",
+    "method": "Planner.",
+    "seed": "The same seed gives the same grasps.",
+}
+_SHORT: Final = {"grasps": "-n"}
+
+
+def with_job_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add an option for each field of `JobOptions`; the command gets those that were given, as `options`."""
+    own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "options"]
+    added = [_parameter(name, field) for name, field in JobOptions.model_fields.items()]
+
+    @functools.wraps(command)
+    def wrapper(**given: Any) -> None:
+        options = {p.name: given.pop(p.name) for p in added}
+        command(**given, options={name: value for name, value in options.items() if value is not None})
+
+    del wrapper.__wrapped__  # its signature is not this one's
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*own, *added)]
+    wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+    return wrapper
+
+
+def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
+    """A model of what was given; InputError names the first option that cannot be used."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = f"--{str(first['loc'][0]).replace('_', '-')}: " if first["loc"] else ""
+        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
+
+
+def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
+    said = field.description or name
+    words = _HELP.get(name) or f"{said[0].upper()}{said[1:]}."
+    words = words.replace("[", "(").replace("]", ")")  # the terminal takes brackets for markup
+    if get_origin(field.annotation) is tuple:
+        words += " Several times."
+    flags = [f"--{name.replace('_', '-')}", *([_SHORT[name]] if name in _SHORT else [])]
+    if field.annotation is bool:
+        option = Annotated[bool, typer.Option(flags[0], help=words)]
+        return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
+    default = "" if field.default in ((), None) else f" Default: {field.default}."
+    annotation: Any = Annotated[_type_of(field) | None, typer.Option(*flags, help=words + default, show_default=False)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _type_of(field: FieldInfo) -> Any:
+    """The type that the command line reads: several choices for a tuple, a name where knobs could stand."""
+    kind = field.annotation
+    if get_origin(kind) is tuple:
+        return list[str]
+    return kind if kind in (int, float) or get_origin(kind) is Literal else str
