@@ -13,11 +13,11 @@ from typing import Final
 
 from service import names
 from service.datasets.planner import Planner
-from service.domain import AssetKind, Lane
+from service.domain import Lane
 from service.errors import UnavailableError
 from service.index.rebuild import rebuild
 from service.indexer import Indexer
-from service.library import load_check, publish_builtins
+from service.library import load_check, publish_builtins, stored_assets
 from service.parts import Parts
 from service.pipeline import queue_tasks
 from service.planning import ingest_id, ingest_message
@@ -100,10 +100,8 @@ class Keeper:
         self._started = True
 
     def _index_assets(self) -> None:
-        for entry in list(self._parts.store.list(names.ASSETS)):
-            _, kind, digest, leaf = entry.key.split("/")
-            if leaf == "asset.json":
-                self._indexer.checked(AssetKind(kind), digest)
+        for kind, digest in stored_assets(self._parts.store):
+            self._indexer.checked(kind, digest)
 
     def _index_events(self, wait_s: float) -> bool:
         """Whether anything but progress came in."""

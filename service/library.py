@@ -51,6 +51,13 @@ def publish_builtins(store: Store) -> list[Asset]:
     return published
 
 
+def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
+    """Kind and digest of every hand and object in the store."""
+    records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
+    # Other files of an asset may lie deeper, such as an object's convex pieces.
+    return [(AssetKind(key[1]), key[2]) for key in records if len(key) == 4 and key[3] == "asset.json"]
+
+
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
     """The record of a hand or object; NotFoundError if there is none."""
     return Asset.model_validate_json(store.get(names.asset_record(kind, digest)))

@@ -12,10 +12,10 @@ from sqlalchemy import Connection, Table, delete, select
 
 from service import names
 from service.datasets.records import DatasetRecord, ObjectSet, Snapshot, dataset_events
-from service.domain import AssetKind, State
+from service.domain import State
 from service.index.index import Index
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
-from service.library import load_asset, load_check
+from service.library import load_asset, load_check, stored_assets
 from service.manifests import ShardManifest
 from service.records import AttemptRecord, JobRecord, job_events, parse_record
 from service.store import Store
@@ -131,10 +131,8 @@ def _lasting(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _assets(store: Store) -> Iterator[tuple[Any, Any]]:
-    for entry in list(store.list(names.ASSETS)):
-        _, kind, digest, leaf = entry.key.split("/")
-        if leaf == "asset.json":
-            yield load_asset(store, AssetKind(kind), digest), load_check(store, AssetKind(kind), digest)
+    for kind, digest in stored_assets(store):
+        yield load_asset(store, kind, digest), load_check(store, kind, digest)
 
 
 def _records(model: type[Any], store: Store, prefix: str, suffix: str) -> Iterable[Any]:

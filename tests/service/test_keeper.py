@@ -15,7 +15,7 @@ from service.errors import QueueUnavailable, StoreUnavailable
 from service.index.index import Index
 from service.index.rebuild import differences
 from service.keeper import Keeper
-from service.library import publish_asset
+from service.library import publish_asset, stored_assets
 from service.parts import Parts
 from service.queue.memory import Delivery, MemoryQueue
 from service.queue.port import Event, EventKind
@@ -264,6 +264,13 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
     bench.queue._held[delivery.key] = delivery
     bench.pass_time(LOST_AFTER_S + 1, beating=delivery)
     assert bench.queue.waiting() == set()
+
+
+def test_files_below_an_asset_do_not_stop_a_keeper_or_a_rebuild(bench: Bench) -> None:
+    (digest, *_) = [digest for kind, digest in stored_assets(bench.parts.store) if kind is AssetKind.OBJECT]
+    bench.parts.store.put(names.object_pieces(digest, "32"), b"pieces")
+    bench.keeper.round()
+    assert differences(bench.parts.index, bench.parts.store) == []
 
 
 def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
