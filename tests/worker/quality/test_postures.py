@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import plate_hand, posture
 from worker.grasps import Posture
 from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.quality.postures import CLEARANCE_M, PALM_CLEARANCE_M, hold_forces, pregrasp, squeeze
+from worker.quality.postures import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M, hold_forces, pregrasp, squeeze
 from worker.quality.probe import Probe
 from worker.transforms import apply
 
@@ -148,3 +148,11 @@ def test_a_grasp_s_postures_do_not_depend_on_its_companions() -> None:
     alone = posture(((0, 0, -0.095), (0.4, 0.4)))
     for make in (pregrasp, squeeze):
         assert np.array_equal(make(hand, BOX, several).joint_positions[-1], make(hand, BOX, alone).joint_positions[0])
+
+
+def test_a_finger_opens_no_farther_than_its_neighbour_lets_it() -> None:
+    """Behind the left plate, 10 mm away, stands a wall that belongs to the right one; alone it would open by 50 mm."""
+    wall = piece(2, trimesh.creation.box((0.03, 0.03, 0.01)), "box", (0.03, 0.03, 0.01), (0.0, 0.0, 0.09))
+    hand = dataclasses.replace(PLATES, digest="walled", pieces=(*PLATES.pieces, wall))
+    opened = (CLOSED.joint_positions - pregrasp(hand, BOX, CLOSED).joint_positions)[0]
+    assert CLEARANCE_M < opened[0] <= 0.010 + JAM_M

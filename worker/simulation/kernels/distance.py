@@ -107,9 +107,9 @@ def self_distance(
     piece_q_in: wp.array2d(dtype=wp.quat),
     body_in: wp.array(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
-    depth_inout: wp.array(dtype=wp.float32),
+    depth_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Greatest depth of the hand's own points in pieces of bodies whose contact counts. Launch over (B, N)."""
+    """Depth (B, L) of each body in others whose contact counts, or of others in it. Launch over points (B, N)."""
     b, i = wp.tid()
     x = point_in[b, i]
     for piece in range(pieces_in.body.shape[0]):
@@ -119,4 +119,5 @@ def self_distance(
             if wp.dot(offset, offset) < bound * bound:
                 nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(piece_q_in[b, piece], offset))
                 if nd[3] < 0.0:
-                    wp.atomic_max(depth_inout, b, -nd[3])
+                    wp.atomic_max(depth_inout, b, body_in[i], -nd[3])
+                    wp.atomic_max(depth_inout, b, pieces_in.body[piece], -nd[3])
