@@ -1,0 +1,131 @@
+"""What the studies of quality share: raw grasps of a hand on an object and what is found out about them, kept on disk.
+
+A cell is one (hand, object). What a cell has found once is read again from its folder, so a study that was stopped goes
+on where it was, and two studies share their grasps and verdicts. Another folder begins anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.domain import FIDELITIES
+from worker.grasps import GraspSet, Posture
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.quality.referee.judge import judge
+from worker.quality.referee.key import Level
+
+HANDS = {
+    "allegro": "allegro/allegro_hand_right.urdf",
+    "barrett": "barrett_bh280/bh280.urdf",
+    "shadow": "shadow/shadow_hand_right.urdf",
+}
+#: Not a seed that any setting was chosen with.
+SEED = 7001
+POSTURES = ("grasp", "pregrasp", "squeeze")
+
+
+@dataclass
+class Cell:
+    """Raw standard grasps of one hand on one object."""
+
+    folder: Path
+    hand_name: str
+    object_name: str
+    hand: HandModel
+    mesh: Path
+    count: int
+
+    @cached_property
+    def obj(self) -> ObjectModel:
+        return object_from_path(self.mesh, face_error_m=FIDELITIES["standard"].face_error_m)
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time of making the grasps [s]: other programs on the machine change it less than wall time."""
+        return float(self.grasps.info["cpu_seconds"])  # type: ignore[arg-type]
+
+    @cached_property
+    def grasps(self) -> GraspSet:
+        """The raw grasps; `seconds` is the wall time of making them with their postures, `info` has the CPU time."""
+        file = self.folder / "grasps.npz"
+        if file.is_file():
+            with np.load(file) as stored:
+                parts = [Posture(stored[f"{name}_pose"], stored[f"{name}_joints"]) for name in POSTURES]
+                info: dict[str, object] = {"cpu_seconds": float(stored["cpu_seconds"])}
+                return GraspSet(*parts, stored["loss"], seconds=float(stored["seconds"]), info=info)
+        # Kernels are loaded before the clock starts.
+        synthesize(self.hand, self.obj, count=1, fidelity=FIDELITIES["draft"], seed=1, device="cpu")
+        began, cpu = time.perf_counter(), time.process_time()
+        found = synthesize(
+            self.hand, self.obj, count=self.count, fidelity=FIDELITIES["standard"], seed=SEED, device="cpu"
+        )
+        found.seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+        found.info = {"cpu_seconds": cpu}
+        arrays: dict[str, Any] = {
+            "loss": found.stability_loss, "seconds": np.array(found.seconds), "cpu_seconds": np.array(cpu)
+        }  # fmt: skip
+        for name in POSTURES:
+            part: Posture = getattr(found, name)
+            arrays |= {f"{name}_pose": part.hand_pose, f"{name}_joints": part.joint_positions}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        partial = file.with_suffix(".tmp.npz")
+        np.savez(partial, **arrays)
+        partial.replace(file)
+        return found
+
+    def verdicts(self, level: Level, hard: bool) -> dict[str, Any]:
+        """`success` of each grasp, its `reasons`, wall and CPU `seconds`, and the `terms` of the verdict."""
+
+        def make() -> dict[str, Any]:
+            grasps, began = self.grasps, time.process_time()
+            found = judge(self.hand, self.obj, grasps, level=level, hard=hard)
+            return {
+                "success": found.success.tolist(),
+                "reasons": found.reasons,
+                "seconds": found.seconds,
+                "cpu_seconds": time.process_time() - began,
+                "terms": found.terms,
+                "pieces": found.pieces,
+                "volume_ratio": found.volume_ratio,
+                "excess_mm": found.excess_m * 1e3,
+            }
+
+        return self.kept(f"{level}{'-hard' if hard else ''}", make)
+
+    def kept(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What `make` finds, from the cell's folder where it was found before."""
+        file = self.folder / f"{name}.json"
+        if not file.is_file():
+            write_json(file, make())
+        found: dict[str, Any] = json.loads(file.read_text())
+        return found
+
+
+def write_json(file: Path, value: object) -> None:
+    """Write so that a run that is killed leaves no half file."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(f".{os.getpid()}.tmp")
+    partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    partial.replace(file)
+
+
+def cells(data: Path, work: Path, hand_name: str, count: int, objects: list[str] | None = None) -> Iterator[Cell]:
+    """The cells of one hand, object by object; all objects of the data folder unless some are named."""
+    hand = hand_from_path(data / "hands" / HANDS[hand_name])
+    for mesh in sorted((data / "objects").glob("*/clean.stl")):
+        name = mesh.parent.name
+        if not objects or name in objects:
+            yield Cell(work / hand_name / name, hand_name, name, hand, mesh, count)

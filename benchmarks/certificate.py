@@ -1,0 +1,103 @@
+"""What the cheap levels of the referee cost and how often they say what the letter of the protocol says.
+
+usage: python benchmarks/certificate.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FILE]
+DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` gets the same as JSON. Stopped runs go on (see cells.py).
+Certified per second are those of both cores: held grasps over half the CPU time, which other programs disturb less
+than wall time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cells import HANDS, cells, write_json
+
+CORES = 2
+LEVELS = ("letter", "certificate", "screen")
+
+
+def wilson(good: int, total: int) -> tuple[float, float]:
+    """95 % interval of a rate."""
+    z, p = 1.96, good / total
+    middle, half = p + z * z / (2 * total), z * math.sqrt(p * (1 - p) / total + z * z / (4 * total * total))
+    return (middle - half) / (1 + z * z / total), (middle + half) / (1 + z * z / total)
+
+
+def row(found: list[dict[str, Any]], letter: np.ndarray) -> dict[str, Any]:
+    """Numbers of one level over the cells of one hand, against the letter's verdicts."""
+    held = np.concatenate([np.array(f["success"]) for f in found]) == 1
+    agree = int((held == letter).sum())
+    cpu = sum(f["cpu_seconds"] for f in found)
+    return {
+        "n": len(held),
+        "held": float(held.mean()),
+        "agreement": agree / len(held),
+        "interval": [round(bound, 4) for bound in wilson(agree, len(held))],
+        "false_accepts": int((held & ~letter).sum()),
+        "false_rejects": int((~held & letter).sum()),
+        "cpu_ms_per_raw_grasp": 1e3 * cpu / len(held),
+        "certified_per_second": CORES * float(held.sum()) / cpu,
+    }
+
+
+def study(args: argparse.Namespace, hand: str, hard: bool) -> dict[str, Any]:
+    found: dict[str, list[dict[str, Any]]] = {level: [] for level in LEVELS}
+    objects = []
+    for cell in cells(args.data, args.work, hand, args.grasps, args.objects):
+        objects.append(cell.object_name)
+        for level in LEVELS:
+            found[level].append(cell.verdicts(level, hard))  # type: ignore[arg-type]
+        sys.stderr.write(f"{hand}{' hard' if hard else ''}: {cell.object_name}\n")
+    letter = np.concatenate([np.array(f["success"]) for f in found["letter"]]) == 1
+    return {
+        "hand": hand,
+        "hard": hard,
+        "objects": objects,
+        "levels": {level: row(found[level], letter) for level in LEVELS},
+    }
+
+
+def lines(one: dict[str, Any]) -> list[str]:
+    out = []
+    for level, r in one["levels"].items():
+        low, high = (f"{100 * bound:.1f}" for bound in r["interval"])
+        agreement = "" if level == "letter" else f"{100 * r['agreement']:.1f} % ({low} to {high})"
+        wrong = "" if level == "letter" else f"{r['false_accepts']}, {r['false_rejects']}"
+        out.append(
+            f"| {one['hand']}{', hard' if one['hard'] else ''} | {level} | {r['n']} | {r['held']:.2f} | {agreement} "
+            f"| {wrong} | {r['cpu_ms_per_raw_grasp']:.0f} | {r['certified_per_second']:.0f} |"
+        )
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--grasps", type=int, default=64)
+    parser.add_argument("--hard", action="store_true", help="the hard protocol too")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    sys.stdout.write(
+        "| hand | level | n | held | agreement (95 %) | false accepts, rejects | CPU ms per raw | certified/s |\n"
+        "| --- | --- | --: | --: | --: | --: | --: | --: |\n"
+    )
+    done = []
+    for hand in args.hands:
+        for hard in (False, True) if args.hard else (False,):
+            done.append(study(args, hand, hard))
+            sys.stdout.write("\n".join(lines(done[-1])) + "\n")
+            sys.stdout.flush()
+            if args.out:
+                write_json(args.out, done)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,155 @@
+"""Quality of raw standard grasps of the three hands on all objects, by the letter of the referee's protocol.
+
+usage: python benchmarks/results_tables.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
+DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. Stopped runs go on: every
+cell (hand, object) is kept under `--work` (see cells.py); a whole run takes some hours of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cells import HANDS, SEED, Cell, cells, write_json
+
+from service.version import PACKAGE_VERSION
+from worker.quality.contact import contact_distance_consistency_mm
+from worker.quality.diversity import explained_variance
+from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.table import measure
+
+FRICTION, THRESHOLD_M, TOP, CORES = 1.0, 0.005, 10, 2
+#: Fast-Grasp'D, table 2 (YCB): means over the top 10 by epsilon of each object.
+PAPER = {
+    "barrett": {"ca_cm2": 55.7, "iv_cm3": 4.70, "epsilon": 0.23, "wrench_volume": 5.09, "sd_cm": 1.40},
+    "allegro": {"ca_cm2": 49.2, "iv_cm3": 5.62, "epsilon": 0.18, "wrench_volume": 3.42, "sd_cm": 1.66},
+    "shadow": {"ca_cm2": 58.6, "iv_cm3": 6.34, "epsilon": 0.18, "wrench_volume": 3.42, "sd_cm": 2.42},
+}
+COLUMNS = {
+    "pd_mm": "penetration_depth_mm", "spd_mm": "self_penetration_depth_mm", "ca_cm2": "contact_area_cm2",
+    "iv_cm3": "intersection_volume_cm3", "epsilon": "epsilon", "wrench_volume": "wrench_volume",
+}  # fmt: skip
+#: Columns of the printed table: key, heading, digits.
+PRINTED = (
+    ("gsr", "GSR", 2), ("gsr_hard", "hard", 2), ("sgs", "SGS", 1), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2),
+    ("cdc_mm", "CDC", 2), ("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2),
+    ("sd_cm", "SD", 2), ("diversity", "D", 2),
+)  # fmt: skip
+
+
+def metrics(cell: Cell) -> dict[str, Any]:
+    """Every metric of every grasp of a cell."""
+    grasps = cell.grasps
+    table = measure(cell.hand, cell.obj, grasps, friction=FRICTION, thresholds_m=[THRESHOLD_M])
+    found: dict[str, Any] = {key: np.ravel(table[f"quality/{name}"]).tolist() for key, name in COLUMNS.items()}
+    probe = probe_of(cell.hand, cell.obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+    near = probe.body_distance(probe.measure(grasps.grasp))
+    found["cdc_mm"] = contact_distance_consistency_mm(cell.hand, near).tolist()
+    pieces = decompose(cell.obj)
+    found["sd_cm"] = simulated_displacement_cm(cell.hand, cell.obj, grasps.grasp, pieces=pieces).tolist()
+    found["diversity"] = float(explained_variance(grasps.grasp)[0])
+    return found
+
+
+def row(cell: Cell) -> dict[str, Any]:
+    """The numbers of one object; seconds are of two cores."""
+    letter, hard = (np.array(cell.verdicts("letter", h)["success"]) == 1 for h in (False, True))
+    certificate = cell.verdicts("certificate", False)
+    quality = cell.kept("metrics", lambda: metrics(cell))
+    top = np.argsort(-np.array(quality["epsilon"]))[:TOP]
+    made, judged = cell.cpu_seconds / CORES, certificate["cpu_seconds"] / CORES
+    return {
+        "object": cell.object_name, "n": len(letter), "gsr": float(letter.mean()), "gsr_hard": float(hard.mean()),
+        "osr": float(letter.any()), "osr_hard": float(hard.any()), "held": int(letter.sum()),
+        "seconds": made, "referee_seconds": judged, "sgs": float(letter.sum() / (made + judged)),
+        "sgs_without_referee": float(letter.sum() / made),
+        **{key: float(np.median(quality[key])) for key in (*COLUMNS, "cdc_mm", "sd_cm")},
+        "diversity": quality["diversity"],
+        "top": {key: float(np.array(quality[key])[top].mean()) for key in PAPER["allegro"]},
+        "top_held": float(letter[top].mean()),
+        **{key: cell.verdicts("letter", False)[key] for key in ("pieces", "volume_ratio", "excess_mm", "terms")},
+    }  # fmt: skip
+
+
+def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """All objects in one row: rates over all grasps, means of the objects' medians."""
+    n, held = sum(r["n"] for r in rows), sum(r["held"] for r in rows)
+    made, judged = sum(r["seconds"] for r in rows), sum(r["referee_seconds"] for r in rows)
+    out = {key: float(np.mean([r[key] for r in rows])) for key, _, _ in PRINTED}
+    return out | {
+        "object": "all", "n": n, "gsr": held / n, "gsr_hard": sum(r["gsr_hard"] * r["n"] for r in rows) / n,
+        "osr": float(np.mean([r["osr"] for r in rows])), "osr_hard": float(np.mean([r["osr_hard"] for r in rows])),
+        "sgs": held / (made + judged), "sgs_without_referee": held / made,
+        "top": {key: float(np.mean([r["top"][key] for r in rows])) for key in PAPER["allegro"]},
+        "top_held": float(np.mean([r["top_held"] for r in rows])),
+    }  # fmt: skip
+
+
+def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], command: str) -> str:
+    head = f"| object | {' | '.join(heading for _, heading, _ in PRINTED)} |"
+    body = [
+        f"| {bold}{r['object']}{bold} | " + " | ".join(f"{bold}{r[key]:.{d}f}{bold}" for key, _, d in PRINTED) + " |"
+        for r, bold in [*((r, "") for r in rows), (total, "**")]
+    ]
+    paper, ours = PAPER[hand], total["top"]
+    names = {"ca_cm2": "CA cm²", "epsilon": "ε", "wrench_volume": "Vol", "iv_cm3": "IV cm³", "sd_cm": "SD cm"}
+    versus = [f"| {label} | {ours[key]:.2f} | {paper[key]:.2f} |" for key, label in names.items()]
+    return "\n".join(
+        [
+            f"# Quality of {hand.capitalize()} grasps",
+            "",
+            f"graspd {PACKAGE_VERSION}, `{command}`: {rows[0]['n']} raw grasps on each of {len(rows)} objects, "
+            f"real URDF, standard fidelity, seed {SEED}. Referee: MuJoCo, DexGraspBench protocol, level *letter*.",
+            "",
+            f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
+            f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
+            f"{total['sgs_without_referee']:.1f} without the referee.**",
+            "",
+            head,
+            "| --- |" + " --: |" * len(PRINTED),
+            *body,
+            "",
+            "GSR: share that holds, normal and at half the friction. SGS: holding grasps per second, made and judged "
+            "(level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, self-penetration mm. "
+            "CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm and μ = 1. IV cm³. "
+            "SD: simulated displacement cm. D: variance explained by the first component. Medians; the last row has "
+            "rates over all grasps and means of the medians.",
+            "",
+            f"Best {TOP} by ε of each object, means, as in table 2 of the paper (YCB objects there):",
+            "",
+            "| | graspd | Fast-Grasp'D |",
+            "| --- | --: | --: |",
+            *versus,
+            f"| held by the letter | {total['top_held']:.2f} | - |",
+            "",
+        ]
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--grasps", type=int, default=64)
+    parser.add_argument("--out", type=Path, default=Path("docs/results"))
+    args = parser.parse_args()
+    for hand in args.hands:
+        rows = []
+        for cell in cells(args.data, args.work, hand, args.grasps, args.objects):
+            rows.append(row(cell))
+            sys.stderr.write(f"{hand} {cell.object_name}: GSR {rows[-1]['gsr']:.2f}, hard {rows[-1]['gsr_hard']:.2f}\n")
+        total = whole(rows)
+        command = f"python benchmarks/results_tables.py DATA --hands {hand}"
+        write_json(args.out / f"quality-{hand}.json", {"hand": hand, "all": total, "objects": rows, "command": command})
+        (args.out / f"quality-{hand}.md").write_text(markdown(hand, rows, total, command))
+
+
+if __name__ == "__main__":
+    main()
