@@ -1,8 +1,10 @@
-"""Forms of the pages: submit, cancel, retry. They work without JavaScript and answer with a page."""
+"""The form of a job and what its buttons do: submit, cancel, retry. They work without JavaScript and answer a page."""
 
 from __future__ import annotations
 
+import json
 import time
+from dataclasses import dataclass
 from typing import Any, Final
 
 from fastapi import APIRouter, Depends, Request
@@ -15,6 +17,8 @@ from api.catalog import Catalog
 from api.dashboard.rendering import render
 from api.dependencies import CatalogOf, may_read, may_submit
 from api.routes.assets import store_upload
+from service.datasets.cost import estimate
+from service.datasets.spec import Matrix
 from service.domain import OFFERED, AssetKind, JobRequest
 from service.errors import GraspdError, InputError
 from service.index.views import AssetView
@@ -22,24 +26,42 @@ from service.index.views import AssetView
 router = APIRouter(include_in_schema=False)
 
 _CHECK_WAIT_S: Final = 15.0
+UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
 
-_DEFAULTS: Final[dict[str, Any]] = {
+DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
-    "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240,
+    "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240, "want": "valid", "referee": "certificate",
 }  # fmt: skip
+FIDELITY_WORDS: Final = {
+    "draft": "Fewest points and starts. For a first look.",
+    "standard": "The balance that the docs measure.",
+    "fine": "More starts, more points. Contacts that hold up.",
+}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a fidelity is expected to cost and give."""
+
+    name: str
+    words: str
+    seconds: float | None
+    """One worker's time for the whole job [s]; None: not known."""
+    valid_yield: float | None
+    origin: str
 
 
 @router.get("/submit", dependencies=[Depends(may_read)])
 def submit_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
     """The form; parameters of the address fill it in."""
-    given = {key: value for key, value in request.query_params.items() if key in _DEFAULTS}
-    return _form(request, catalog, _DEFAULTS | given)
+    given = {key: value for key, value in request.query_params.items() if key in DEFAULTS}
+    return _form(request, catalog, DEFAULTS | given)
 
 
 @router.post("/submit", dependencies=[Depends(may_submit)], response_model=None)
 async def submit(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
-    """Submit what the form says, after the upload of a mesh if there is one."""
-    async with request.form(max_files=1, max_fields=20) as fields:
+    """Submit what the form says, after the upload of a hand or a mesh if there is one."""
+    async with request.form(max_files=2, max_fields=24) as fields:
         return await run_in_threadpool(_submit, request, catalog, fields)
 
 
@@ -67,29 +89,49 @@ def first_message(error: ValueError) -> str:
     return str(error)
 
 
+def asset_choices(catalog: Catalog, kind: AssetKind) -> list[tuple[str, str]]:
+    """Names to choose from, with a word on those that cannot be used now."""
+    try:
+        assets = catalog.assets(kind, limit=200).items
+    except GraspdError:
+        return []
+    notes = {"refuse": " (refused)", None: " (being checked)"}
+    # Of several versions of a name the newest is meant.
+    newest = {asset.name: asset for asset in reversed(assets)}
+    return [(name, name + ("" if one.builtin else notes.get(one.verdict, ""))) for name, one in sorted(newest.items())]
+
+
 def _submit(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
     form: dict[str, Any] = {
-        name: fields[name] for name in _DEFAULTS if isinstance(fields.get(name), str) and fields[name] != ""
+        name: fields[name] for name in DEFAULTS if isinstance(fields.get(name), str) and fields[name] != ""
     }
     form["stereo"] = fields.get("stereo") == "true"
-    shown = _DEFAULTS | form
+    shown = DEFAULTS | form
     try:
         body = JobRequest.model_validate(form)
     except ValidationError as error:
         return _form(request, catalog, shown, errors=_by_field(error), status=422)
     try:
-        file = fields.get("file")
-        if isinstance(file, UploadFile) and file.filename:
-            limit = request.app.state.settings.max_upload_bytes
-            asset = store_upload(catalog, AssetKind.OBJECT, file, None, limit_bytes=limit)
-            shown |= {"object": asset.name}
-            body = body.model_copy(update={"object": asset.name})
-            _await_check(catalog, asset)
+        for kind, field in ((AssetKind.HAND, "hand_file"), (AssetKind.OBJECT, "file")):
+            if (asset := _upload(request, catalog, fields, kind, field)) is not None:
+                shown |= {kind.value: asset.name}
+                body = body.model_copy(update={kind.value: asset.name})
+                _await_check(catalog, asset)
         job = catalog.submit(body)
     except InputError as error:
         problem = {"title": error.title, "detail": str(error)}
         return _form(request, catalog, shown, problem=problem, status=error.status)
     return RedirectResponse(f"/jobs/{job.id}", status_code=303)
+
+
+def _upload(request: Request, catalog: Catalog, fields: FormData, kind: AssetKind, field: str) -> AssetView | None:
+    file = fields.get(field)
+    if not isinstance(file, UploadFile) or not file.filename:
+        return None
+    units = fields.get("units")
+    options = json.dumps({"units": units}) if kind is AssetKind.OBJECT and units in dict(UNITS) and units != "m" else ""
+    limit = request.app.state.settings.max_upload_bytes
+    return store_upload(catalog, kind, file, None, limit_bytes=limit, options=options)
 
 
 def _await_check(catalog: Catalog, asset: AssetView) -> None:
@@ -109,6 +151,24 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     return errors
 
 
+def _expected(catalog: Catalog, form: dict[str, Any]) -> list[Expected]:
+    """Time and yield of each fidelity for what the form says, from what was measured here or stored."""
+    found = []
+    for name in OFFERED:
+        wanted = {key: value for key, value in form.items() if key not in ("hand", "object", "fidelity")}
+        try:
+            matrix = Matrix.model_validate(
+                wanted | {"hands": (form["hand"],), "objects": (form["object"],), "fidelity": name}
+            )
+            cost = estimate(catalog.parts.index, matrix)
+            rate = cost.rates[0] if cost.rates else None
+            share, origin = (rate.valid_yield, rate.origin) if rate else (None, "")
+            found.append(Expected(name, FIDELITY_WORDS[name], cost.seconds, share, origin))
+        except (ValidationError, GraspdError):
+            found.append(Expected(name, FIDELITY_WORDS[name], None, None, ""))
+    return found
+
+
 def _form(
     request: Request,
     catalog: Catalog,
@@ -124,19 +184,11 @@ def _form(
         status=status,
         page="/submit",
         form=form,
-        errors=dict.fromkeys([*_DEFAULTS, "file"], "") | (errors or {}),
+        errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
         problem=problem,
-        hands=_choices(catalog, AssetKind.HAND),
-        objects=_choices(catalog, AssetKind.OBJECT),
-        fidelities=[(name, name) for name in OFFERED],
+        hands=asset_choices(catalog, AssetKind.HAND),
+        objects=asset_choices(catalog, AssetKind.OBJECT),
+        expected=_expected(catalog, form),
+        units=UNITS,
         max_upload=request.app.state.settings.max_upload_bytes,
     )
-
-
-def _choices(catalog: Catalog, kind: AssetKind) -> list[tuple[str, str]]:
-    try:
-        assets = catalog.assets(kind, limit=200).items
-    except GraspdError:
-        return []
-    notes = {"refuse": " (refused)", None: " (being checked)"}
-    return [(asset.name, asset.name + ("" if asset.builtin else notes.get(asset.verdict, ""))) for asset in assets]

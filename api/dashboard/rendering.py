@@ -14,6 +14,13 @@ from service.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
+NAVIGATION: Final = (
+    ("/", "Home"),
+    ("/datasets", "Datasets"),
+    ("/grasps", "Grasps"),
+    ("/workers", "Workers"),
+    ("/chart", "Chart"),
+)
 
 
 def environment() -> Environment:
@@ -32,7 +39,7 @@ def environment() -> Environment:
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
     """A page. `page` marks the place in the navigation, `events` the stream that moves it."""
     context = {"page": "", "events": "", "refresh_s": 0, "health": request.app.state.catalog.health()} | context
-    context |= {"version": PACKAGE_VERSION, "signed_in": not request.app.state.keys.is_open}
+    context |= {"navigation": NAVIGATION, "version": PACKAGE_VERSION, "signed_in": not request.app.state.keys.is_open}
     text = request.app.state.templates.get_template(template).render(context)
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from api.models import JobDetail
+from api.models import GraspDetail, JobDetail, Shard
 
 
 def loader(job: JobDetail, base_url: str) -> str:
@@ -28,3 +28,14 @@ def curl(job: JobDetail, base_url: str) -> str:
     base = base_url.rstrip("/")
     lines = [f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base}{shard.file}" for shard in job.shards]
     return "\n".join(lines)
+
+
+def grasp_loader(grasp: GraspDetail, shard: Shard, base_url: str) -> str:
+    """Python that reads one grasp out of its shard."""
+    return f"""import io, urllib.request
+import h5py
+
+url = "{base_url.rstrip("/")}{shard.file}"
+with h5py.File(io.BytesIO(urllib.request.urlopen(url).read())) as shard:
+    pose = shard["grasp/hand_pose"][{grasp.row}]           # x y z [m], quaternion w x y z
+    joints = shard["grasp/joint_positions"][{grasp.row}]   # rad or m"""

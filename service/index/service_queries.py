@@ -61,7 +61,7 @@ class ServiceQueries(Database):
     def stats(self) -> Stats:
         """The whole service in a few numbers."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
-        sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.size_bytes))
+        sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
         with self.reading() as connection:
             of_jobs = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
             of_tasks = connection.execute(select(tasks.c.state, func.count()).group_by(tasks.c.state)).all()
@@ -70,14 +70,15 @@ class ServiceQueries(Database):
                 for kind, *row in connection.execute(select(shards.c.kind, *sums).group_by(shards.c.kind))
             }
             living = connection.scalar(alive)
-        _, made, valid, _ = of_shards.get("base", (0, 0, 0, 0))
+        _, made, valid, tried, _ = of_shards.get("base", (0, 0, 0, 0, 0))
         return Stats(
             jobs=_by_state(of_jobs),
             tasks=_by_state(of_tasks),
             grasps=made,
             valid=valid,
+            tried=tried,
             shards=sum(row[0] for row in of_shards.values()),
-            bytes=sum(row[3] for row in of_shards.values()),
+            bytes=sum(row[4] for row in of_shards.values()),
             workers=int(living or 0),
         )
 

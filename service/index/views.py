@@ -195,6 +195,7 @@ class Stats(View):
     tasks: dict[State, int]
     grasps: int
     valid: int
+    tried: int = Field(0, description="grasps planned for them, kept or not")
     shards: int
     bytes: int
     workers: int

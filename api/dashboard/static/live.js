@@ -10,11 +10,13 @@
       const size = Math.abs(seconds);
       const [unit, length] = size < 60 ? ["second", 1] : size < 3600 ? ["minute", 60] : size < 86400 ? ["hour", 3600] : ["day", 86400];
       element.textContent = size < 5 ? "just now" : relative.format(Math.round(seconds / length), unit);
-      element.title = new Date(element.dateTime).toLocaleString();
+      element.title = new Date(element.dateTime).toLocaleString([], { dateStyle: "medium", timeStyle: "medium" });
     }
   }
 
   function swap(text) {
+    let changed = false;
+    document.dispatchEvent(new Event("graspd:swapping"));
     const fresh = new DOMParser().parseFromString(text, "text/html");
     for (const region of document.querySelectorAll("[data-live]")) {
       const next = fresh.getElementById(region.id);
@@ -23,8 +25,12 @@
       const was = next.outerHTML;
       sayTimes(next);
       region.replaceWith(document.adoptNode(next));
-      document.getElementById(next.id).dataset.was = was;
+      const shown = document.getElementById(next.id);
+      shown.dataset.was = was;
+      showCopies(shown);
+      changed = true;
     }
+    if (changed) document.dispatchEvent(new Event("graspd:swapped"));
   }
 
   let pending = null;
@@ -55,8 +61,13 @@
     }, () => {});
   });
 
-  for (const button of document.querySelectorAll("button[data-copy]")) button.hidden = false;
+  function showCopies(root) {
+    for (const button of root.querySelectorAll("button[data-copy]")) button.hidden = false;
+  }
+
+  showCopies(document);
   sayTimes(document);
   setInterval(() => sayTimes(document), 15000);
+  document.addEventListener("htmx:after:swap", () => sayTimes(document));
   if (document.body.dataset.events) watch();
 })();

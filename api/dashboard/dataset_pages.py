@@ -1,0 +1,231 @@
+"""Datasets: the hand x object matrix of all work and of each dataset, and what is done to chosen cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, Final
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData
+
+from api.catalog import Catalog
+from api.dashboard import matrix
+from api.dashboard.forms import asset_choices, first_message
+from api.dashboard.rendering import render
+from api.dependencies import CatalogOf, may_read, may_submit
+from service.datasets import actions
+from service.datasets.spec import DatasetRequest
+from service.domain import OFFERED, AssetKind, JobRequest, State
+from service.errors import ConflictError, InputError
+from service.index.dataset_views import CellView
+
+PAGE_SIZE: Final = 20
+#: A matrix of more cells is shown as a list, a page at a time: nobody reads a table of ten thousand fields.
+MATRIX_CELLS: Final = 1000
+_CELLS_AT_ONCE: Final = 200
+_MAX_FIELDS: Final = 4000
+_DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
+
+router = APIRouter(prefix="/datasets", include_in_schema=False)
+
+
+@router.get("", dependencies=[Depends(may_read)])
+def datasets_page(
+    request: Request,
+    catalog: CatalogOf,
+    cursor: Annotated[str | None, Query(max_length=512)] = None,
+) -> HTMLResponse:
+    """All datasets, and every hand on every object that the service knows."""
+    return _overview(request, catalog, cursor=cursor)
+
+
+@router.post("", dependencies=[Depends(may_submit)], response_model=None)
+async def create(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
+    """Make a dataset of the form."""
+    async with request.form(max_fields=_MAX_FIELDS) as fields:
+        return await run_in_threadpool(_create, request, catalog, fields)
+
+
+@router.post("/cells", dependencies=[Depends(may_submit)], response_model=None)
+async def act_on_pairs(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
+    """Submit, retry or cancel the jobs of chosen pairs."""
+    async with request.form(max_fields=_MAX_FIELDS) as fields:
+        return await run_in_threadpool(_act_on_pairs, request, catalog, fields)
+
+
+@router.get("/{name}", dependencies=[Depends(may_read)])
+def dataset_page(
+    request: Request,
+    name: str,
+    catalog: CatalogOf,
+    state: str = "",
+    cursor: Annotated[str | None, Query(max_length=512)] = None,
+) -> HTMLResponse:
+    """One dataset: its matrix, its progress, its snapshots."""
+    index = catalog.parts.index
+    dataset = index.dataset(name)
+    chosen = State(state) if state in set(State) else None
+    as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
+    page = None if as_matrix else index.dataset_cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
+    cells = _all_cells(catalog, name) if page is None else page.items
+    return render(
+        request,
+        "dataset.html",
+        page="/datasets",
+        events="" if dataset.state.is_final else "/events",
+        refresh_s=0 if dataset.state.is_final else 5,
+        dataset=dataset,
+        grid=matrix.of_dataset(dataset, cells) if as_matrix else None,
+        cells=cells,
+        chosen=chosen or "",
+        next=page.next if page else None,
+        snapshots=index.snapshots(name, limit=10).items,
+        did=_did(request),
+    )
+
+
+@router.post("/{name}/cells", dependencies=[Depends(may_submit)])
+async def act_on_cells(request: Request, name: str, catalog: CatalogOf) -> RedirectResponse:
+    """Retry or cancel the jobs of chosen cells of a dataset."""
+    async with request.form(max_fields=_MAX_FIELDS) as fields:
+        return await run_in_threadpool(_act_on_cells, catalog, name, fields)
+
+
+@router.post("/{name}/{action}", dependencies=[Depends(may_submit)], response_model=None)
+def act(request: Request, name: str, action: str, catalog: CatalogOf) -> RedirectResponse | HTMLResponse:
+    """Cancel or retry a whole dataset, or take a snapshot of it."""
+    do: dict[str, Callable[..., Any]] = {
+        "cancel": actions.cancel,
+        "retry": actions.retry,
+        "snapshot": actions.snapshot,
+    }
+    if action not in do:
+        raise InputError(f"a dataset has no action {action!r}; it can be cancelled, retried or taken as a snapshot")
+    do[action](catalog.parts, name)
+    return _redirect(f"/datasets/{name}", action, done=1)
+
+
+def _create(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
+    form = {key: str(fields[key]) for key in ("name", "grasps", "fidelity") if fields.get(key)}
+    wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
+    try:
+        dataset, _ = actions.create(catalog.parts, DatasetRequest.model_validate(wanted))
+    except (ValidationError, InputError) as error:
+        message = first_message(error) if isinstance(error, ValidationError) else str(error)
+        return _overview(request, catalog, problem=message, form=wanted, status=422)
+    return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
+
+
+def _act_on_pairs(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
+    action = str(fields.get("action", ""))
+    pairs = [(hand, obj) for cell in fields.getlist("cell") for hand, _, obj in [str(cell).partition("|")] if obj]
+    try:
+        if action == "submit":
+            options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
+            wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
+            done, left = _each(catalog.submit, wanted)
+        else:
+            done, left = _each(_job_action(catalog, action), _jobs_of(catalog, pairs, action))
+    except (ValidationError, InputError) as error:
+        message = first_message(error) if isinstance(error, ValidationError) else str(error)
+        return _overview(request, catalog, problem=message, status=422)
+    return _redirect("/datasets", action, done=done, left=left)
+
+
+def _act_on_cells(catalog: Catalog, name: str, fields: FormData) -> RedirectResponse:
+    action = str(fields.get("action", ""))
+    done, left = _each(_job_action(catalog, action), [str(cell) for cell in fields.getlist("cell")])
+    return _redirect(f"/datasets/{name}", action, done=done, left=left)
+
+
+def _job_action(catalog: Catalog, action: str) -> Callable[[str], Any]:
+    if action == "retry":
+        return catalog.retry
+    if action == "cancel":
+        return catalog.cancel
+    raise InputError(f"cells have no action {action!r}; they can be submitted, retried or cancelled")
+
+
+def _jobs_of(catalog: Catalog, pairs: Iterable[tuple[str, str]], action: str) -> list[str]:
+    states = (State.FAILED, State.CANCELLED) if action == "retry" else (State.QUEUED, State.RUNNING)
+    return [
+        job.id
+        for hand, obj in pairs
+        for state in states
+        for job in catalog.parts.index.jobs(state=state, hand=hand, object=obj, limit=_CELLS_AT_ONCE).items
+    ]
+
+
+def _each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
+    """How many took the action, and how many were in a state that has no use for it."""
+    done = left = 0
+    for one in wanted:
+        try:
+            do(one)
+            done += 1
+        except ConflictError:
+            left += 1
+    return done, left
+
+
+def _redirect(address: str, action: str, *, done: int, left: int = 0) -> RedirectResponse:
+    return RedirectResponse(f"{address}?{urlencode({'did': action, 'done': done, 'left': left})}", status_code=303)
+
+
+def _did(request: Request) -> str:
+    """What the last action did, in words."""
+    given = request.query_params
+    done, left = given.get("done", ""), given.get("left", "0")
+    if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
+        return ""
+    if given["did"] == "snapshot":
+        return "The snapshot is taken; it lists every shard of now."
+    what = "job" if done == "1" else "jobs"
+    words = f"{done} {what} {_DONE[given['did']]}"
+    return words + (f"; {left} left as they are, in a state that has no use for it" if left != "0" else "") + "."
+
+
+def _all_cells(catalog: Catalog, name: str) -> list[CellView]:
+    cells: list[CellView] = []
+    cursor = None
+    while True:
+        page = catalog.parts.index.dataset_cells(name, limit=_CELLS_AT_ONCE, cursor=cursor)
+        cells += page.items
+        cursor = page.next
+        if cursor is None:
+            return cells
+
+
+def _overview(
+    request: Request,
+    catalog: Catalog,
+    *,
+    cursor: str | None = None,
+    problem: str = "",
+    form: dict[str, Any] | None = None,
+    status: int = 200,
+) -> HTMLResponse:
+    hands, objects = (asset_choices(catalog, kind) for kind in (AssetKind.HAND, AssetKind.OBJECT))
+    index = catalog.parts.index
+    page = index.datasets(limit=PAGE_SIZE, cursor=cursor)
+    return render(
+        request,
+        "datasets.html",
+        status=status,
+        page="/datasets",
+        events="/events",
+        refresh_s=10,
+        datasets=page.items,
+        next=page.next,
+        grid=matrix.of_service(index.matrix(), [name for name, _ in hands], [name for name, _ in objects]),
+        hands=hands,
+        objects=objects,
+        fidelities=OFFERED,
+        form={"name": "", "grasps": "320", "fidelity": "standard", "hands": [], "objects": []} | (form or {}),
+        problem=problem,
+        did=_did(request),
+    )

@@ -1,0 +1,116 @@
+"""The pages of grasps: the list with its filters, and one grasp in 3D."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import HTMLResponse
+
+from api.dashboard import snippets
+from api.dashboard.forms import first_message
+from api.dashboard.rendering import render
+from api.dependencies import CatalogOf, may_read
+from api.models import GraspDetail, GraspQuery
+from api.paging import next_address
+from service.domain import AssetKind
+
+PAGE_SIZES: Final = {"cards": 24, "table": 50}
+#: Sort key, label, unit of the metrics that lists of grasps show.
+COLUMNS: Final = (
+    ("epsilon", "ε", ""),
+    ("contact_area_cm2", "Contact area", "cm²"),
+    ("intersection_volume_cm3", "Intersection", "cm³"),
+    ("penetration_depth_mm", "Penetration", "mm"),
+)
+#: Metrics of which less is better: a first click sorts them upwards.
+_LESS_IS_BETTER: Final = frozenset({"intersection_volume_cm3", "penetration_depth_mm"})
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.get("/grasps", dependencies=[Depends(may_read)])
+def grasps_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+    """Every grasp of the index: filters, order, pages. The address holds all of it."""
+    given = {key: value for key, value in request.query_params.items() if value}
+    cursor, view = given.pop("cursor", None), given.pop("view", "cards")
+    view = view if view in PAGE_SIZES else "cards"
+    problem, page, query = "", None, GraspQuery()
+    try:
+        query = GraspQuery.model_validate(given)
+        page = catalog.grasps(query, limit=PAGE_SIZES[view], cursor=cursor)
+    except ValueError as error:
+        problem = first_message(error)
+    rows = page.items if page else []
+    return render(
+        request,
+        "grasps.html",
+        status=422 if problem else 200,
+        page="/grasps",
+        filters={name: given.get(name, "") for name in GraspQuery.model_fields},
+        filtered=bool(set(given) - {"sort", "order"}),
+        problem=problem,
+        hands=_names(catalog, AssetKind.HAND),
+        objects=_names(catalog, AssetKind.OBJECT),
+        rows=rows,
+        models=catalog.parts.index.assets_of_shards({grasp.shard_id for grasp in rows}) if view == "cards" else {},
+        columns=COLUMNS,
+        sort=query.sort,
+        sorts=[(key, label) for key, label, _ in COLUMNS],
+        order=query.order,
+        descending=query.order == "desc",
+        links={key: _sort_link(request, query, key) for key, _, _ in COLUMNS},
+        show_pair=True,
+        view=view,
+        views=[(name, _view_link(request, name)) for name in PAGE_SIZES],
+        next=next_address(request, page.next) if page and page.next else None,
+        limit=PAGE_SIZES[view],
+    )
+
+
+@router.get("/grasps/{shard_id}/{row}", dependencies=[Depends(may_read)])
+def grasp_page(request: Request, shard_id: str, row: int, catalog: CatalogOf) -> HTMLResponse:
+    """One grasp: 3D, verdict, quality, and where it is kept."""
+    grasp, shard = catalog.grasp(shard_id, row), catalog.shard(shard_id)
+    return render(
+        request,
+        "grasp.html",
+        page="/grasps",
+        grasp=grasp,
+        shard=shard,
+        job=catalog.parts.index.job_of_shard(shard_id),
+        metrics=_metrics(grasp),
+        loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
+    )
+
+
+def _metrics(grasp: GraspDetail) -> list[tuple[str, float | None, str]]:
+    return [
+        ("ε (Ferrari-Canny)", grasp.epsilon, ""),
+        ("Wrench space volume", grasp.wrench_volume, ""),
+        ("Contact area", grasp.contact_area_cm2, "cm²"),
+        ("Intersection volume", grasp.intersection_volume_cm3, "cm³"),
+        ("Penetration", grasp.penetration_depth_mm, "mm"),
+        ("Self-penetration", grasp.self_penetration_depth_mm, "mm"),
+        ("Stability loss", grasp.stability_loss, ""),
+    ]
+
+
+def _names(catalog: CatalogOf, kind: AssetKind) -> list[tuple[str, str]]:
+    names = sorted({asset.name for asset in catalog.assets(kind, limit=200).items})
+    return [(name, name) for name in names]
+
+
+def _sort_link(request: Request, query: GraspQuery, key: str) -> str:
+    order = "asc" if key in _LESS_IS_BETTER else "desc"
+    if query.sort == key:
+        order = "asc" if query.order == "desc" else "desc"
+    url = request.url.remove_query_params("cursor").include_query_params(sort=key, order=order)
+    return f"{url.path}?{url.query}"
+
+
+def _view_link(request: Request, view: str) -> str:
+    url: Any = request.url.remove_query_params(["cursor", "view"])
+    if view != "cards":
+        url = url.include_query_params(view=view)
+    return f"{url.path}?{url.query}" if url.query else str(url.path)

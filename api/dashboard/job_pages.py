@@ -1,0 +1,87 @@
+"""The page of one job: stages, loss, quality, views, best grasps, attempts, files; and the pictures it shows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.responses import HTMLResponse
+
+from api.dashboard import charts, snippets
+from api.dashboard.grasp_pages import COLUMNS
+from api.dashboard.pictures import Channel
+from api.dashboard.rendering import render
+from api.dependencies import CatalogOf, may_read
+from api.models import GraspQuery, JobDetail
+
+_SHOWN_PICTURES: Final = 8
+_SHOWN_GRASPS: Final = 8
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.get("/jobs/{job_id}", dependencies=[Depends(may_read)])
+def job_page(request: Request, job_id: str, catalog: CatalogOf) -> HTMLResponse:
+    """All of one job."""
+    job = catalog.job(job_id)
+    pictures = _pictures(job)
+    shown = {key: (label, unit) for key, label, unit in COLUMNS}
+    rows = catalog.grasps(GraspQuery(job=job_id, valid=True), limit=_SHOWN_GRASPS).items if job.valid else []
+    where = {"job": job_id, "valid": "true"}
+    return render(
+        request,
+        "job.html",
+        events="" if job.state.is_final else f"/v1/jobs/{job.id}/events",
+        refresh_s=0 if job.state.is_final else 3,
+        job=job,
+        histograms=[
+            (*shown[data.metric], data, charts.bars(data, "/grasps", where))
+            for data in (catalog.histograms(job_id, job.valid) if job.valid else [])
+        ],
+        loss=_loss(catalog, job),
+        pictures=pictures[:_SHOWN_PICTURES],
+        picture_count=len(pictures),
+        rows=rows,
+        models=dict.fromkeys((grasp.shard_id for grasp in rows), (job.hand_digest, job.object_digest)),
+        columns=COLUMNS,
+        sort="epsilon",
+        shards=job.shards,
+        loader=snippets.loader(job, str(request.base_url)),
+        curl=snippets.curl(job, str(request.base_url)),
+    )
+
+
+@router.get("/shards/{shard_id}/pictures/{index}.png", dependencies=[Depends(may_read)])
+def picture(
+    request: Request,
+    shard_id: str,
+    index: int,
+    catalog: CatalogOf,
+    channel: Channel = "rgb",
+    width: Annotated[int | None, Query(ge=16, le=4096)] = None,
+) -> Response:
+    """One rendered view as a PNG: colour, depth or segmentation, whole or no wider than `width` pixels."""
+    data = request.app.state.pictures.png(catalog.shard(shard_id).key, index, channel, width)
+    return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
+
+
+def _loss(catalog: CatalogOf, job: JobDetail) -> charts.Plot | None:
+    curve = catalog.loss_curve(job)
+    if curve is None:
+        return None
+    return charts.line(curve.iterations, curve.losses, x="iteration", y="Loss", log=True)
+
+
+def _pictures(job: JobDetail) -> list[dict[str, Any]]:
+    """Every rendered picture; of a stereo pair the left one comes first."""
+    eyes = ("left", "right") if job.request.stereo else ("",)
+    return [
+        {
+            "address": f"/shards/{shard.id}/pictures/{index}.png",
+            "label": f"View {index // len(eyes) + 1} {eyes[index % len(eyes)]}".strip(),
+            "shard": shard.id,
+        }
+        for shard in job.shards
+        if shard.kind == "views"
+        for index in range(shard.count)
+    ]

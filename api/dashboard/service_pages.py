@@ -1,0 +1,126 @@
+"""The pages of the service as a whole: home, workers, the chart of speed against accuracy."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime, timedelta
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse
+
+from api.catalog import Catalog
+from api.dashboard import charts, tradeoff
+from api.dashboard.rendering import render
+from api.dependencies import CatalogOf, may_read
+from api.models import STAGE_LABELS
+from service.domain import State
+from service.errors import NotFoundError, UnavailableError
+from service.index.dataset_views import DatasetView
+from service.index.views import TaskView, WorkerView
+
+PAGE_SIZE: Final = 25
+_LOST_SHOWN: Final = timedelta(minutes=10)
+_MINUTES: Final = 60
+_DATASETS: Final = 6
+
+router = APIRouter(include_in_schema=False)
+
+
+@router.get("/", dependencies=[Depends(may_read)])
+def home(
+    request: Request,
+    catalog: CatalogOf,
+    state: str = "",
+    cursor: Annotated[str | None, Query(max_length=512)] = None,
+) -> HTMLResponse:
+    """Health, throughput, jobs, queue, workers, failures."""
+    chosen = State(state) if state in set(State) else None
+    minutes = catalog.valid_per_minute(minutes=_MINUTES)
+    start = time.time() // 60 * 60 - 60 * (_MINUTES - 1)
+    return render(
+        request,
+        "home.html",
+        page="/",
+        events="/events",
+        refresh_s=5,
+        chosen=chosen or "",
+        stats=catalog.stats(),
+        minutes=minutes,
+        pace=charts.minutes(minutes, start),
+        jobs=catalog.jobs(state=chosen, limit=PAGE_SIZE, cursor=cursor),
+        stages=stage_depths(catalog),
+        workers=[worker for worker in catalog.workers() if is_recent(worker)],
+        failures=catalog.failures(limit=4),
+        datasets=_latest_datasets(catalog),
+    )
+
+
+@router.get("/workers", dependencies=[Depends(may_read)])
+def workers_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+    """Who works on what, on which device, and since when."""
+    workers = [worker for worker in catalog.workers() if is_recent(worker)]
+    return render(
+        request,
+        "workers.html",
+        page="/workers",
+        events="/events",
+        refresh_s=5,
+        workers=workers,
+        tasks={worker.name: task for worker in workers if (task := _task_of(catalog, worker)) is not None},
+        busy=sum(worker.state == "busy" for worker in workers),
+        alive=sum(worker.state != "lost" for worker in workers),
+        stages=stage_depths(catalog),
+    )
+
+
+@router.get("/chart", dependencies=[Depends(may_read)])
+def chart_page(request: Request, catalog: CatalogOf, y: str = "gsr", hand: str = "", object: str = "") -> HTMLResponse:
+    """Speed against accuracy of methods and fidelities, as `graspd chart` measured them last."""
+    measured = tradeoff.load(catalog.store)
+    axis = y if y in tradeoff.AXES else "gsr"
+    return render(
+        request,
+        "chart.html",
+        page="/chart",
+        measured=measured,
+        chart=tradeoff.draw(measured, axis=axis, hand=hand, object=object) if measured else None,
+        axes=tradeoff.AXES,
+        axis=axis,
+        hand=hand,
+        object=object,
+    )
+
+
+def is_recent(worker: WorkerView) -> bool:
+    """A worker that is lost stays on the page for a while, so that somebody sees it."""
+    age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
+    return worker.state != "lost" or age < _LOST_SHOWN
+
+
+def stage_depths(catalog: Catalog) -> list[tuple[str, int]]:
+    """Waiting tasks by stage; empty where Redis does not answer, which the page says elsewhere."""
+    try:
+        depths = catalog.depths()
+    except UnavailableError:
+        return []
+    totals = dict.fromkeys(STAGE_LABELS, 0)
+    for (_, stage), waiting in depths.items():
+        totals[stage] += waiting
+    return [(STAGE_LABELS[stage], waiting) for stage, waiting in totals.items()]
+
+
+def _latest_datasets(catalog: Catalog) -> list[DatasetView]:
+    """The newest datasets, those still at work first."""
+    newest = catalog.parts.index.datasets(limit=_DATASETS).items
+    return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
+
+
+def _task_of(catalog: Catalog, worker: WorkerView) -> TaskView | None:
+    """What a worker does; a check of an upload is no task of the index."""
+    if worker.state != "busy" or not worker.task_id:
+        return None
+    try:
+        return catalog.parts.index.task(worker.task_id)
+    except NotFoundError:
+        return None
