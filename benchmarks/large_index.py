@@ -57,6 +57,9 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
     maker = _Maker(index, grasps // jobs, jobs, np.random.default_rng(seed))
     with index.writing() as connection:
         maker.insert(connection)
+    with index.reading() as connection:
+        if connection.dialect.name == "postgresql":  # which does so by itself in a while
+            connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM ANALYZE")
     return maker.counts
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -344,9 +345,63 @@ def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts) -> None:
 def test_a_pair_is_found_whichever_way_the_database_goes(
     parts: Parts, monkeypatch: pytest.MonkeyPatch, sorted_at_once: int
 ) -> None:
-    monkeypatch.setattr("service.index.grasp_queries._SORTED_AT_ONCE", sorted_at_once)
+    monkeypatch.setattr("service.index.grasp_search.SORTED_AT_ONCE", sorted_at_once)
     job, _ = pipeline.submit(parts, request())
     run_all(parts, job.id)
     sort = GraspSort(by="penetration_depth_mm", descending=False)
     assert len(parts.index.grasps(GraspFilter(hand="gripper", object="ball"), sort=sort).items) == 32
     assert parts.index.grasps(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []
+
+
+@pytest.mark.parametrize("where", [
+    GraspFilter(valid=True, at_least={"epsilon": 0.2}, at_most={"penetration_depth_mm": 2.5}),
+    GraspFilter(hand="gripper", valid=False, at_least={"contact_area_cm2": 0.5}),
+    GraspFilter(object="ball", at_most={"epsilon": 0.4}, at_least={"wrench_volume": 0.6}),
+    GraspFilter(valid=True, at_least={"epsilon": 0.97, "contact_area_cm2": 0.97}),
+])  # fmt: skip
+@pytest.mark.parametrize(("sorted_at_once", "looked_at"), [(1000, (8, 16)), (0, (8, 16)), (0, (1000,))])
+@pytest.mark.parametrize("sort", [GraspSort(), GraspSort(by="penetration_depth_mm", descending=False)])
+def test_every_way_of_searching_finds_the_same(
+    parts: Parts,
+    monkeypatch: pytest.MonkeyPatch,
+    where: GraspFilter,
+    sorted_at_once: int,
+    looked_at: tuple[int, ...],
+    sort: GraspSort,
+) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=160))
+    run_all(parts, job.id)
+    everything = parts.index.grasps(sort=sort, limit=200).items
+    passing = [
+        grasp
+        for grasp in everything
+        if where.valid in (None, grasp.valid)
+        and all(getattr(grasp, name) >= bound for name, bound in where.at_least.items())
+        and all(getattr(grasp, name) <= bound for name, bound in where.at_most.items())
+    ]
+    monkeypatch.setattr("service.index.grasp_search.SORTED_AT_ONCE", sorted_at_once)
+    monkeypatch.setattr("service.index.grasp_search.LOOKED_AT", looked_at)
+    found: list[GraspView] = []
+    cursor = None
+    while True:
+        page = parts.index.grasps(where, sort=sort, limit=7, cursor=cursor)
+        found += page.items
+        if (cursor := page.next) is None:
+            break
+    assert found == passing
+
+
+@pytest.mark.parametrize("bucket_s", [1, 45, 60, 3600, 5400, 86400])
+def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts, bucket_s: int) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=96, scenes=1))
+    run_all(parts, job.id)
+    hour = "2026-05-01T{:02}:{:02}:{:02}.123Z"
+    times = [hour.format(7, 59, 59), hour.format(8, 0, 0), hour.format(8, 0, 44), hour.format(9, 30, 1)]
+    with parts.index.writing() as connection:
+        for number, shard in enumerate(parts.index.shards(job=job.id, limit=9).items):
+            change = update(tables.shards).where(tables.shards.c.id == shard.id)
+            connection.execute(change.values(created=times[number % 4]))
+    buckets = parts.index.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
+    assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6)
+    starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
+    assert starts == sorted({t - t % bucket_s for t in (int(datetime.fromisoformat(x).timestamp()) for x in times)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from sqlalchemy import insert
 
 from service.index.filters import GraspFilter
 from service.index.index import Index
-from service.index.tables import METRICS, grasps
+from service.index.tables import METRICS, grasps, shards
 
 COUNT = 500
 BINS = 12
@@ -62,3 +63,41 @@ def test_a_histogram_counts_as_numpy_does(index: Index, values: np.ndarray) -> N
 def test_values_that_are_all_alike_fall_into_one_bin(index: Index, values: np.ndarray) -> None:
     one = float(values[3])
     assert index.histogram(GraspFilter(), "epsilon", one, one, BINS) == [1] + [0] * (BINS - 1)
+
+
+def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
+    found = index.distributions(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"), bins=BINS)
+    passed = values[::2]
+    counts, _ = np.histogram(passed, BINS)
+    assert (found.looked_at, found.share, set(found.metrics)) == (len(passed), 1.0, {"epsilon"})
+    assert found.metrics["epsilon"].counts == counts.tolist()
+    assert found.metrics["epsilon"].mean == pytest.approx(passed.mean())
+
+
+def test_distributions_of_many_grasps_come_from_a_fair_sample_of_shards(index: Index) -> None:
+    with index.writing() as connection:
+        for number in range(400):
+            shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]
+            made = {"shard_id": shard, "hand": "a", "object": "b", "created": "2026-01-01T00:00:00Z", "valid": True}
+            rows = [made | {"row": row, "epsilon": number / 400} for row in range(8)]
+            connection.execute(insert(grasps), rows)
+            connection.execute(insert(shards), _shard(shard, hand="a", object="b", count=8))
+    found = index.distributions(GraspFilter(hand="a", object="b"), ("epsilon",), at_most=800)
+    assert found.share == pytest.approx(0.25)
+    # 100 shards are expected; the number drawn has a standard deviation of 9, their mean one of 0.03.
+    assert 60 * 8 < found.looked_at < 140 * 8
+    assert found.metrics["epsilon"].mean == pytest.approx(0.5, abs=0.12)
+
+
+def _shard(shard: str, **fields: object) -> dict[str, object]:
+    texts = dict.fromkeys(("key", "sha256", "hand_digest", "object_digest", "device", "worker", "created"), "x")
+    numbers = dict.fromkeys(("size_bytes", "valid", "batch", "seed", "seconds"), 0)
+    return {
+        "id": shard,
+        "kind": "base",
+        "stage": "synthesize",
+        "inputs": [],
+        "manifest": {},
+        **texts,
+        **numbers,
+    } | fields
