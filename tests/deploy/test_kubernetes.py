@@ -1,0 +1,249 @@
+"""The manifests: valid, in step with settings, images and queue; nothing ends a busy worker."""
+
+from __future__ import annotations
+
+import functools
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+
+import graspd
+from service.domain import Lane, Stage
+from service.queue.rq_queue import queue_name
+from service.settings import Settings
+from service.version import PACKAGE_VERSION
+from tests.conftest import REPOSITORY
+from tests.deploy import keda
+from tests.deploy.composition import SERVICES, seconds
+
+FOLDER = REPOSITORY / "docker" / "kubernetes"
+VARIANTS = ("fixed-cpu", "keda-cpu", "keda-gpu")
+SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
+COMMANDS = {name for name, *_ in graspd.COMMANDS}
+Document = dict[str, Any]
+
+
+@functools.cache
+def _files() -> dict[str, list[Document]]:
+    """Documents of every file, as written."""
+    found = {}
+    for path in sorted(FOLDER.rglob("*.yaml")):
+        if path.name not in ("kustomization.yaml", "images.yaml"):
+            found[str(path.relative_to(FOLDER))] = list(yaml.safe_load_all(path.read_text()))
+    return found
+
+
+def documents(*kinds: str) -> list[Document]:
+    """All documents of some kinds, or all."""
+    return [found for file in _files().values() for found in file if not kinds or found["kind"] in kinds]
+
+
+def job_template(found: Document) -> Document:
+    return found["spec"]["jobTargetRef"]
+
+
+def pods() -> Iterator[tuple[str, Document]]:
+    """Name and pod spec of everything that runs pods."""
+    for found in documents("Deployment", "StatefulSet", "ScaledJob"):
+        holder = job_template(found) if found["kind"] == "ScaledJob" else found["spec"]
+        yield found["metadata"]["name"], holder["template"]["spec"]
+
+
+def containers() -> list[tuple[str, Document]]:
+    return [(name, container) for name, pod in pods() for container in pod["containers"]]
+
+
+def rendered(variant: str) -> list[Document]:
+    """What `kubectl apply -k` would send."""
+    if shutil.which("kubectl") is None:
+        pytest.skip("kubectl is not installed")
+    done = subprocess.run(["kubectl", "kustomize", str(FOLDER / variant)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return list(yaml.safe_load_all(done.stdout))
+
+
+@pytest.mark.parametrize("version", ["1.30.0", "1.34.0"])
+def test_the_documents_are_what_kubernetes_takes(version: str) -> None:
+    for found in documents():
+        if not found["apiVersion"].startswith("keda.sh/"):
+            kubernetes_validate.validate(found, version, strict=True)
+
+
+def test_the_pods_that_keda_starts_are_what_kubernetes_takes() -> None:
+    for found in documents("ScaledJob"):
+        spec = job_template(found) | {"parallelism": 1}
+        job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "worker"}, "spec": spec}
+        kubernetes_validate.validate(job, "1.34.0", strict=True)
+
+
+def test_a_wrong_field_would_be_found() -> None:
+    broken = yaml.safe_load((FOLDER / "base" / "keeper.yaml").read_text())
+    broken["spec"]["replica"] = 2
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(broken, "1.34.0", strict=True)
+
+
+def test_the_documents_of_keda_hold_only_fields_that_keda_has() -> None:
+    for found in documents("ScaledJob"):
+        keda.ScaledJobSpec.model_validate(found["spec"])
+    for found in documents("TriggerAuthentication"):
+        keda.TriggerAuthenticationSpec.model_validate(found["spec"])
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_variant_can_be_rendered_with_all_images_pinned(variant: str) -> None:
+    images = re.findall(r"image: (\S+)", yaml.safe_dump_all(rendered(variant)))
+    assert images
+    for image in images:
+        assert re.search(r":v?\d+\.\d+\.\d+", image), image
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_variant_runs_the_version_of_the_package(variant: str) -> None:
+    images = re.findall(r"image: (graspd-\S+)", yaml.safe_dump_all(rendered(variant)))
+    assert {image.partition(":")[2] for image in images} == {PACKAGE_VERSION}
+
+
+@pytest.mark.parametrize("variant", ["keda-cpu", "keda-gpu"])
+def test_every_list_of_the_queue_starts_a_worker_that_serves_it(variant: str) -> None:
+    served: set[str] = set()
+    for found in rendered(variant):
+        if found["kind"] != "ScaledJob":
+            continue
+        spec = keda.ScaledJobSpec.model_validate(found["spec"])
+        arguments = job_template(found)["template"]["spec"]["containers"][0]["args"]
+        at = arguments.index("--stages") + 1 if "--stages" in arguments else None
+        stages = arguments[at].split(",") if at else list(Stage)
+        own = {f"rq:queue:{queue_name(lane, Stage(stage))}" for lane in Lane for stage in stages}
+        assert {trigger.metadata.list_name for trigger in spec.triggers} == own
+        served |= own
+    assert served == {f"rq:queue:{queue_name(lane, stage)}" for lane in Lane for stage in Stage}
+
+
+def test_nothing_ends_a_worker_that_is_busy() -> None:
+    jobs = documents("ScaledJob")
+    assert jobs
+    for found in jobs:
+        spec = keda.ScaledJobSpec.model_validate(found["spec"])
+        # The lists do not hold running tasks: `default` would take them off a second time.
+        assert spec.scaling_strategy.strategy == "accurate"
+        assert spec.rollout.strategy == "gradual"
+        job = job_template(found)
+        assert "activeDeadlineSeconds" not in job
+        assert "--burst" in job["template"]["spec"]["containers"][0]["args"], "the worker ends by itself"
+        annotations = job["template"]["metadata"]["annotations"]
+        assert annotations["cluster-autoscaler.kubernetes.io/safe-to-evict"] == "false"
+    assert not documents("ScaledObject", "HorizontalPodAutoscaler"), "they end pods without asking who is busy"
+
+
+def test_kubernetes_waits_longer_than_a_process_may_take_to_stop() -> None:
+    (settings,) = documents("ConfigMap")
+    for name, pod in pods():
+        assert pod["terminationGracePeriodSeconds"] > float(settings["data"]["GRASPD_STOP_GRACE_S"]), name
+
+
+def test_there_is_one_keeper_and_the_old_one_ends_first() -> None:
+    (keeper,) = [found for found in documents("Deployment") if found["metadata"]["name"] == "keeper"]
+    assert keeper["spec"]["replicas"] == 1
+    assert keeper["spec"]["strategy"] == {"type": "Recreate"}
+
+
+def test_the_environment_is_made_of_settings() -> None:
+    (settings,) = documents("ConfigMap")
+    given = set(settings["data"]) | {entry["name"] for _, container in containers() for entry in container["env"]}
+    assert {name for name in given if name.startswith("GRASPD_")} <= SETTINGS
+    assert {name for name in given if not name.startswith("GRASPD_")} <= {
+        "AWS_REGION",
+        "REDIS_PASSWORD",
+        "REDISCLI_AUTH",
+    }
+
+
+def test_the_settings_can_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    (settings,) = documents("ConfigMap")
+    for name, value in settings["data"].items():
+        assert isinstance(value, str), f"{name}: Kubernetes takes strings only"
+        monkeypatch.setenv(name, value)
+    Settings()
+
+
+def test_no_secret_is_written_down() -> None:
+    assert not documents("Secret")
+    for _, container in containers():
+        for entry in container["env"]:
+            if re.search("PASSWORD|SECRET|AUTH|INDEX_URL", entry["name"]):
+                assert "secretKeyRef" in entry["valueFrom"], entry["name"]
+
+
+def test_every_reference_to_a_secret_is_one_that_the_docs_make() -> None:
+    text = yaml.safe_dump_all(documents())
+    named = set(re.findall(r"(graspd-(?:redis|index|store|keys))\b", text))
+    page = (REPOSITORY / "docs" / "operations.md").read_text()
+    assert named == {name for name in named if f"secret generic {name}" in page}
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _ in pods()}))
+def test_a_pod_has_no_rights_to_lose(name: str) -> None:
+    for pod in (pod for found, pod in pods() if found == name):
+        assert pod["automountServiceAccountToken"] is False
+        assert pod["securityContext"]["runAsNonRoot"] is True
+        for container in pod["containers"]:
+            rights = container["securityContext"]
+            assert rights["readOnlyRootFilesystem"] is True
+            assert rights["allowPrivilegeEscalation"] is False
+            assert rights["capabilities"] == {"drop": ["ALL"]}
+            assert "memory" in container["resources"]["limits"]
+
+
+def test_containers_run_commands_that_exist() -> None:
+    for name, container in containers():
+        if container["image"].startswith("graspd-"):
+            assert container["args"][0] in COMMANDS, name
+
+
+def test_the_probes_are_routes_and_checks_that_exist() -> None:
+    from api.routes.system import router
+
+    routes = {route.path for route in router.routes}
+    for _, container in containers():
+        for kind in ("startupProbe", "livenessProbe", "readinessProbe"):
+            probe = container.get(kind, {})
+            if "httpGet" in probe:
+                assert probe["httpGet"]["path"] in routes
+            elif probe and probe["exec"]["command"][0] == "graspd":
+                assert probe["exec"]["command"][1:] in (["keeper", "--check"], ["worker", "--check"])
+
+
+def test_the_api_is_not_restarted_because_a_part_is_away() -> None:
+    (api,) = [container for name, container in containers() if name == "api"]
+    assert api["livenessProbe"]["httpGet"]["path"] == "/healthz"
+    assert api["readinessProbe"]["httpGet"]["path"] == "/readyz"
+
+
+def test_everything_is_shut_until_a_policy_opens_it() -> None:
+    policies = {found["metadata"]["name"]: found["spec"] for found in documents("NetworkPolicy")}
+    assert policies["nothing-else"] == {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
+
+
+def test_workers_reach_no_database() -> None:
+    (to_index,) = [found for found in documents("NetworkPolicy") if found["metadata"]["name"] == "to-index"]
+    allowed = to_index["spec"]["podSelector"]["matchLabels"]
+    for found in documents("Deployment", "ScaledJob"):
+        name = found["metadata"]["name"]
+        holder = job_template(found) if found["kind"] == "ScaledJob" else found["spec"]
+        labels = holder["template"]["metadata"]["labels"]
+        assert (allowed.items() <= labels.items()) is not name.startswith("worker"), name
+
+
+def test_compose_and_kubernetes_run_the_same_redis() -> None:
+    (redis,) = [container for name, container in containers() if name == "redis"]
+    assert redis["image"] == SERVICES["redis"]["image"]
+    assert seconds(SERVICES["redis"]["stop_grace_period"]) == 30
+    options = {"--appendonly", "--appendfsync", "--maxmemory", "--maxmemory-policy", "--requirepass"}
+    assert options <= set(redis["args"]) & set(SERVICES["redis"]["command"])
