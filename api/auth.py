@@ -47,6 +47,15 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     return key
 
 
+def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
+    """Whether `authorize` would let the request pass."""
+    try:
+        authorize(request, scope)
+    except ApiError:
+        return False
+    return True
+
+
 def refuse_strangers(request: HTTPConnection) -> None:
     """While the service is open, only this machine may use it.
 

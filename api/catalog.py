@@ -7,22 +7,35 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
 from api.auth import caller
 from api.grasp_files import GraspFiles
+from api.health import Probes
 from api.idempotency import Idempotency
-from api.models import GraspDetail, GraspQuery, Health, Histogram, Job, JobDetail, LossCurve, MeanMetrics, Part, Shard
+from api.metrics import Snapshot
+from api.models import (
+    GraspDetail,
+    GraspQuery,
+    Health,
+    Histogram,
+    Job,
+    JobDetail,
+    LossCurve,
+    MeanMetrics,
+    Part,
+    Shard,
+    Worker,
+)
 from api.progress import Paces, eta_of_job, progress_of_job, stage_statuses
 from api.quotas import Quotas
 from service import library, pipeline
 from service.digests import digest_files
 from service.domain import AssetKind, JobRequest, Lane, Stage, State
 from service.embedded import redis_url
-from service.errors import ConflictError, GraspdError, NotFoundError
+from service.errors import ConflictError, NotFoundError, UnavailableError
 from service.index.filters import GraspFilter, GraspSort, Metric
 from service.index.views import (
     AssetView,
@@ -33,15 +46,16 @@ from service.index.views import (
     ShardView,
     Stats,
     TaskView,
-    WorkerView,
 )
+from service.keeper import PART as KEEPER
 from service.logs import bind
+from service.metrics.index_now import read_index
+from service.metrics.queue_now import QueueNow
 from service.parts import Parts
 from service.queue.rq_queue import connect
 from service.store import Store
 
 log = logging.getLogger(__name__)
-_HEALTH_S: Final = 2.0
 _PAGE: Final = 200
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_HISTOGRAMS: Final = 256
@@ -66,7 +80,7 @@ class Catalog:
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
         self._losses: dict[str, tuple[int, list[float]] | None] = {}
         self._grasp_files = GraspFiles(parts.store)
-        self._health: tuple[float, Health] | None = None
+        self._probes = Probes(parts)
 
     @property
     def store(self) -> Store:
@@ -180,8 +194,22 @@ class Catalog:
         self._parts.index.add_asset(asset, library.load_check(self._parts.store, kind, asset.digest))
         return self._parts.index.asset(kind, asset.digest)
 
-    def workers(self) -> list[WorkerView]:
-        return self._parts.index.workers()
+    def workers(self) -> list[Worker]:
+        """Workers, the living first, each with the stage it does and the age of its lease."""
+        known = self._parts.index.workers()
+        doing = self._parts.index.outputs([worker.task_id for worker in known if worker.task_id])
+        try:
+            pulses = self._queue_now().workers
+        except UnavailableError:
+            pulses = {}
+        return [
+            Worker(
+                **worker.model_dump(),
+                stage=Stage(doing[worker.task_id][0]) if worker.task_id in doing else None,
+                lease_age_s=round(pulses[worker.name].lease_age_s, 3) if worker.name in pulses else None,
+            )
+            for worker in known
+        ]
 
     def stats(self) -> Stats:
         return self._parts.index.stats()
@@ -203,16 +231,20 @@ class Catalog:
 
     def health(self) -> Health:
         """State of the three parts; asked anew at most every two seconds."""
-        now = time.monotonic()
-        if self._health is None or now - self._health[0] > _HEALTH_S:
-            probes: dict[str, Callable[[], float]] = {
-                "redis": self._parts.queue.ping,
-                "index": self._parts.index.ping,
-                "store": self._parts.store.probe,
-            }
-            parts = {name: _probe(probe) for name, probe in probes.items()}
-            self._health = (now, Health(ok=all(part.ok for part in parts.values()), parts=parts))
-        return self._health[1]
+        return self._probes.health()
+
+    def snapshot(self) -> Snapshot:
+        """The service as Prometheus sees it; a part that is away leaves its numbers out."""
+        found = Snapshot()
+        parts = self.health().parts
+        found.add_parts({name: _seconds(part) for name, part in parts.items()})
+        with contextlib.suppress(UnavailableError):
+            queue = self._parts.queue
+            found.add_queue(self._queue_now(), keeper_is_up=queue.announced(KEEPER))
+            found.add_sums(queue.counted())
+        with contextlib.suppress(UnavailableError):
+            found.add_index(read_index(self._parts.index))
+        return found
 
     def histograms(self, job_id: str, valid: int, *, bins: int = 20) -> list[Histogram]:
         """Distribution of each metric over a job's valid grasps.
@@ -257,6 +289,10 @@ class Catalog:
                 self._losses.clear()
             self._losses[shard_id] = (int(info.get("chunk", 1)), curve) if curve else None
         return self._losses[shard_id]
+
+    def _queue_now(self) -> QueueNow:
+        # A worker's registration lives for whole seconds: see `worker.heartbeat`.
+        return self._parts.queue.now(lease_s=max(2, round(self._parts.settings.lease_s)))
 
     def _detail(self, job: JobView) -> JobDetail:
         mean = {data.metric: data.mean for data in self.histograms(job.id, job.valid)} if job.valid else {}
@@ -324,8 +360,5 @@ def _shard(shard: ShardView) -> Shard:
     return Shard(**shard.model_dump(), file=f"/v1/shards/{shard.id}/file")
 
 
-def _probe(probe: Callable[[], float]) -> Part:
-    try:
-        return Part(ok=True, latency_ms=round(1000 * probe(), 3))
-    except GraspdError as error:
-        return Part(ok=False, detail=str(error))
+def _seconds(part: Part) -> float | None:
+    return None if part.latency_ms is None else part.latency_ms / 1000

@@ -30,6 +30,12 @@ def may_administer(request: Request) -> None:
     authorize(request, Scope.ADMIN)
 
 
+def may_scrape(request: Request) -> None:
+    """Whoever may read; or anybody, where the settings say so."""
+    if request.app.state.settings.metrics_need_key:
+        authorize(request, Scope.READ)
+
+
 CatalogOf = Annotated[Catalog, Depends(get_catalog)]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]

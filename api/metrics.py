@@ -1,66 +1,127 @@
-"""Prometheus metrics of the API process, in a registry of their own."""
+"""Prometheus text of one API process: what it answered itself, and the service as queue, index and keeper know it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
-from service.domain import Lane, Stage
-from service.index.views import Stats
+from service.metrics.index_now import IndexNow
+from service.metrics.queue_now import QueueNow
+from service.metrics.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
+from service.metrics.tally import parse_field
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
+Values = dict[str, dict[tuple[str, ...], float]]
+
 
 class Metrics:
-    """Counts and times what this process answered; gauges of the service are set at each scrape."""
+    """Counts and times what this process answered; renders that together with a snapshot of the service."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
-        labels = ("method", "route", "status")
-        self._requests = Counter("graspd_http_requests", "answered requests", labels, registry=self.registry)
+        counted, timed = SERIES["graspd_http_requests_total"], SERIES["graspd_http_request_seconds"]
+        self._requests = Counter(
+            counted.name.removesuffix("_total"), counted.meaning, counted.labels, registry=self.registry
+        )
         self._seconds = Histogram(
-            "graspd_http_request_seconds",
-            "time to answer [s]",
-            ("method", "route"),
-            registry=self.registry,
-            buckets=(0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0),
+            timed.name, timed.meaning, timed.labels, registry=self.registry, buckets=HTTP_BUCKETS_S
         )
-        self._up = Gauge("graspd_part_up", "1: the part answers", ("part",), registry=self.registry)
-        self._latency = Gauge(
-            "graspd_part_latency_seconds", "time the part took to answer [s]", ("part",), registry=self.registry
-        )
-        self._jobs = Gauge("graspd_jobs", "jobs by state", ("state",), registry=self.registry)
-        self._tasks = Gauge("graspd_tasks", "tasks by state", ("state",), registry=self.registry)
-        self._waiting = Gauge("graspd_queue_depth", "waiting tasks", ("lane", "stage"), registry=self.registry)
-        self._grasps = Gauge("graspd_grasps", "grasps in the index", ("verdict",), registry=self.registry)
-        self._workers = Gauge("graspd_workers", "workers that hold their lease", registry=self.registry)
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count one answered request."""
         self._requests.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
 
-    def set_part(self, part: str, latency_s: float | None) -> None:
-        """State of redis, index or store; None: it does not answer."""
-        self._up.labels(part).set(latency_s is not None)
-        if latency_s is not None:
-            self._latency.labels(part).set(latency_s)
-
-    def set_counts(self, stats: Stats, depths: Mapping[tuple[Lane, Stage], int]) -> None:
-        """What the index and the queue say now."""
-        for state, count in stats.jobs.items():
-            self._jobs.labels(state).set(count)
-        for state, count in stats.tasks.items():
-            self._tasks.labels(state).set(count)
-        self._waiting.clear()
-        for (lane, stage), count in depths.items():
-            self._waiting.labels(lane, stage).set(count)
-        self._grasps.labels("all").set(stats.grasps)
-        self._grasps.labels("valid").set(stats.valid)
-        self._workers.set(stats.workers)
-
-    def render(self) -> bytes:
+    def render(self, service: Snapshot) -> bytes:
         """Text exposition format."""
-        return generate_latest(self.registry)
+        snapshot = CollectorRegistry()
+        snapshot.register(service)
+        return generate_latest(self.registry) + generate_latest(snapshot)
+
+
+class Snapshot:
+    """The service at the moment of a scrape. A part that does not answer leaves its series out."""
+
+    def __init__(self) -> None:
+        self._values: Values = defaultdict(dict)
+        self._sums: Mapping[str, float] = {}
+
+    def add_parts(self, latencies_s: Mapping[str, float | None]) -> None:
+        """Time each part took to answer [s]; None: it does not answer."""
+        for part, seconds in latencies_s.items():
+            self._set("graspd_part_up", part, value=float(seconds is not None))
+            if seconds is not None:
+                self._set("graspd_part_latency_seconds", part, value=seconds)
+
+    def add_queue(self, queue: QueueNow, *, keeper_is_up: bool) -> None:
+        for (lane, stage), depth in queue.depth.items():
+            self._set("graspd_queue_depth", lane, stage, value=depth)
+            oldest = queue.oldest_s.get((lane, stage), 0.0)
+            self._set("graspd_queue_oldest_task_seconds", lane, stage, value=oldest)
+            self._set("graspd_tasks_running", lane, stage, value=queue.running.get((lane, stage), 0))
+        states = [pulse.state for pulse in queue.workers.values()]
+        for state in ("idle", "busy", "stopping"):
+            self._set("graspd_workers", state, value=states.count(state))
+        for name, pulse in queue.workers.items():
+            self._set("graspd_worker_lease_age_seconds", name, pulse.device, value=pulse.lease_age_s)
+        self._set("graspd_keeper_up", value=float(keeper_is_up))
+
+    def add_index(self, index: IndexNow) -> None:
+        for state, count in index.jobs.items():
+            self._set("graspd_jobs_unfinished", state, value=count)
+            self._set("graspd_job_oldest_seconds", state, value=index.oldest_s[state])
+        self._set("graspd_grasps_per_second", "all", value=index.grasps_per_s)
+        self._set("graspd_grasps_per_second", "valid", value=index.valid_per_s)
+
+    def add_sums(self, sums: Mapping[str, float]) -> None:
+        """What the keeper counted."""
+        self._sums = sums
+
+    def collect(self) -> Iterator[Metric]:
+        """What prometheus_client asks for."""
+        for name, samples in self._values.items():
+            family = GaugeMetricFamily(name, SERIES[name].meaning, labels=SERIES[name].labels)
+            for labels, value in samples.items():
+                family.add_metric(labels, value)
+            yield family
+        yield from _families(self._sums)
+
+    def _set(self, name: str, *labels: str, value: float) -> None:
+        self._values[name][tuple(map(str, labels))] = value
+
+
+def _families(sums: Mapping[str, float]) -> Iterable[Metric]:
+    """Counters and histograms of the keeper; what does not fit the list of series is left out."""
+    found: Values = defaultdict(dict)
+    for text, amount in sums.items():
+        if (parsed := parse_field(text)) is not None:
+            name, labels = parsed
+            found[name][labels] = amount
+    for series in SERIES.values():
+        if series.source != "keeper":
+            continue
+        if series.kind == "histogram":
+            yield _histogram(series.name, series.meaning, found)
+            continue
+        family = CounterMetricFamily(series.name, series.meaning, labels=series.labels)
+        for labels, amount in sorted(found[series.name].items()):
+            if len(labels) == len(series.labels):
+                family.add_metric(labels, amount)
+        yield family
+
+
+def _histogram(name: str, meaning: str, found: Values) -> Metric:
+    family: Any = HistogramMetricFamily(name, meaning, labels=SERIES[name].labels)
+    bounds = [*map(str, STAGE_BUCKETS_S), "+Inf"]
+    for labels, total in sorted(found[f"{name}_sum"].items()):
+        reached, buckets = 0.0, []
+        for bound in bounds:
+            reached += found[f"{name}_bucket"].get((*labels, bound), 0.0)
+            buckets.append((bound, reached))
+        family.add_metric(labels, buckets, sum_value=total)
+    return family

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.domain import JobRequest, Stage, State
-from service.index.views import AttemptView, GraspView, ShardView, StageProgress
+from service.index.views import AttemptView, GraspView, ShardView, StageProgress, WorkerView
 
 
 class StageStatus(StageProgress):
@@ -142,8 +142,17 @@ class Part(BaseModel):
 class Health(BaseModel):
     """Readiness, part by part."""
 
-    ok: bool
+    ok: bool = Field(description="redis, index and store answer")
     parts: dict[str, Part]
+    keeper: bool = Field(False, description="a keeper gave a sign of life lately: without one no task is queued anew")
+    workers: int = Field(0, ge=0, description="workers that hold their lease")
+
+
+class Worker(WorkerView):
+    """A worker and what it does now."""
+
+    stage: Stage | None = Field(None, description="stage of the task in hand")
+    lease_age_s: float | None = Field(None, description="time since its last beat [s]; absent once it is gone")
 
 
 class LossCurve(BaseModel):

@@ -8,3 +8,11 @@ from datetime import UTC, datetime
 def timestamp() -> str:
     """Now, RFC 3339 in UTC with milliseconds; such texts sort by time."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def age_of(when: str) -> float | None:
+    """Seconds since a time in RFC 3339, for showing; None if it cannot be read."""
+    try:
+        return max(0.0, (datetime.now(UTC) - datetime.fromisoformat(when)).total_seconds())
+    except (ValueError, TypeError):
+        return None

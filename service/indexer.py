@@ -13,6 +13,7 @@ from service.domain import AssetKind, Stage, State
 from service.errors import UnavailableError
 from service.library import load_asset, load_check
 from service.manifests import ShardManifest, load_manifest
+from service.metrics.tally import Tally
 from service.names import attempt as attempt_key
 from service.parts import Parts
 from service.planning import backoff
@@ -30,6 +31,7 @@ class Indexer:
         self._parts = parts
         self._told: OrderedDict[str, State] = OrderedDict()
         self._deferrals: dict[str, int] = {}
+        self._tally = Tally(parts.queue)
 
     def apply(self, events: Sequence[Event]) -> None:
         """Bring the index up to date. Applying an event twice changes nothing.
@@ -57,6 +59,7 @@ class Indexer:
                 log.exception("event %s of task %s is left out", event.kind, event.task_id)
         if made:
             self.tell(self._parts.index.add_manifests(made))
+            self._tally.made(made)
         if progress:
             self._parts.index.set_progress(progress)
 
@@ -65,6 +68,9 @@ class Indexer:
         for job, state in states.items():
             if self._told.get(job) is not state:
                 self._parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job, message=state.value))
+                log.info("job is %s", state, extra={"job": job})
+                if state.is_final:
+                    self._tally.ended(state)
             self._told[job] = state
             self._told.move_to_end(job)
             if len(self._told) > _REMEMBERED_JOBS:
@@ -76,7 +82,9 @@ class Indexer:
             kind, _, digest = output.partition("/")
             self.checked(AssetKind(kind), digest)
         else:
-            self.tell(self._parts.index.add_manifest(load_manifest(self._parts.store, stage, output)))
+            manifest = load_manifest(self._parts.store, stage, output)
+            self.tell(self._parts.index.add_manifest(manifest))
+            self._tally.made([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
         """Index a hand or object as the store has it now."""
@@ -89,7 +97,19 @@ class Indexer:
         not_before = time.time() + wait
         state = self._parts.index.add_attempt(attempt, not_before=not_before)
         if state is not None:
+            about = {
+                "job": attempt.job_id,
+                "task": attempt.task_id,
+                "attempt": attempt.number,
+                "worker": attempt.worker,
+            }
+            log.warning("attempt failed: %s: %s", attempt.kind, attempt.reason, extra=about)
+            self._tally.failed(attempt.stage.value, attempt.kind)
             self.tell({attempt.job_id: state})
+
+    def flush(self) -> None:
+        """Add what was counted since the last time to the sums that Prometheus reads."""
+        self._tally.flush()
 
     def _apply(self, event: Event) -> None:
         if event.kind is EventKind.STARTED:
@@ -102,8 +122,10 @@ class Indexer:
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
         elif event.kind is EventKind.DEFERRED:
+            self._tally.handed_back(event.stage or "", event.kind.value)
             self._defer(event)
         elif event.kind in (EventKind.RETURNED, EventKind.CANCELLED):
+            self._tally.handed_back(event.stage or "", event.kind.value)
             self._wait_again(event, 0.0, None)
 
     def _defer(self, event: Event) -> None:

@@ -79,6 +79,7 @@ class Keeper:
             self._has_plans = self._planner.advance()
             self._plan_again = now + self._parts.settings.keeper_interval_s
         if now >= self._tell_again:
+            self._indexer.flush()
             self._look_after_workers()
             self._tell_again = now + _WORKERS_EVERY_S
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-
 from fastapi import APIRouter, Depends, Request, Response
 
-from api.dependencies import CatalogOf, may_read
-from api.metrics import CONTENT_TYPE
-from api.models import Health
+from api.auth import is_allowed
+from api.dependencies import CatalogOf, may_read, may_scrape
+from api.keys import Scope
+from api.metrics import CONTENT_TYPE, Metrics
+from api.models import Health, Worker
 from api.problems import responses
-from service.errors import UnavailableError
-from service.index.views import Stats, WorkerView
+from service.index.views import Stats
 
 router = APIRouter(tags=["system"])
 
 
 @router.get("/v1/workers", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
-def list_workers(catalog: CatalogOf) -> list[WorkerView]:
-    """Workers that gave a sign of life lately, with their device and what they do."""
+def list_workers(catalog: CatalogOf) -> list[Worker]:
+    """Workers that gave a sign of life lately: device, stage in hand, age of the lease."""
     return catalog.workers()
 
 
@@ -35,23 +34,28 @@ def healthz() -> dict[str, bool]:
 
 
 @router.get("/readyz", responses={503: {"model": Health, "description": "A part does not answer"}})
-def readyz(catalog: CatalogOf, response: Response) -> Health:
-    """Redis, index and store, each with the time it took to answer."""
+def readyz(request: Request, catalog: CatalogOf, response: Response) -> Health:
+    """Redis, index and store, each with the time it took to answer; whether a keeper lives, and how many workers.
+
+    What is wrong with a part is told to those who may read.
+    """
     health = catalog.health()
     if not health.ok:
         response.status_code = 503
         response.headers["Retry-After"] = "2"
+    if not is_allowed(request, Scope.READ):
+        parts = {name: part.model_copy(update={"detail": ""}) for name, part in health.parts.items()}
+        health = health.model_copy(update={"parts": parts})
     return health
 
 
-@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+@router.get(
+    "/metrics",
+    dependencies=[Depends(may_scrape)],
+    response_class=Response,
+    responses=responses(401, 403, others={200: {"content": {"text/plain": {}}}}),
+)
 def metrics(request: Request, catalog: CatalogOf) -> Response:
-    """Prometheus text format."""
-    values = request.app.state.metrics
-    health = catalog.health()
-    for name, part in health.parts.items():
-        values.set_part(name, None if part.latency_ms is None else part.latency_ms / 1000)
-    # A scrape must show which part is down, so it succeeds without the counts.
-    with contextlib.suppress(UnavailableError):
-        values.set_counts(catalog.stats(), catalog.depths())
-    return Response(values.render(), media_type=CONTENT_TYPE)
+    """Prometheus text format. A scrape must show which part is down, so it succeeds without what that part knows."""
+    values: Metrics = request.app.state.metrics
+    return Response(values.render(catalog.snapshot()), media_type=CONTENT_TYPE)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from service.domain import Lane, Stage
+from service.metrics.queue_now import QueueNow, WorkerPulse
 from service.queue.port import Event, Lease, Message, WorkerBeat
 
 
@@ -32,6 +34,7 @@ class MemoryQueue:
     _events: list[Event] = field(default_factory=list)
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
+    _sums: dict[str, float] = field(default_factory=dict)
     _read: int = 0
     _acknowledged: set[str] = field(default_factory=set)
     _numbers: itertools.count[int] = field(default_factory=itertools.count)
@@ -103,6 +106,18 @@ class MemoryQueue:
 
     def announced(self, part: str) -> bool:
         return self._announced.get(part, 0.0) > time.monotonic()
+
+    def now(self, *, lease_s: float) -> QueueNow:
+        running = Counter((Lane.BULK, held.message.stage) for held in self._held.values())
+        pulses = {name: WorkerPulse(beat.device, beat.state, 0.0) for name, beat in self._workers.items()}
+        return QueueNow(depth=self.depths(), running=running, workers=pulses)
+
+    def count(self, amounts: Mapping[str, float]) -> None:
+        for name, amount in amounts.items():
+            self._sums[name] = self._sums.get(name, 0.0) + amount
+
+    def counted(self) -> dict[str, float]:
+        return dict(self._sums)
 
     def tidy(self) -> None:
         """Nothing is left behind."""

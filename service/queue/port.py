@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
@@ -10,6 +10,7 @@ from typing import Protocol
 from pydantic import ConfigDict
 
 from service.domain import IngestMessage, Lane, Model, Stage, TaskMessage
+from service.metrics.queue_now import QueueNow
 
 Message = TaskMessage | IngestMessage
 
@@ -139,6 +140,19 @@ class TaskQueue(Protocol):
 
     def announced(self, part: str) -> bool:
         """Whether a part said so."""
+
+    def now(self, *, lease_s: float) -> QueueNow:
+        """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.
+
+        Args:
+            lease_s: how long a worker's registration outlives its beat [s].
+        """
+
+    def count(self, amounts: Mapping[str, float]) -> None:
+        """Add to sums that outlive this process."""
+
+    def counted(self) -> dict[str, float]:
+        """All those sums."""
 
     def tidy(self) -> None:
         """Throw away what dead workers and refused entries left behind."""

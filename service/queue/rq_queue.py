@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from typing import Any, Final
@@ -24,6 +24,7 @@ from rq.exceptions import DuplicateJobError
 from service.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.embedded import redis_url
 from service.errors import QueueUnavailable
+from service.metrics.queue_now import QueueNow, read_queue
 from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
 from service.queue.port import Event, Lease, Message, WorkerBeat
 from service.settings import Settings
@@ -32,6 +33,8 @@ EVENTS: Final = "graspd:events"
 #: Events kept: two minutes of a hundred workers' progress, 20 MB at most. Those lost are made good from the store.
 EVENTS_KEPT: Final = 50_000
 WORKERS: Final = "graspd:workers"
+#: Sums for Prometheus, a few hundred fields.
+METRICS: Final = "graspd:metrics"
 _GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
 _SOCKET_TIMEOUT_S: Final = 10.0
@@ -190,6 +193,20 @@ class RqQueue:
     def announced(self, part: str) -> bool:
         with _mapped():
             return bool(self.connection.exists(f"graspd:part:{part}"))
+
+    def now(self, *, lease_s: float) -> QueueNow:
+        with _mapped():
+            return read_queue(self.connection, workers_key=WORKERS, worker_key=worker_key(""), lease_s=lease_s)
+
+    def count(self, amounts: Mapping[str, float]) -> None:
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for name, amount in amounts.items():
+                pipe.hincrbyfloat(METRICS, name, amount)
+            pipe.execute()
+
+    def counted(self) -> dict[str, float]:
+        with _mapped():
+            return {name.decode(): float(amount) for name, amount in self.connection.hgetall(METRICS).items()}
 
     def tidy(self) -> None:
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.

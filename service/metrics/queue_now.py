@@ -1,0 +1,81 @@
+"""What the queue says at the moment of a scrape: two round trips, whatever waits in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from service.clock import age_of
+from service.domain import Lane, Stage
+
+Place = tuple[Lane, Stage]
+
+
+@dataclass(frozen=True)
+class WorkerPulse:
+    """A living worker."""
+
+    device: str
+    state: str
+    lease_age_s: float
+    """Time since its last beat, by Redis's clock."""
+
+
+@dataclass(frozen=True)
+class QueueNow:
+    """Waiting and running tasks, and the workers. Places without a task may be left out."""
+
+    depth: Mapping[Place, int] = field(default_factory=dict)
+    oldest_s: Mapping[Place, float] = field(default_factory=dict)
+    running: Mapping[Place, int] = field(default_factory=dict)
+    workers: Mapping[str, WorkerPulse] = field(default_factory=dict)
+
+
+def read_queue(connection: Any, *, workers_key: str, worker_key: str, lease_s: float) -> QueueNow:
+    """Two round trips: lengths and heads of the lists, then the age of the heads and the beats of the workers.
+
+    Args:
+        connection: Redis.
+        workers_key: set of the workers' names.
+        worker_key: what stands before a name in the key that a living worker renews.
+        lease_s: how long that key lives after a beat [s].
+    """
+    places = list(product(Lane, Stage))
+    with connection.pipeline(transaction=False) as pipe:
+        for lane, stage in places:
+            name = f"{lane.value}-{stage.value}"
+            pipe.llen(f"rq:queue:{name}")
+            pipe.lindex(f"rq:queue:{name}", 0)
+            pipe.zcard(f"rq:wip:{name}")
+        pipe.smembers(workers_key)
+        *found, names = pipe.execute()
+    lengths, heads, running = found[0::3], found[1::3], found[2::3]
+    first = {place: head.decode() for place, head in zip(places, heads, strict=True) if head is not None}
+    known = sorted(name.decode() for name in names)
+    with connection.pipeline(transaction=False) as pipe:
+        for head in first.values():
+            pipe.hget(f"rq:job:{head}", "enqueued_at")
+        for name in known:
+            pipe.get(f"{worker_key}{name}")
+            pipe.pttl(f"{worker_key}{name}")
+        rest = pipe.execute()
+    since, beats = rest[: len(first)], rest[len(first) :]
+    ages = {place: age_of(when.decode()) if when else None for place, when in zip(first, since, strict=True)}
+    pulses = {name: _pulse(beats[2 * i], beats[2 * i + 1], lease_s) for i, name in enumerate(known)}
+    return QueueNow(
+        depth=dict(zip(places, lengths, strict=True)),
+        oldest_s={place: age for place, age in ages.items() if age is not None},
+        running=dict(zip(places, running, strict=True)),
+        workers={name: pulse for name, pulse in pulses.items() if pulse is not None},
+    )
+
+
+def _pulse(beat: bytes | None, lives_ms: int, lease_s: float) -> WorkerPulse | None:
+    try:
+        facts = json.loads(beat or b"")
+        return WorkerPulse(str(facts["device"]), str(facts["state"]), max(0.0, lease_s - lives_ms / 1000))
+    except (ValueError, KeyError, TypeError):
+        return None
