@@ -1,0 +1,145 @@
+"""A user's own files through the whole service: command line, API, keeper, worker with the real engine."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.settings import Settings
+from service.store import open_store
+from service.supervisor import Supervisor
+
+GRIPPER = """\
+<robot name="pincer">
+  <link name="base">
+    <collision><origin xyz="0 0 -0.01"/><geometry><box size="0.12 0.04 0.02"/></geometry></collision>
+  </link>
+  <link name="left">
+    <collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.03 0.08"/></geometry></collision>
+  </link>
+  <link name="right">
+    <collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.03 0.08"/></geometry></collision>
+  </link>
+  <joint name="slide_left" type="prismatic">
+    <parent link="base"/><child link="left"/><origin xyz="-0.055 0 0"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="0.05" effort="20" velocity="1"/>
+  </joint>
+  <joint name="slide_right" type="prismatic">
+    <parent link="base"/><child link="right"/><origin xyz="0.055 0 0"/><axis xyz="-1 0 0"/>
+    <limit lower="0" upper="0.05" effort="20" velocity="1"/>
+  </joint>
+</robot>
+"""
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Runs `graspd` as a user does, in a folder of the user's files."""
+
+    environment: dict[str, str]
+    folder: Path
+
+    def __call__(self, *arguments: str) -> tuple[int, dict[str, Any], str]:
+        """Exit code, the JSON object on the last line, standard error."""
+        command = [sys.executable, "-m", "graspd", *arguments, "--json"]
+        done = subprocess.run(
+            command, capture_output=True, text=True, env=self.environment, cwd=self.folder, timeout=280, check=False
+        )
+        lines = done.stdout.strip().splitlines()
+        return done.returncode, json.loads(lines[-1]) if lines else {}, done.stderr
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hand without meshes, a box in millimetres, a shell that is open, and a folder of two objects."""
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "pincer.urdf").write_text(GRIPPER)
+    (folder / "endless.urdf").write_text(GRIPPER.replace('lower="0" upper="0.05"', 'lower="0.05" upper="0"'))
+    trimesh.creation.box((60.0, 40.0, 30.0)).export(folder / "brick.stl")
+    shell = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    shell.update_faces(shell.triangles_center[:, 2] < 0.01)
+    shell.export(folder / "shell.stl")
+    (folder / "toys").mkdir()
+    trimesh.creation.icosphere(subdivisions=2, radius=0.02).export(folder / "toys" / "ball.ply")
+    trimesh.creation.cylinder(radius=0.015, height=0.06).export(folder / "toys" / "rod.obj")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Supervisor]:
+    settings = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0, device="cpu")
+    with Supervisor(settings, workers=1) as supervisor:
+        supervisor.wait_ready(60)
+        yield supervisor
+
+
+@pytest.fixture(scope="module")
+def graspd(service: Supervisor, files: Path) -> Shell:
+    names = {"GRASPD_API_URL": service.api_url, "GRASPD_DATA_DIR": str(service.settings.data_dir)}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
+    # The tests' own folder of modules, not what lies in the user's.
+    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), kept.get("PYTHONPATH"))))
+    return Shell(kept | names | {"PYTHONPATH": path}, files)
+
+
+def test_a_hand_is_added_with_its_guesses(graspd: Shell) -> None:
+    code, hand, _ = graspd("hands", "add", "pincer.urdf")
+    assert (code, hand["name"], hand["verdict"]) == (0, "pincer", "accept")
+    assert hand["facts"]["palm_approach"] == [0.0, 0.0, 1.0]
+
+
+def test_a_hand_that_cannot_be_used_is_refused_with_the_mend(graspd: Shell) -> None:
+    code, hand, said = graspd("hands", "add", "endless.urdf")
+    assert (code, hand["verdict"]) == (2, "refuse")
+    assert "slide_left" in said and len(said.strip().splitlines()) == 1
+
+
+def test_an_object_is_refused_and_gets_in_with_the_mend_that_was_named(graspd: Shell) -> None:
+    code, _, said = graspd("objects", "add", "brick.stl")
+    assert code == 2 and "--units mm" in said
+    code, brick, _ = graspd("objects", "add", "brick.stl", "--units", "mm", "--density", "500")
+    assert (code, brick["verdict"]) == (0, "accept")
+    assert brick["facts"]["mass_kg"] == pytest.approx(60e-3 * 40e-3 * 30e-3 * 500, rel=1e-3)
+
+
+def test_an_open_mesh_needs_a_word(graspd: Shell) -> None:
+    code, _, said = graspd("objects", "add", "shell.stl")
+    assert code == 2 and "--allow-open" in said
+    code, shell, _ = graspd("objects", "add", "shell.stl", "--allow-open")
+    assert (code, shell["verdict"]) == (0, "accept")
+
+
+def test_a_folder_of_objects_becomes_a_dataset_and_its_files(
+    graspd: Shell, service: Supervisor, tmp_path: Path
+) -> None:
+    graspd("hands", "add", "pincer.urdf")
+    wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
+    cheap = ("--fidelity", "draft", "--want", "raw", "--referee", "none")
+    code, seen, _ = graspd(*wanted, *cheap, "--dry-run")
+    assert code == 0 and seen["estimate"]["cells"] == 2 and "dataset" not in seen
+    code, made, said = graspd(*wanted, *cheap, "--yes", "--wait")
+    assert code == 0, said
+    assert (made["dataset"]["state"], made["dataset"]["grasps"]) == ("succeeded", 8)
+    code, status, _ = graspd("datasets", "status", "play")
+    assert [(cell["object"], cell["state"]) for cell in status["matrix"]] == [
+        ("ball", "succeeded"),
+        ("rod", "succeeded"),
+    ]
+    code, export, _ = graspd("datasets", "export", "play", "-o", str(tmp_path / "play"))
+    assert code == 0 and export["complete"]
+    assert len(list((tmp_path / "play").rglob("*.h5"))) == export["files"] == 2
+    settings = service.settings
+    index = Index(settings.resolved_index_url)
+    assert differences(index, open_store(settings.resolved_store_url)) == []
+    index.close()
