@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import OrderedDict
+from collections.abc import Callable
 from types import ModuleType
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 import warp as wp
@@ -26,11 +28,33 @@ from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.simulation import HandState
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 #: How finely peers see hand and object where their source does not say.
 GROUND: Final = Fidelity(name="peers", coarse_points=400, fine_points=1000, object_points=4000, phong_alpha=0.0)
 
 _lock = threading.Lock()
+
+
+class Kept(Generic[T]):
+    """What a method makes once of a pair and its options, kept for the pairs used last."""
+
+    def __init__(self, make: Callable[..., T], size: int = 4) -> None:
+        self._make, self._size = make, size
+        self._found: OrderedDict[tuple[object, ...], tuple[Pair, T]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __call__(self, pair: Pair, *options: object) -> T:
+        """`make(pair, *options)`, from memory where it was used lately."""
+        key = (id(pair), *options)
+        with self._lock:
+            if key not in self._found:
+                # The pair is kept beside it: its id is not given to another one meanwhile.
+                self._found[key] = (pair, self._make(pair, *options))
+            self._found.move_to_end(key)
+            while len(self._found) > self._size:
+                self._found.popitem(last=False)
+            return self._found[key][1]
 
 
 def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:

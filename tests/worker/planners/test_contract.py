@@ -17,6 +17,7 @@ from worker.planners import synthesize
 #: Peers with options that make them quick.
 PEERS: dict[str, dict[str, object]] = {
     "autograsp": {},
+    "graspd2022": {"steps": 60, "grid": 24},
     "graspit": {"steps": 30_400},
 }
 EACH = pytest.mark.parametrize("method", sorted(PEERS))

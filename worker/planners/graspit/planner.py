@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import OrderedDict
 from typing import Final
 
 from pydantic import Field
@@ -15,16 +13,15 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.autograsp import kernels as closing_kernels
 from worker.planners.autograsp.closing import Closer
-from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspit import kernels
 from worker.planners.graspit.schedule import FIRST_STEP
 from worker.planners.graspit.search import Search
-from worker.planners.ground import grasp_set, ground_of, joined
+from worker.planners.ground import Kept, grasp_set, ground_of, joined
 from worker.planners.parts import Steps, cut, run_parts
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
 from worker.simulation.simulation import HandState
 
-KEPT: Final = 4
+_searches: Final = Kept(Search)
 
 
 class GraspitOptions(Options):
@@ -48,7 +45,7 @@ class Graspit:
     ) -> GraspSet:  # fmt: skip
         began = time.perf_counter()
         pair = ground_of(hand, obj, device, kernels, closing_kernels)
-        search = _search_of(pair)
+        search = _searches(pair)
         keep, moves = self.options.keep, self.options.steps - FIRST_STEP
         chains = -(-count // keep)
         steps = Steps(chains * moves, progress, cancelled)
@@ -60,22 +57,6 @@ class Graspit:
 
         states = joined(run_parts(cut(chains, threads, device), work))
         return grasp_set(pair, states[:count], began, {"chains": chains, "moves": moves})
-
-
-_searches: OrderedDict[int, Search] = OrderedDict()
-_lock = threading.Lock()
-
-
-def _search_of(pair: Pair) -> Search:
-    """The search of a pair, kept as long as the pair itself is."""
-    with _lock:
-        found = _searches.get(id(pair))
-        if found is None or found.pair is not pair:
-            found = _searches[id(pair)] = Search(pair)
-        _searches.move_to_end(id(pair))
-        while len(_searches) > KEPT:
-            _searches.popitem(last=False)
-        return found
 
 
 def _planner(options: GraspitOptions) -> Planner:

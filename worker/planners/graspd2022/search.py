@@ -1,0 +1,163 @@
+"""The optimisation of a batch of hands: kinematics, forces, gradient, Adam, as a fixed list of launches."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.hands.surface import sample_surface
+from worker.planners.fast_graspd.pairs import Pair
+from worker.planners.graspd2022 import kernels
+from worker.planners.graspd2022.grid import distance_grid
+from worker.planners.parts import Steps
+from worker.simulation.kernels import kinematics, optimizers, pieces
+from worker.simulation.simulation import MAX_DILATION, HandState, Schedule, Simulation
+from worker.transforms import quat_rotate
+
+Floats = NDArray[np.float64]
+
+#: Hand points: the source's hand has 778 vertices.
+POINTS: Final = 778
+#: The source's constants, SI units: stiffness, viscous friction, friction, time step, speed, mass.
+STIFFNESS: Final = 1e5
+VISCOUS: Final = 1e3
+FRICTION: Final = 0.5
+STEP_S: Final = 1e-5
+SPEED: Final = 0.01
+MASS: Final = 1.0
+LEAK: Final = 0.1
+MISMATCH: Final = 1e-2
+TOLERANCE_N: Final = 10.0
+DAMPING: Final = 1.0
+FORCE_RATE: Final = 1e-2
+#: Rates of Adam: root position [m], root rotation (1e-3 on a quaternion's numbers) [rad], joints [rad].
+RATES: Final = (1e-3, 2e-3, 3e-3)
+WARMUP: Final = 200
+#: The dilated object starts this far from the hand [m]; hands start this far behind the nearest free place [m].
+APART_M: Final = 0.01
+BACKOFF_M: Final = 0.05
+CHUNK: Final = 25
+
+
+def schedule(steps: int) -> Schedule:
+    """Dilation to 0 over the first half; rates grow over the first `WARMUP` iterations."""
+    at = np.arange(steps)
+    dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
+    rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)
+    # Hands in hands press by the same stiffness, squared as the other forces are.
+    own = np.full(steps, STIFFNESS**2)
+    zero = np.zeros(steps)
+    return Schedule(dilation, zero, zero, own, rates)
+
+
+def physics_of(gyration: float, *, mismatch: float = MISMATCH) -> Any:
+    """The constants as the kernels have them; `gyration` [m] weighs torques."""
+    out = kernels.Physics()
+    out.stiffness, out.viscous, out.friction, out.leak = STIFFNESS, VISCOUS, FRICTION, LEAK
+    out.mismatch, out.gyration, out.tolerance = mismatch, gyration, TOLERANCE_N
+    out.damping, out.rate, out.warmup = DAMPING, FORCE_RATE, float(WARMUP)
+    return out
+
+
+class Search:
+    """One hand on one object as Grasp'D sees them; hands are given in batches."""
+
+    def __init__(self, pair: Pair, cells: int) -> None:
+        self.pair, self.cells = pair, cells
+        self.grid = distance_grid(pair.fine.obj, cells)
+        self.points = sample_surface(pair.hand.model, POINTS)
+
+    def run(self, starts: HandState, *, steps: int, tell: Steps) -> tuple[HandState, Floats]:
+        """The hands after `steps` iterations, and the residual of their forces against the task, (n,) of 1."""
+        batch = _Batch(self, _retreated(self.pair, starts), steps)
+        n = len(starts.pivot)
+        for first in range(0, steps, CHUNK):
+            count = min(CHUNK, steps - first)
+            batch.run(count)
+            tell(n * count, "descent")
+        return batch.simulation.state(n), batch.residual()
+
+
+def _retreated(pair: Pair, starts: HandState) -> HandState:
+    back = quat_rotate(starts.rotation, pair.hand.model.palm.approach)
+    return HandState(starts.pivot - BACKOFF_M * back, starts.rotation, starts.q)
+
+
+class _Batch:
+    """Arrays and launches of a batch."""
+
+    def __init__(self, search: Search, starts: HandState, steps: int) -> None:
+        pair, n = search.pair, len(starts.pivot)
+        self.grid, self.n = search.grid, n
+        self.simulation = Simulation(
+            pair.hand, pair.fine.obj, search.points, pair.coarse.own, capacity=n, options=pair.options
+        )
+        self.device = self.simulation.device
+        self.physics = physics_of(pair.fine.obj.model.gyration_radius)
+        velocity = SPEED * np.array([[0.0, 0, 0], [1, 1, 1], [-1, -1, -1]])
+        wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
+        self.wanted = wanted
+        with wp.ScopedDevice(self.device):
+            self.velocity = wp.array(velocity, dtype=wp.vec3)
+            self.task = wp.array(wanted, dtype=kernels.vec6)
+            shape = (n, POINTS, 3)
+            self.force, self.first, self.largest = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
+            self.total, self.pull = (wp.zeros((n, 3), dtype=kernels.vec6) for _ in range(2))
+            self.multiplier, self.gap = (wp.zeros((n, 3), dtype=wp.float32) for _ in range(2))
+        self.simulation.set_schedule(schedule(steps))
+        self.simulation.set_state(starts)
+        self.simulation.dilation_scale.assign(self._first_dilation())
+        self.launches = self._record()
+
+    def _forward(self) -> list[Any]:
+        s = self.simulation
+        return [s.hand.tree, s.active, s.pivot, s.rotation, s.q, s.body_p, s.body_q, s.axis, s.force, s.torque,
+                s.contacts, s.point_depth, s.object_depth, s.self_depth]  # fmt: skip
+
+    def _first_dilation(self) -> NDArray[np.float32]:
+        """(n,) share of `MAX_DILATION` at which the dilated object is `APART_M` from each hand."""
+        s = self.simulation
+        with wp.ScopedDevice(self.device):
+            least = wp.full(self.n, 1e3, dtype=wp.float32)
+            wp.launch(kinematics.forward, self.n, inputs=self._forward())
+            wp.launch(
+                kernels.nearest, (self.n, POINTS),
+                inputs=[self.grid, s.point_body, s.point_position, s.body_p, s.body_q, least],
+            )  # fmt: skip
+            return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
+
+    def _record(self) -> list[Any]:
+        s, n = self.simulation, self.n
+        pose = [s.body_p, s.body_q]
+        wrench = [s.force, s.torque]
+        forces = [self.force, self.first, self.largest, self.total]
+        steps: list[tuple[Any, Any, list[Any]]] = [
+            (kinematics.forward, n, self._forward()),
+            (kernels.multipliers, (n, 3),
+             [self.physics, s.active, self.task, self.total, self.multiplier, self.pull, self.gap]),
+            (kernels.relax, (n, POINTS),
+             [self.physics, self.grid, s.active, s.iteration, s.dilation, s.dilation_scale, self.velocity,
+              s.point_body, s.point_position, *pose, self.pull, *forces, *wrench]),
+            (pieces.pieces_in_pieces, (n, len(s.hand.model.pieces)),
+             [s.hand.pieces, s.body_points, s.self_scale, 0.0, s.active, s.iteration, s.self_weight, *pose, *wrench,
+              s.self_depth]),
+            (kinematics.backward, n, [s.hand.tree, s.active, s.pivot, s.body_p, s.axis, *wrench, s.gradient]),
+            (optimizers.adam, n,
+             [s.active, s.iteration, s.rates, 0.9, 0.999, s.hand.lower, s.hand.upper, s.gradient, s.first, s.second,
+              s.pivot, s.rotation, s.q]),
+            (optimizers.advance, 1, [s.iteration]),
+        ]  # fmt: skip
+        return [wp.launch(k, dim, inputs=inputs, device=self.device, record_cmd=True) for k, dim, inputs in steps]
+
+    def run(self, iterations: int) -> None:
+        """Launch so many iterations."""
+        for _ in range(iterations):
+            for launch in self.launches:
+                launch.launch()
+
+    def residual(self) -> Floats:
+        """(n,) largest residual of the moving tasks, 1: as if nothing touched."""
+        return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
