@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import lru_cache
 from typing import Any, Final
 
 from api.models import GraspDetail, Posture, Push
 from service.errors import InputError, NotFoundError
 from service.index.views import GraspView, ShardView
-from service.shards import Shard, read_shard
+from service.shards import SCHEMAS, Shard, read_shard
 from service.store import Store
 
 #: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.
 _KEPT_SHARDS: Final = 64
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 _SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
-#: As `quality/verdict_outcome` of the schema numbers them.
-OUTCOMES: Final = ("held", "not tried", "penetration", "displaced", "rotated", "no contact", "unstable")
+_OUTCOME: Final = "quality/verdict_outcome"
+#: What the numbers of the column mean, as its description in the schema says.
+OUTCOMES: Final = {
+    int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_OUTCOME].description)
+}
 DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
 
 
@@ -63,12 +67,12 @@ def _posture(file: Shard, name: str, row: int) -> Posture:
 
 
 def _pushes(file: Shard, row: int) -> list[Push]:
-    outcomes = file.arrays.get("quality/verdict_outcome")
+    outcomes = file.arrays.get(_OUTCOME)
     if outcomes is None or _verdict(file, "quality/success", row) is None:
         return []
     codes = outcomes[row].tolist()
     return [
-        Push(direction=direction, outcome=OUTCOMES[code] if code < len(OUTCOMES) else "unknown")
+        Push(direction=direction, outcome=OUTCOMES.get(code, "unknown"))
         for direction, code in zip(DIRECTIONS, codes, strict=False)
     ]
 

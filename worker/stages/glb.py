@@ -19,7 +19,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals
 
 #: Points on the hand from which a viewer measures its distance to the object.
-SURFACE_POINTS: Final = 1500
+SURFACE_POINTS: Final = 3000
 _FLOAT, _BYTE, _U32 = 5126, 5120, 5125
 _POINTS: Final = 0
 _ARRAY, _ELEMENTS = 34962, 34963
