@@ -40,7 +40,8 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
     ("bench", "worker.studies.commands", "Studies", "Grasps per second, and where the time goes."),
     ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
-    ("export", "worker.rendering.commands", "Without a server", "Pictures as PNG, OpenEXR and JSON files."),
+    ("export", "worker.exchange.commands", "Without a server", "Grasps and pictures in the formats of others."),
+    ("import", "worker.exchange.commands", "Without a server", "Grasps of others, judged and measured like ours."),
     ("gallery", "worker.rendering.studies", "Studies", "Hands and objects at rest, as a camera sees them."),
     ("bench-render", "worker.rendering.studies", "Studies", "Images per second, and where the time goes."),
 )

@@ -105,6 +105,30 @@ def certified_grasps(
     return work.finish(rounds, count)
 
 
+def scored(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    request: JobRequest,
+    *,
+    threads: int = 0,
+    pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
+    progress: Progress = lambda done, total, message: None,
+    cancelled: Cancelled = lambda: False,
+) -> Certified:
+    """Grasps that are there already, judged and measured as `request` says; all of them are kept.
+
+    Raises:
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `cancelled()` answers True.
+    """
+    work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, threads, "cpu", progress, cancelled)
+    with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
+        work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
+        work.tried = len(grasps)
+        return work.finish([work.score(grasps)], len(grasps))
+
+
 def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
     """Grasps to plan next: as many as the rate so far promises to be enough, and a tenth more.
 
@@ -182,7 +206,11 @@ class _Work:
         )  # fmt: skip
         self.tried += size
         self.seconds["planner"] += planned.seconds
-        every = request.want == "raw"
+        return self.score(planned)
+
+    def score(self, planned: GraspSet) -> _Round:
+        """Judge and measure grasps, and keep those that are wanted."""
+        size, every = len(planned), self.request.want == "raw"
         columns = self._judged(planned)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)

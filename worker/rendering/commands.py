@@ -1,4 +1,4 @@
-"""Command line: `graspd render`, `graspd pictures` and `graspd export`."""
+"""Command line: `graspd render` and `graspd pictures`."""
 
 from __future__ import annotations
 
@@ -132,30 +132,6 @@ def pictures(
         emit({"file": str(output), "grasps": len(rows), "rows": rows.tolist()})
     else:
         typer.echo(f"{output}: the best {len(rows)} grasps")
-
-
-@app.command(epilog="graspd export views.h5 --format images -o images")
-@reporting_errors
-def export(
-    shard: Annotated[Path, typer.Argument(help="A views shard, as `graspd render` writes it.")],
-    format_: Annotated[str, typer.Option("--format", help="images: PNG, OpenEXR and JSON files.")] = "images",
-    depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
-    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("images"),
-    json: JsonFlag = False,
-) -> None:
-    """Write the pictures of a shard as image files, named as Replicator's writer names them."""
-    if format_ != "images":
-        raise InputError(f"there is no export format {format_!r}; use images")
-    if depth not in ("exr", "png"):
-        raise InputError(f"there is no depth format {depth!r}; use exr or png")
-    from worker.rendering.export import export_images
-
-    views = read_shard(shard, kind="views")
-    written = export_images(views, output, depth="exr" if depth == "exr" else "png")
-    if json:
-        emit({"folder": str(output), "pictures": len(views["camera/eye"]), "files": len(written)})
-    else:
-        typer.echo(f"{output}: {len(views['camera/eye'])} pictures, {len(written)} files")
 
 
 def _drawn(scene: Shard, base_file: Path, hand: str | None) -> DrawnHand:

@@ -60,8 +60,8 @@ def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path
         return folder / f"{name}_{view:04}.{suffix}"
 
     written = [
-        _png(path("rgb", "png"), views["image/rgb"][view]),
-        _png(path("semantic_segmentation", "png"), views["image/segmentation"][view]),
+        export_png(path("rgb", "png"), views["image/rgb"][view]),
+        export_png(path("semantic_segmentation", "png"), views["image/segmentation"][view]),
         _json(path("view", "json"), describe(views, view)),
     ]
     for dataset, name in _DISTANCES.items():
@@ -70,9 +70,9 @@ def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path
             write: Callable[[Path, NDArray[np.float32]], Path] = _exr_z if depth == "exr" else _png_metres
             written.append(write(path(name, depth), metres))
     if "image/normals" in views.arrays:
-        written.append(_exr(path("normals", "exr"), "XYZ", np.moveaxis(views["image/normals"][view], -1, 0)))
+        written.append(export_exr(path("normals", "exr"), "XYZ", np.moveaxis(views["image/normals"][view], -1, 0)))
     if "image/rgb_hand" in views.arrays:
-        written.append(_png(path("rgb_hand", "png"), views["image/rgb_hand"][view]))
+        written.append(export_png(path("rgb_hand", "png"), views["image/rgb_hand"][view]))
     return written
 
 
@@ -107,7 +107,8 @@ def _labels(views: Shard) -> dict[str, dict[str, str]]:
     return {str(label): {"class": name} for label, name in names.items()}
 
 
-def _png(path: Path, pixels: NDArray[Any]) -> Path:
+def export_png(path: Path, pixels: NDArray[Any]) -> Path:
+    """An image of 8 or 16 bits."""
     Image.fromarray(np.ascontiguousarray(pixels)).save(path, compress_level=1)
     return path
 
@@ -115,14 +116,15 @@ def _png(path: Path, pixels: NDArray[Any]) -> Path:
 def _png_metres(path: Path, metres: NDArray[np.float32]) -> Path:
     steps = np.where(np.isfinite(metres), np.asarray(metres, float) / PNG_STEP_M, 0.0)
     # What is too far for 16 bits says so by the largest value, not by wrapping round.
-    return _png(path, np.clip(np.rint(steps), 0, 65535).astype(np.uint16))
+    return export_png(path, np.clip(np.rint(steps), 0, 65535).astype(np.uint16))
 
 
 def _exr_z(path: Path, metres: NDArray[np.float32]) -> Path:
-    return _exr(path, "Z", [metres])
+    return export_exr(path, "Z", [metres])
 
 
-def _exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[Any]) -> Path:
+def export_exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[Any]) -> Path:
+    """Channels of one letter each as OpenEXR, in the type of their planes (H, W)."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
     with OpenEXR.File(header, channels, 1) as file:
