@@ -105,6 +105,23 @@ def rebuild(
         raise typer.Exit(1)
 
 
+@index_app.command(epilog="graspd index downgrade 0003")
+@reporting_errors
+def downgrade(
+    revision: Annotated[str, typer.Argument(help="Revision of the older graspd: the newest of its migrations.")],
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take the index back to an earlier schema, before an older graspd is installed. Stop the service first."""
+    from service.index.database import downgrade as take_back
+
+    take_back(load_settings(data_dir=data_dir).resolved_index_url, revision)
+    if json:
+        emit({"revision": revision})
+    else:
+        typer.echo(f"the index has revision {revision}; the next start of this graspd would bring it forward again")
+
+
 @index_app.command(epilog="graspd index path")
 @reporting_errors
 def path(data_dir: DataDir = None) -> None:

@@ -11,9 +11,10 @@ from typing import Any, Final
 
 from alembic import command
 from alembic.config import Config
+from alembic.util import CommandError
 from sqlalchemy import Connection, Engine, Table, create_engine, event, make_url, text
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from service.errors import IndexUnavailable, InputError
 
@@ -22,6 +23,8 @@ _MIGRATIONS: Final = Path(__file__).parent / "migrations"
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
 _MIGRATION_LOCK: Final = 0x67727370
+#: The same for one writer at a time.
+_WRITE_LOCK: Final = 0x67727371
 
 
 class Database:
@@ -45,11 +48,17 @@ class Database:
         with _mapped(), self._engine.connect() as connection:
             if connection.dialect.name == "sqlite":
                 connection.exec_driver_sql("BEGIN")
+            else:
+                connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
 
     @contextmanager
     def writing(self, within: Connection | None = None) -> Iterator[Connection]:
-        """A transaction, or part of the one given: all of it is kept or nothing. Threads of one process take turns."""
+        """A transaction, or part of the one given: all of it is kept or nothing. Writers take turns, on every database.
+
+        States are derived from facts that are read in the same transaction: two of these at once would each miss what
+        the other brings.
+        """
         if within is not None:
             yield within
             return
@@ -57,6 +66,9 @@ class Database:
             if connection.dialect.name == "sqlite":
                 # A transaction that reads first and writes later fails at once when another one wrote in between.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
+            else:
+                connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITE_LOCK})
             yield connection
             connection.commit()
 
@@ -120,7 +132,36 @@ def _sqlite_engine(url: str, database: str | None) -> Engine:
     return engine
 
 
+def downgrade(url: str, revision: str) -> None:
+    """Take the schema back to an earlier revision, before an older graspd is installed that knows no later one.
+
+    Raises:
+        InputError: there is no such revision, or it is later than the schema's.
+    """
+    engine = _engine(url)
+    try:
+        with _mapped(), _migrating(engine) as config:
+            command.downgrade(config, revision)
+    except CommandError as error:
+        raise InputError(f"the index cannot go back to revision {revision!r}: {_line(error)}") from None
+    finally:
+        engine.dispose()
+
+
 def _migrate(engine: Engine) -> None:
+    try:
+        with _migrating(engine) as config:
+            command.upgrade(config, "head")
+    except CommandError as error:
+        raise IndexUnavailable(
+            f"the index was made by another version of graspd ({_line(error)}); use that version, or run its "
+            "`graspd index downgrade`, or delete the index: it is made again from the store"
+        ) from None
+
+
+@contextmanager
+def _migrating(engine: Engine) -> Iterator[Config]:
+    """Alembic's configuration while no other process migrates; all of a migration is kept or nothing."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
             connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _MIGRATION_LOCK})
@@ -130,10 +171,11 @@ def _migrate(engine: Engine) -> None:
             config = Config()
             config.set_main_option("script_location", str(_MIGRATIONS))
             config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            yield config
             connection.commit()
         finally:
             if connection.dialect.name == "postgresql":
+                connection.rollback()  # what broke off, or the lock could not be given back
                 connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _MIGRATION_LOCK})
                 connection.commit()
 
@@ -142,6 +184,9 @@ def _migrate(engine: Engine) -> None:
 def _mapped() -> Iterator[None]:
     try:
         yield
+    except DataError as error:
+        # Not the database is at fault but what it was to hold: to try again would never end.
+        raise InputError(f"the index cannot hold this: {_line(error)}") from error
     except SQLAlchemyError as error:
         raise IndexUnavailable(f"the index does not answer or cannot be written: {_line(error)}") from error
 
