@@ -201,6 +201,17 @@ class Asset(Model):
     facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
 
 
+class Origin(Model):
+    """Where a job came from, for the logs and traces of its tasks; nothing is decided by it."""
+
+    request: str = Field("", max_length=64, description="id of the HTTP request")
+    key: str = Field("", max_length=64, description="name of the API key")
+    traceparent: str = Field("", max_length=64, description="W3C trace context")
+
+    # A newer front door may say more.
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
 class TaskMessage(Model):
     """What travels through the queue: enough for a worker with the store alone to do the task."""
 
@@ -219,6 +230,7 @@ class TaskMessage(Model):
     object_digest: Digest
     inputs: tuple[str, ...] = Field((), description="shard ids this task reads")
     output: str = Field(description="shard id this task writes")
+    origin: Origin | None = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from service import names
 from service.clock import timestamp
 from service.digests import job_id
-from service.domain import AssetKind, JobRequest, Lane, State
+from service.domain import AssetKind, JobRequest, Lane, Origin, State
 from service.errors import ConflictError, InputError, UnavailableError
 from service.index.feed import ReadyTask
 from service.index.views import AssetView, JobView
+from service.logs import bound
 from service.parts import Parts
 from service.planning import lane_of, message_of
 from service.queue.port import Event, EventKind
@@ -55,6 +56,7 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> J
         object_digest=obj.digest,
         lane=lane or lane_of(request),
         created=timestamp(),
+        origin=_present_origin(),
     )
 
 
@@ -87,7 +89,7 @@ def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
     in_queue = parts.index.unfinished_tasks(job_id)
     add_job_event(parts.store, job_id, "cancelled", cause=cause)
-    parts.index.set_job_events(job_id, job_events(parts.store, job_id))
+    _index_events(parts, job_id)
     try:
         parts.queue.discard(in_queue)
     except UnavailableError as error:
@@ -109,7 +111,7 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
     if job.state not in (State.FAILED, State.CANCELLED):
         raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
     add_job_event(parts.store, job_id, "retried", parts.index.failed_tasks(job_id), cause=cause)
-    parts.index.set_job_events(job_id, job_events(parts.store, job_id))
+    _index_events(parts, job_id)
     _start(parts, job_id)
     return _told(parts, job_id)
 
@@ -149,6 +151,12 @@ def _start(parts: Parts, job_id: str) -> None:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
 
 
+def _index_events(parts: Parts, job_id: str) -> None:
+    """What users did to a job, read while nobody else writes: of two at once the later one must know of both events."""
+    with parts.index.writing() as connection:
+        parts.index.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
+
+
 def _told(parts: Parts, job_id: str) -> JobView:
     job = parts.index.job(job_id)
     try:
@@ -172,6 +180,12 @@ def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
     if asset.verdict is None:
         raise ConflictError(f"{kind.value} {name!r} is still being checked; submit again in a moment")
     return asset
+
+
+def _present_origin() -> Origin | None:
+    """The request that is being answered now, if any."""
+    origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
+    return origin if origin != Origin() else None
 
 
 def _ended(state: State) -> str:

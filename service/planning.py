@@ -105,6 +105,7 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
         object_digest=job.object_digest,
         inputs=task.inputs,
         output=task.output,
+        origin=job.origin,
     )
 
 

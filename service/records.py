@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service import names
 from service.clock import timestamp
-from service.domain import Digest, JobRequest, Lane, Stage
+from service.domain import Digest, JobRequest, Lane, Origin, Stage
 from service.errors import StoreUnavailable
 from service.store import Store
 from service.version import STAGE_REVISIONS
@@ -34,6 +34,7 @@ class JobRecord(Record):
     object_digest: Digest
     lane: Lane
     created: str
+    origin: Origin | None = None
 
     @model_validator(mode="before")
     @classmethod

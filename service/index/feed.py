@@ -42,7 +42,7 @@ class Feed(Database):
     def ready_tasks(self, lane: Lane, *, now: float, limit: int) -> list[ReadyTask]:
         """Tasks to be queued: batch by batch over all jobs, so that no job waits behind all of another."""
         query = (
-            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.hand_digest, jobs.c.object_digest)
+            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.ready.is_(True), tasks.c.queued.is_(False), tasks.c.lane == lane.value)
             .where(_due(tasks.c.not_before, now))
@@ -55,7 +55,7 @@ class Feed(Database):
     def ready_of_job(self, job_id: str, *, limit: int) -> list[ReadyTask]:
         """The first tasks of one job that may be queued."""
         query = (
-            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.hand_digest, jobs.c.object_digest)
+            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
             .join(jobs, jobs.c.id == tasks.c.job_id)
             .where(tasks.c.job_id == job_id, tasks.c.ready.is_(True), tasks.c.queued.is_(False))
             .order_by(tasks.c.batch)
@@ -124,6 +124,7 @@ def _ready(row: Any) -> ReadyTask:
         id=row["job_id"],
         request=row["request"],
         revisions=row["revisions"],
+        origin=row["origin"],
         hand_digest=row["hand_digest"],
         object_digest=row["object_digest"],
         lane=row["lane"],

@@ -25,6 +25,7 @@ def job_row(record: JobRecord) -> Row:
         "object_digest": record.object_digest,
         "request": record.request.model_dump(mode="json"),
         "revisions": dict(record.revisions),
+        "origin": record.origin and record.origin.model_dump(exclude_defaults=True),
         "cancelled": False,
         "created": record.created,
         "finished": None,

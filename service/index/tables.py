@@ -23,6 +23,7 @@ jobs: Final = Table(
     Column("object_digest", String(32), nullable=False),
     Column("request", JSON, nullable=False),
     Column("revisions", JSON, nullable=False, server_default='{"synthesize": 1, "scene": 1, "render": 1}'),
+    Column("origin", JSON(none_as_null=True)),
     Column("cancelled", Boolean, nullable=False),
     Column("created", String(32), nullable=False),
     Column("finished", String(32)),
