@@ -10,9 +10,9 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service import names
+from service import logs, names
 from service.clock import timestamp
-from service.domain import IngestMessage, Stage, TaskMessage
+from service.domain import IngestMessage, Origin, Stage, TaskMessage
 from service.errors import InputError, TaskCancelled, TaskRefused, UnavailableError
 from service.manifests import publish_shard, shard_exists
 from service.queue.port import Event, EventKind, Message
@@ -50,8 +50,12 @@ class Runner:
         Raises:
             TaskRefused: the message cannot be read, so there is no task to fail.
         """
-        started, clock = timestamp(), time.monotonic()
         message = parse_message(raw)
+        with logs.bind(**_subjects(message)):
+            return self._run(message, raw, context)
+
+    def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
+        started, clock = timestamp(), time.monotonic()
         try:
             if raw.get("schema") != TASK_SCHEMA:
                 raise TaskRefused(
@@ -71,7 +75,7 @@ class Runner:
         except Exception as error:
             return self._failed(message, error, context, started)
         finally:
-            log.info("task %s (%s) took %.2f s", message.task_id, message.stage, time.monotonic() - clock)
+            log.info("%s took %.2f s", message.stage, time.monotonic() - clock)
 
     def _do(self, message: Message, context: TaskContext) -> Event:
         context.check()
@@ -104,7 +108,7 @@ class Runner:
         return None if kind is None else self._event(kind, message, output=output_of(message))
 
     def _failed(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
-        log.warning("task %s failed: %s", message.task_id, error, exc_info=not isinstance(error, InputError))
+        log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
         # Bad input does not get better by trying again.
         last = isinstance(error, InputError | TaskRefused) or message.attempt >= message.max_attempt
         attempt = AttemptRecord(
@@ -153,6 +157,15 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
         return model.model_validate({key: value for key, value in raw.items() if key in known})
     except (ValidationError, AttributeError) as error:
         raise TaskRefused(f"the queue holds something that is no task of graspd: {_one_line(error)}") from None
+
+
+def _subjects(message: Message) -> dict[str, Any]:
+    """What every log line of a task says it is about."""
+    found: dict[str, Any] = {"task": message.task_id, "attempt": message.attempt}
+    if isinstance(message, TaskMessage):
+        origin = message.origin or Origin()
+        found |= {"job": message.job_id, "request": origin.request, "key": origin.key}
+    return found
 
 
 def output_of(message: Message) -> str:
