@@ -10,8 +10,9 @@ import numpy as np
 from service.errors import InputError
 from worker.hands.load import assemble, main_file
 from worker.hands.model import HandModel
-from worker.hands.options import parse_options
+from worker.hands.options import HandOptions, parse_options
 from worker.hands.surface import sample_surface
+from worker.hands.tree import joints_above
 from worker.hands.urdf import Urdf, read_urdf
 
 #: Points with which the outer surface is measured.
@@ -42,7 +43,17 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
         f"{len(hand.pieces)} convex pieces; palm {hand.root_link!r} facing {_direction(hand)}"
     )
-    return {"verdict": "accept", "message": "; ".join([message, *urdf.notes]), "repairs": [], "facts": facts}
+    notes = [*urdf.notes, *_left_out(urdf, hand, settings)]
+    facts["notes"] = notes
+    return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
+
+
+def _left_out(urdf: Urdf, hand: HandModel, settings: HandOptions) -> list[str]:
+    """What a user must know of a hand that was cut off its arm without having said so."""
+    above = joints_above(urdf, hand.root_link)
+    if settings.root or not above:
+        return []
+    return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {urdf.root})"]
 
 
 def hand_facts(hand: HandModel, urdf: Urdf) -> dict[str, Any]:

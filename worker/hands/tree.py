@@ -87,7 +87,7 @@ def _check_names(urdf: Urdf, options: HandOptions) -> None:
 
 
 def _pick_root(urdf: Urdf, options: HandOptions) -> str:
-    """The chosen root; else the URDF's, moved down past dropped links and empty frames joined by fixed joints."""
+    """The chosen root; else the URDF's, moved down past dropped links, and past the joints of an arm or a wrist."""
     if options.root:
         return options.root
     root, drop = urdf.root, set(options.drop)
@@ -96,7 +96,44 @@ def _pick_root(urdf: Urdf, options: HandOptions) -> str:
         if len(children) != 1:
             raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
         root = children[0]
-    return root
+    return _below_arm(urdf, root, options)
+
+
+def _below_arm(urdf: Urdf, root: str, options: HandOptions) -> str:
+    """Where a hand on an arm begins: behind the last moving joint before the fingers part; else the root itself."""
+    start, at = root, root
+    palm = options.palm.link if options.palm else None
+    while at != palm:
+        onward = [joint for joint in urdf.joints.values() if joint.parent == at and _moves(urdf, joint, options)]
+        if len(onward) != 1:
+            # A tree that never parts is a single finger: nothing above it is an arm.
+            return start if onward else root
+        (joint,) = onward
+        at = joint.child
+        if joint.type != "fixed" and joint.name not in options.fix:
+            start = at
+    return start
+
+
+def _moves(urdf: Urdf, joint: Joint, options: HandOptions) -> bool:
+    """Whether the joint, or one behind it, moves."""
+    if joint.child in options.drop:
+        return False
+    if joint.type != "fixed" and joint.name not in options.fix:
+        return True
+    return any(_moves(urdf, after, options) for after in urdf.joints.values() if after.parent == joint.child)
+
+
+def joints_above(urdf: Urdf, link: str) -> tuple[str, ...]:
+    """Moving joints between the URDF's root and a link, from the root on."""
+    carrier = {joint.child: joint for joint in urdf.joints.values()}
+    found: list[str] = []
+    while link in carrier:
+        joint = carrier[link]
+        if joint.type != "fixed":
+            found.insert(0, joint.name)
+        link = joint.parent
+    return tuple(found)
 
 
 def _kept_joints(urdf: Urdf, root: str, drop: set[str]) -> list[Joint]:

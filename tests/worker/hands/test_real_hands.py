@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 import yourdfpy
 
+from worker.hands.check import check_hand
 from worker.hands.kinematics import body_poses
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
@@ -67,23 +71,60 @@ def test_hulls_are_small_enough_for_fast_queries(real: tuple[str, Path, HandMode
 @pytest.mark.parametrize(
     ("name", "root", "normal"),
     [
-        ("allegro", None, (1, 0, 0)),
-        ("barrett", None, (0, 0, 1)),
-        ("bh280", None, (0, 0, 1)),
+        ("allegro", "base_link", (1, 0, 0)),
+        ("barrett", "base_link", (0, 0, 1)),
+        ("bh280", "bh_palm", (0, 0, 1)),
         ("shadow", "palm", (0, -1, 0)),
     ],
 )
-def test_the_palm_normal_is_guessed_right(
-    shared_data: Path, name: str, root: str | None, normal: tuple[int, int, int]
+def test_root_and_palm_normal_are_guessed_from_the_urdf_alone(
+    shared_data: Path, name: str, root: str, normal: tuple[int, int, int]
 ) -> None:
-    path = shared_data / "hands" / URDFS[name]
-    _, files, _ = files_from_path(path)
-    hand = load_hand(files, name=name, digest="0" * 32, options={"root": root} if root else {})
+    hand = bare(shared_data, name)
+    assert hand.root_link == root
     np.testing.assert_allclose(hand.palm.approach, normal, atol=1e-9)
 
 
 def load(shared_data: Path, name: str) -> HandModel:
     return hand_from_path(shared_data / "hands" / URDFS[name])
+
+
+def bare(shared_data: Path, name: str, **options: object) -> HandModel:
+    """The hand from its URDF and meshes alone, without the notes beside them."""
+    _, files, _ = files_from_path(shared_data / "hands" / URDFS[name])
+    return load_hand(files, name=name, digest="0" * 32, options=options)
+
+
+def facts(shared_data: Path, name: str) -> dict[str, Any]:
+    """The notes on a hand."""
+    return json.loads((shared_data / "hands" / URDFS[name]).with_name("hand.json").read_text())
+
+
+def test_every_real_hand_is_accepted_as_it_is(shared_data: Path) -> None:
+    for name in URDFS:
+        _, files, _ = files_from_path(shared_data / "hands" / URDFS[name])
+        found = check_hand(files, name)
+        assert found["verdict"] == "accept", found["message"]
+        said = facts(shared_data, name)
+        assert len(found["facts"]["fingertips"]) == len(said["fingertips"])
+        above = 2 if name == "shadow" else 0
+        assert len(found["facts"]["dofs"]) == said["dof"] - above
+
+
+def test_allegro_frames_without_inertia_weigh_next_to_nothing(shared_data: Path) -> None:
+    hand, said = load(shared_data, "allegro"), facts(shared_data, "allegro")
+    assert said["inertial_missing"] == ["palm", "wrist"]
+    assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], abs=2e-3)
+    assert (hand.masses > 0).all()
+
+
+def test_allegro_fingertips_of_one_mesh_file_are_four_equal_pieces(shared_data: Path) -> None:
+    tips = [p for p in load(shared_data, "allegro").pieces if p.kind == "hull"]
+    assert len(tips) == 4 and len({p.body for p in tips}) == 4
+    own = [piece.vertices - piece.vertices.mean(axis=0) for piece in tips]
+    spans = [np.sort(np.linalg.norm(vertices, axis=1)) for vertices in own]
+    for span in spans[1:]:
+        np.testing.assert_allclose(span, spans[0], atol=1e-9)
 
 
 def test_allegro_posture_respects_limits_that_exclude_zero(shared_data: Path) -> None:
@@ -109,6 +150,45 @@ def test_barrett_closes_in_the_negative_direction(shared_data: Path) -> None:
 def test_barrett_spread_joints_close_nothing(shared_data: Path) -> None:
     hand = load(shared_data, "barrett")
     assert (hand.closing[[i for i, name in enumerate(hand.dof_names) if "prox" in name]] == 0).all()
+
+
+def test_barrett_masses_are_those_of_the_urdf_however_wrong(shared_data: Path) -> None:
+    # 3 kg for a hand of 1 kg: nothing that is static needs them, so they are kept and shown, not corrected.
+    hand, said = load(shared_data, "barrett"), facts(shared_data, "barrett")
+    assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], rel=1e-4)
+
+
+def test_barrett_link_with_a_typo_in_its_name_is_a_link_like_others(shared_data: Path) -> None:
+    hand = load(shared_data, "barrett")
+    assert "finger_1_med_liink" in hand.body_names
+    assert hand_from_path(shared_data / "hands" / URDFS["barrett"], {"drop": ["finger_1_med_liink"]}).dofs == 6
+
+
+def test_barrett_without_tip_frames_has_its_last_links_as_fingertips(shared_data: Path) -> None:
+    hand = bare(shared_data, "barrett")
+    named = [hand.body_names[body] for body in hand.fingertips]
+    assert sorted(named) == sorted(facts(shared_data, "barrett")["fingertips"].values())
+
+
+def test_bh280_fingers_are_open_and_side_by_side_at_zero(shared_data: Path) -> None:
+    hand = load(shared_data, "bh280")
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(np.zeros(4)))[0]
+    first, second = (poses[hand.body_names.index(f"bh_finger_{k}3"), :3] for k in (1, 2))
+    # Fingers 1 and 2 stand 5 cm apart on the same side of the palm, finger 3 on the other.
+    third = poses[hand.body_names.index("bh_finger_33"), :3]
+    across = first - second
+    axis = int(np.argmax(np.abs(across)))
+    assert np.delete(across, axis) == pytest.approx([0.0, 0.0], abs=1e-6) and abs(across[axis]) < 0.06
+    assert np.linalg.norm(third - first) > 0.1
+
+
+def test_bh280_transmissions_and_foreign_tags_do_not_matter(shared_data: Path) -> None:
+    _, files, _ = files_from_path(shared_data / "hands" / URDFS["bh280"])
+    text = files["bh280.urdf"]
+    assert b"<transmission" in text and b"drake:" in text and b"FROGGERCOL" in text
+    hand = bare(shared_data, "bh280")
+    assert not [name for name in hand.body_names if "FROGGER" in name]
+    assert len(hand.pieces) >= sum(facts(shared_data, "bh280")["collision_elements"].values())
 
 
 def test_bh280_mimic_tags_leave_four_degrees_of_freedom(shared_data: Path) -> None:
@@ -145,8 +225,37 @@ def test_shadow_meshes_of_two_units_come_out_alike(shared_data: Path) -> None:
     assert extents["ffdistal"] == pytest.approx(0.027, abs=2e-3)
 
 
+def test_shadow_has_the_tendon_coupling_that_a_user_adds(shared_data: Path) -> None:
+    fingers = ("FF", "MF", "RF", "LF")
+    assert bare(shared_data, "shadow").dofs == 22
+    couplings = {f"{finger}J1": {"of": f"{finger}J2", "multiplier": 1.0} for finger in fingers}
+    hand = bare(shared_data, "shadow", couplings=couplings)
+    assert hand.dofs == 18
+    joints = dict(zip(hand.joint_names, hand.expand(hand.upper), strict=True))
+    assert all(joints[f"{finger}J1"] == joints[f"{finger}J2"] for finger in fingers)
+
+
+def test_shadow_distal_mesh_that_is_not_watertight_becomes_a_closed_hull(shared_data: Path) -> None:
+    assert not facts(shared_data, "shadow")["collision_mesh_files"]["th_distal_pst_full.obj"]["watertight"]
+    (tip,) = (p for p in load(shared_data, "shadow").pieces if p.link == "thdistal" and p.kind == "hull")
+    assert trimesh.Trimesh(tip.vertices, tip.faces).is_watertight
+
+
+def test_shadow_root_link_without_shape_is_no_obstacle(shared_data: Path) -> None:
+    whole = bare(shared_data, "shadow", root="world")
+    assert whole.root_link == "world" and whole.dofs == 24
+    assert "forearm" in {piece.link for piece in whole.pieces}
+
+
+def test_the_check_says_which_joints_are_left_out_and_how_to_keep_them(shared_data: Path) -> None:
+    _, files, _ = files_from_path(shared_data / "hands" / URDFS["shadow"])
+    note = "WRJ2, WRJ1 above the palm left out, poses are those of 'palm' (--root world)"
+    assert check_hand(files, "shadow")["facts"]["notes"] == [note]
+    assert check_hand(files, "shadow", {"root": "world"})["facts"]["notes"] == []
+
+
 def test_shadow_forearm_and_wrist_are_left_out(shared_data: Path) -> None:
-    hand = load(shared_data, "shadow")
+    hand = bare(shared_data, "shadow")
     assert hand.root_link == "palm" and hand.dofs == 22
     assert not {"forearm", "wrist"} & {piece.link for piece in hand.pieces}
 
