@@ -93,6 +93,24 @@ def test_penetration_depth_is_that_of_the_pressed_plates() -> None:
     assert verdict.penetration_depth_mm[0] == pytest.approx(3.0, abs=0.01)
 
 
+def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
+    grasps, test = many_grasps(), Test(build(PLATES, BOX, WHOLE, Physics()))
+    ends = []
+    for anew in (False, True):
+        test._close(grasps, 3)
+        test._save()
+        test._push(0)
+        test._run(0.4)
+        if anew:
+            test._close(grasps, 3)
+        else:
+            test._restore()
+        test._push(2)
+        test._run(0.4)
+        ends.append(test.data.qpos.copy())
+    assert np.array_equal(*ends)
+
+
 @pytest.mark.parametrize("level", ["certificate", "screen"])
 def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
     grasps = many_grasps()
