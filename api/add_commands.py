@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from api.add_sets import add_set, files_of_set, name_of_set
+from api.hand_files import upload_of
 from api.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
 from service.asset_options import (
@@ -36,7 +37,9 @@ WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a
 
 @reporting_errors
 def add_hand(
-    file: Annotated[Path, typer.Argument(help="A URDF, or a ZIP of its folder.")],
+    file: Annotated[
+        Path, typer.Argument(help="A URDF, whose meshes are found beside it; its folder; or a ZIP of that.")
+    ],
     name: NameOption = None,
     palm: PalmOption = None,
     approach: ApproachOption = None,
@@ -50,7 +53,8 @@ def add_hand(
 ) -> None:
     """Upload a hand, wait for its check, and say what was guessed."""
     options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
-    _add(AssetKind.HAND, file, name, options, wait=wait, url=url, json=json)
+    with upload_of(file) as upload:
+        _add(AssetKind.HAND, upload, name, options, wait=wait, url=url, json=json)
 
 
 @reporting_errors
