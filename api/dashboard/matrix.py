@@ -90,7 +90,7 @@ def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Seque
     ordered = sorted(names, key=lambda name: (name not in worked, name))
     for hand in columns:
         for obj in ordered[:_ROWS]:
-            found.setdefault((hand, obj), Cell(hand, obj, f"{hand}|{obj}", "", "empty", 0, 0))
+            found.setdefault((hand, obj), Cell(hand, obj, f"{hand}|{obj}", "", "blank", 0, 0))
     return _grid(columns, ordered[:_ROWS], found, hidden=max(0, len(ordered) - _ROWS))
 
 

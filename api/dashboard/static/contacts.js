@@ -3,85 +3,94 @@ import { Color, DynamicDrawUsage, Group, InstancedMesh, Matrix4, MeshBasicMateri
 
 /** Points farther than this from the object are not shown [m]; it is the contact threshold of the index. */
 export const REACH_M = 0.005;
-const DOT_M = 0.0011;
+/** How far from the surface distances are known [m]: deeper than any grasp that one looks at twice. */
+const FIELD_M = 0.01;
+const DOT_M = 0.0013;
+/** Distances closer than this are one. */
+const SAME_M = 1e-7;
+/** A triangle lower than this is a sliver [m]. */
+const SLIVER_M = 1e-6;
 // Blue to red by way of green: readable with the common colour blindnesses because lightness changes too.
 const STOPS = [[-0.001, 0xd1263c], [-0.0002, 0xf0803c], [0.0003, 0x14b87a], [0.002, 0x35a2f0], [REACH_M, 0xb9d4f5]];
 
-/** Signed distance from a triangle mesh, exact within `REACH_M` of it; infinity elsewhere. */
+/** Signed distance from a triangle mesh, exact within `FIELD_M` of it; infinity elsewhere. */
 export class DistanceField {
   constructor(geometry) {
-    this.at = geometry.getAttribute("position").array;
-    this.index = geometry.index.array;
-    this.cell = 2 * REACH_M;
+    const at = geometry.getAttribute("position").array;
+    const index = geometry.index.array;
+    this.cell = FIELD_M;
     this.cells = new Map();
-    for (let t = 0; t < this.index.length; t += 3) this.#insert(t);
+    for (let t = 0; t < index.length; t += 3) {
+      const [a, b, c] = [0, 1, 2].map((k) => new Vector3().fromArray(at, 3 * index[t + k]));
+      const ab = b.clone().sub(a), ac = c.clone().sub(a);
+      const normal = ab.clone().cross(ac);
+      // A sliver of the triangulation has no direction of its own, and its neighbours cover it.
+      if (normal.length() < SLIVER_M * Math.max(ab.length(), ac.length(), b.distanceTo(c))) continue;
+      this.#insert({ a, b, c, ab, ac, normal: normal.normalize() });
+    }
   }
 
+  /**
+   * The side is told by the sum of the normals at the closest point, each weighted by its face's angle there
+   * (Baerentzen and Aanaes 2005): right on faces, edges and corners.
+   */
   distance(point) {
     let best = Infinity;
-    let sign = 1;
-    let facing = 0;
-    const normal = new Vector3();
-    const closest = new Vector3();
-    for (const t of this.cells.get(this.#key(...["x", "y", "z"].map((k) => Math.floor(point[k] / this.cell)))) ?? []) {
-      const [a, b, c] = this.#corners(t);
-      closestOnTriangle(point, a, b, c, closest);
+    const closest = new Vector3(), away = new Vector3(), side = new Vector3();
+    const [i, j, k] = [point.x, point.y, point.z].map((value) => Math.floor(value / this.cell));
+    for (const face of this.cells.get(key(i, j, k)) ?? []) {
+      const weight = closestOnTriangle(point, face, closest);
       const distance = closest.distanceTo(point);
-      if (distance > best + 1e-7) continue;
-      // Several faces share an edge or a corner: the one that looks most directly at the point tells the side.
-      normal.copy(b).sub(a).cross(c.clone().sub(a)).normalize();
-      const side = normal.dot(closest.sub(point)) * -1;
-      const directness = distance > 1e-9 ? Math.abs(side) / distance : 1;
-      if (distance < best - 1e-7 || directness > facing) {
-        facing = directness;
-        sign = side < 0 ? -1 : 1;
+      if (distance > best + SAME_M) continue;
+      if (distance < best - SAME_M) {
+        side.set(0, 0, 0);
+        away.copy(point).sub(closest);
       }
       best = Math.min(best, distance);
+      side.addScaledVector(face.normal, weight);
     }
-    return sign * best;
+    // Beyond that the nearest face may not be in the cell's list.
+    if (best > FIELD_M) return Infinity;
+    return away.dot(side) < 0 ? -best : best;
   }
 
-  #corners(t) {
-    return [0, 1, 2].map((k) => new Vector3().fromArray(this.at, 3 * this.index[t + k]));
-  }
-
-  #key(i, j, k) {
-    return (i + 512) * 1048576 + (j + 512) * 1024 + (k + 512);
-  }
-
-  #insert(t) {
-    const corners = this.#corners(t);
-    const [low, high] = [Math.min, Math.max].map((end, s) => ["x", "y", "z"].map((k) =>
-      Math.floor((end(...corners.map((corner) => corner[k])) + (s ? REACH_M : -REACH_M)) / this.cell)));
-    for (let i = low[0]; i <= high[0]; i++) {
-      for (let j = low[1]; j <= high[1]; j++) {
-        for (let k = low[2]; k <= high[2]; k++) {
-          const key = this.#key(i, j, k);
-          if (!this.cells.has(key)) this.cells.set(key, []);
-          this.cells.get(key).push(t);
+  #insert(face) {
+    const corners = [face.a, face.b, face.c];
+    const reach = (axis) => [Math.min(...corners.map((p) => p[axis])) - FIELD_M, Math.max(...corners.map((p) => p[axis])) + FIELD_M].map((v) => Math.floor(v / this.cell));
+    const [x, y, z] = ["x", "y", "z"].map(reach);
+    for (let i = x[0]; i <= x[1]; i++) {
+      for (let j = y[0]; j <= y[1]; j++) {
+        for (let k = z[0]; k <= z[1]; k++) {
+          const cell = key(i, j, k);
+          if (this.cells.has(cell)) this.cells.get(cell).push(face); else this.cells.set(cell, [face]);
         }
       }
     }
   }
 }
 
-/** Closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5). */
-function closestOnTriangle(p, a, b, c, out) {
-  const ab = b.clone().sub(a), ac = c.clone().sub(a), ap = p.clone().sub(a);
+const key = (i, j, k) => (i + 512) * 1048576 + (j + 512) * 1024 + (k + 512);
+const ap = new Vector3(), bp = new Vector3(), cp = new Vector3();
+
+/** Closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5), and the face's angle there [rad]. */
+function closestOnTriangle(p, { a, b, c, ab, ac }, out) {
+  ap.copy(p).sub(a);
   const d1 = ab.dot(ap), d2 = ac.dot(ap);
-  if (d1 <= 0 && d2 <= 0) return out.copy(a);
-  const bp = p.clone().sub(b), d3 = ab.dot(bp), d4 = ac.dot(bp);
-  if (d3 >= 0 && d4 <= d3) return out.copy(b);
+  if (d1 <= 0 && d2 <= 0) return out.copy(a), ab.angleTo(ac);
+  bp.copy(p).sub(b);
+  const d3 = ab.dot(bp), d4 = ac.dot(bp);
+  if (d3 >= 0 && d4 <= d3) return out.copy(b), bp.copy(c).sub(b).angleTo(cp.copy(a).sub(b));
   const vc = d1 * d4 - d3 * d2;
-  if (vc <= 0 && d1 >= 0 && d3 <= 0) return out.copy(a).addScaledVector(ab, d1 / (d1 - d3));
-  const cp = p.clone().sub(c), d5 = ab.dot(cp), d6 = ac.dot(cp);
-  if (d6 >= 0 && d5 <= d6) return out.copy(c);
+  if (vc <= 0 && d1 >= 0 && d3 <= 0) return out.copy(a).addScaledVector(ab, d1 / (d1 - d3)), Math.PI;
+  cp.copy(p).sub(c);
+  const d5 = ab.dot(cp), d6 = ac.dot(cp);
+  if (d6 >= 0 && d5 <= d6) return out.copy(c), bp.copy(b).sub(c).angleTo(cp.copy(a).sub(c));
   const vb = d5 * d2 - d1 * d6;
-  if (vb <= 0 && d2 >= 0 && d6 <= 0) return out.copy(a).addScaledVector(ac, d2 / (d2 - d6));
+  if (vb <= 0 && d2 >= 0 && d6 <= 0) return out.copy(a).addScaledVector(ac, d2 / (d2 - d6)), Math.PI;
   const va = d3 * d6 - d5 * d4;
-  if (va <= 0 && d4 - d3 >= 0 && d5 - d6 >= 0) return out.copy(b).addScaledVector(c.clone().sub(b), (d4 - d3) / (d4 - d3 + d5 - d6));
+  if (va <= 0 && d4 - d3 >= 0 && d5 - d6 >= 0) return out.copy(c).sub(b).multiplyScalar((d4 - d3) / (d4 - d3 + d5 - d6)).add(b), Math.PI;
   const scale = 1 / (va + vb + vc);
-  return out.copy(a).addScaledVector(ab, vb * scale).addScaledVector(ac, vc * scale);
+  return out.copy(a).addScaledVector(ab, vb * scale).addScaledVector(ac, vc * scale), 2 * Math.PI;
 }
 
 function colourOf(distance, out) {
@@ -103,7 +112,7 @@ export class Contacts {
     hand.eachPoint(() => { count += 1; });
     const dot = new SphereGeometry(DOT_M, 8, 6);
     this.front = new InstancedMesh(dot, new MeshBasicMaterial(), count);
-    this.behind = new InstancedMesh(dot, new MeshBasicMaterial({ transparent: true, opacity: 0.3, depthTest: false }), count);
+    this.behind = new InstancedMesh(dot, new MeshBasicMaterial({ transparent: true, opacity: 0.5, depthTest: false }), count);
     this.group = new Group();
     for (const mesh of [this.behind, this.front]) {
       mesh.instanceMatrix.setUsage(DynamicDrawUsage);

@@ -1,10 +1,10 @@
 // A hand that takes postures and an object, as three.js groups. Metres; poses are x y z, then quaternion w x y z.
 import { Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 
-const COLOURS = { palm: 0x4a535d, finger: 0x6b7682, tip: 0x17a398, object: 0xe3ab62 };
+const COLOURS = { palm: 0x59636f, finger: 0x7b8794, tip: 0x2bb5a8, object: 0xe8b878 };
 
-function material(color, metalness = 0) {
-  return new MeshStandardMaterial({ color, roughness: metalness ? 0.45 : 0.62, metalness });
+function material(color) {
+  return new MeshStandardMaterial({ color, roughness: 0.58, metalness: 0 });
 }
 
 function solid(geometry, look) {
@@ -16,7 +16,7 @@ function solid(geometry, look) {
 /** A hand: `pose` moves it; `group` is what to draw. */
 export class Hand {
   constructor(model) {
-    const looks = { palm: material(COLOURS.palm, 0.3), finger: material(COLOURS.finger, 0.3), tip: material(COLOURS.tip) };
+    const looks = { palm: material(COLOURS.palm), finger: material(COLOURS.finger), tip: material(COLOURS.tip) };
     this.looks = Object.values(looks);
     this.extras = model.extras;
     this.joints = new Map();

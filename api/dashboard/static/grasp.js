@@ -37,7 +37,7 @@ async function start(figure) {
     stage.invalidate();
   };
   show();
-  stage.frame(all, besideHand(hand), 0.92);
+  stage.frame(all, besideHand(hand), 0.8);
   wire(figure, { stage, hand, thing, contacts, slider, show });
   figure.dataset.state = "ready";
 }

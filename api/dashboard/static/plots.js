@@ -14,9 +14,14 @@
     return value;
   }
 
+  const clock = (seconds) => new Date(1000 * seconds).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
+
+  // Of a logarithmic axis only 1, 2, 5 times a power of ten carry a number and a line.
+  const round = (_, splits) => splits.map((v) => ([1, 2, 5].includes(Number((v / 10 ** Math.floor(Math.log10(v) + 1e-9)).toPrecision(3))) ? v : null));
+
   function options(figure, data, width) {
     const { kind, x, y, unit, log } = data;
-    const ink = resolved("ink"), line = resolved("line"), accent = resolved("accent"), soft = resolved("soft");
+    const ink = resolved("ink"), line = resolved("line"), accent = resolved("accent"), soft = resolved(kind === "bars" ? "accent" : "soft");
     const font = `12px ${colour("--sans")}`;
     const axis = { stroke: ink, font, grid: { stroke: line, width: 1 }, ticks: { show: false } };
     return {
@@ -25,11 +30,11 @@
       legend: { live: true },
       scales: { x: { time: kind === "bars" }, y: log ? { distr: 3 } : { range: (_, low, high) => [0, Math.max(high, 1) * 1.08] } },
       axes: [
-        { ...axis, grid: { show: false }, values: kind === "bars" ? (_, ticks) => ticks.map((t) => new Date(1000 * t).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" })) : undefined },
-        { ...axis, size: 52 },
+        { ...axis, size: 30, gap: 8, space: 90, grid: { show: false }, values: kind === "bars" ? (_, ticks) => ticks.map((t) => clock(t)) : undefined },
+        { ...axis, ...(log ? { filter: round, grid: { ...axis.grid, filter: round } } : {}), size: 44, gap: 8, space: 36 },
       ],
       series: [
-        { label: x, value: (_, v) => (v === null || v === undefined ? "–" : kind === "bars" ? new Date(1000 * v).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" }) : String(v)) },
+        { label: x, value: (_, v) => (v === null || v === undefined ? "–" : kind === "bars" ? clock(v) : String(v)) },
         {
           label: y, stroke: accent, fill: soft, width: kind === "bars" ? 0 : 2, points: { show: false },
           paths: kind === "bars" ? uPlot.paths.bars({ size: [0.82, 40], radius: 0.15 }) : undefined,

@@ -2,7 +2,7 @@
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand, Thing } from "./figures.js";
-import { besideHand, LiveStage } from "./stage.js";
+import { LiveStage } from "./stage.js";
 
 const stages = new Map();
 
@@ -19,10 +19,10 @@ async function show(figure) {
     const stage = stages.get(figure);
     if (stage.shown) stage.scene.remove(stage.shown);
     const made = model.extras.kind === "hand" ? new Hand(model) : new Thing(model);
-    if (made instanceof Hand) made.pose(upright(model.extras.palm.approach), model.extras.preshape);
+    if (made instanceof Hand) made.pose([0, 0, 0, 1, 0, 0, 0], model.extras.preshape);
     stage.shown = made.group;
     stage.scene.add(made.group);
-    stage.frame(made.group, made instanceof Hand ? besideHand(made) : new Vector3(1, -1.5, 0.8), 1.0);
+    stage.frame(made.group, made instanceof Hand ? beforePalm(made) : new Vector3(1, -1.5, 0.8), 1.0);
     said.textContent = "";
     figure.dataset.state = "ready";
   } catch (error) {
@@ -31,11 +31,13 @@ async function show(figure) {
   }
 }
 
-/** Pose in which the palm looks up and a little forward, as one would hold a hand to look at it. */
-function upright([x, y, z]) {
-  const half = new Vector3(x, y, z).add(new Vector3(0.35, 0.1, 0.93).normalize()).normalize();
-  // The rotation that takes the approach to the wanted direction is half a turn about their bisector.
-  return [0, 0, 0, 0, half.x, half.y, half.z];
+/** Where one sees the palm of a hand that stands in its own frame. */
+function beforePalm(hand) {
+  const approach = new Vector3(...hand.extras.palm.approach);
+  const up = new Vector3(0, 0, 1);
+  const side = new Vector3().crossVectors(up, approach);
+  if (side.length() < 0.2) return new Vector3(1, -1.2, 0.55);
+  return approach.addScaledVector(side.normalize(), 0.75).addScaledVector(up, 0.35);
 }
 
 for (const figure of document.querySelectorAll("[data-viewer=model]")) {

@@ -1,20 +1,20 @@
 // A lit stage with a camera that orbits. Draws only when something changed, so an idle page costs nothing.
 import {
-  ACESFilmicToneMapping, Box3, DirectionalLight, HemisphereLight, PCFSoftShadowMap, PerspectiveCamera, Scene, Sphere,
-  Vector3, WebGLRenderer, OrbitControls,
+  Box3, DirectionalLight, HemisphereLight, NoToneMapping, PCFShadowMap, PerspectiveCamera, Scene, Sphere, Vector3,
+  WebGLRenderer, OrbitControls,
 } from "./vendor/three.min.js";
 
 const FIELD_DEG = 32;
 const TURN = Math.PI / 24;
 
 function lit(scene) {
-  scene.add(new HemisphereLight(0xf4f7ff, 0x8a8378, 1.5));
-  const key = new DirectionalLight(0xfff4e6, 2.6);
+  scene.add(new HemisphereLight(0xffffff, 0xb5aea4, 1.9));
+  const key = new DirectionalLight(0xfff6ea, 1.9);
   key.castShadow = true;
   key.shadow.mapSize.set(1024, 1024);
   key.shadow.bias = -0.0006;
   key.shadow.normalBias = 0.0012;
-  const rim = new DirectionalLight(0xcfe3ff, 1.1);
+  const rim = new DirectionalLight(0xdbe9ff, 0.9);
   scene.add(key, key.target, rim, rim.target);
   return { key, rim };
 }
@@ -23,10 +23,9 @@ function lit(scene) {
 export class Stage {
   constructor(canvas) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: !canvas });
-    this.renderer.toneMapping = ACESFilmicToneMapping;
-    this.renderer.toneMappingExposure = 1.05;
+    this.renderer.toneMapping = NoToneMapping;
     this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = PCFSoftShadowMap;
+    this.renderer.shadowMap.type = PCFShadowMap;
     this.scene = new Scene();
     this.lights = lit(this.scene);
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01, 10);
