@@ -1,0 +1,208 @@
+"""Real hands x real objects through a whole service that is killed in the middle and started again.
+
+    python -m benchmarks.matrix DATA --data-dir /tmp/matrix --out docs/results/matrix.md
+
+DATA holds `hands/*/*.urdf` and `objects/*/clean.stl`. At a third of the work every process is killed with -9; then the
+same two commands, `graspd up` and `graspd datasets create`, go on. The page says what came out of each cell, what was
+repeated, and how far the estimate was off.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from api.client import Client
+from api.dashboard.filters import duration, size
+from api.dataset_client import DatasetClient
+from service.index.dataset_views import CellView, DatasetView
+from service.version import PACKAGE_VERSION
+
+#: Name in the service and URDF of each hand.
+HANDS: Final = {
+    "wonik_allegro": "allegro/allegro_hand_right.urdf",
+    "barrett_8dof": "barrett/bhand_model.urdf",
+    "barrett_bh280": "barrett_bh280/bh280.urdf",
+    "shadow_e3m5": "shadow/shadow_hand_right.urdf",
+}
+DATASET: Final = "matrix"
+_POLL_S: Final = 2.0
+
+
+@dataclass
+class Run:
+    """A service that can be killed, and what was seen of it."""
+
+    folder: Path
+    environment: dict[str, str]
+    processes: list[int] = field(default_factory=list)
+    url: str = ""
+
+    def up(self) -> float:
+        """Start the service; seconds until it answered."""
+        start = time.monotonic()
+        log = (self.folder / "up.log").open("ab")
+        command = [
+            sys.executable,
+            "-m",
+            "graspd",
+            "up",
+            "--port",
+            "0",
+            "--data-dir",
+            str(self.folder / "data"),
+            "--json",
+        ]
+        child = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log, env=self.environment, text=True, start_new_session=True
+        )
+        assert child.stdout is not None
+        told = json.loads(child.stdout.readline())
+        self.url = told["api_url"]
+        self.environment["GRASPD_API_URL"] = self.url
+        self.processes = [child.pid, *told["processes"].values()]
+        return time.monotonic() - start
+
+    def kill(self) -> None:
+        """kill -9 of everything at once."""
+        for pid in self.processes:
+            os.kill(pid, signal.SIGKILL)
+        os.waitpid(self.processes[0], 0)
+
+    def stop(self) -> None:
+        os.kill(self.processes[0], signal.SIGTERM)
+        os.waitpid(self.processes[0], 0)
+
+    def graspd(self, *arguments: str) -> dict[str, Any]:
+        """The JSON object of a command."""
+        command = [sys.executable, "-m", "graspd", *arguments, "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, env=self.environment, check=False)
+        if done.returncode:
+            raise SystemExit(f"{' '.join(arguments)}: {done.stderr}")
+        return json.loads(done.stdout.splitlines()[-1])
+
+    def datasets(self) -> DatasetClient:
+        return DatasetClient(Client(self.url))
+
+    def shards(self) -> dict[str, tuple[str, str]]:
+        """Checksum and time of each manifest in the store."""
+        found = {}
+        for file in (self.folder / "data" / "store" / "shards" / "base").glob("*.json"):
+            manifest = json.loads(file.read_bytes())
+            found[file.stem] = (manifest["sha256"], manifest["created"])
+        return found
+
+
+def main(
+    data: Annotated[Path, typer.Argument(help="Folder with hands/ and objects/.")],
+    data_dir: Annotated[Path, typer.Option(help="Folder of the service and its log.")],
+    out: Annotated[Path, typer.Option(help="Page to write.")],
+    grasps: Annotated[int, typer.Option(help="Valid grasps of each cell.")] = 32,
+    fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
+    kill_at: Annotated[float, typer.Option(help="Share of the work at which all is killed.")] = 0.33,
+) -> None:
+    """Run it and write the page."""
+    data_dir.mkdir(parents=True, exist_ok=True)
+    run = Run(data_dir, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")})
+    run.up()
+    for name, urdf in HANDS.items():
+        typer.echo(run.graspd("hands", "add", str(data / "hands" / urdf), "--name", name)["message"])
+    create = (
+        "datasets", "create", DATASET, "--hands", ",".join(HANDS), "--objects", str(data / "objects"),
+        "--grasps", str(grasps), "--fidelity", fidelity, "--yes",
+    )  # fmt: skip
+    start = time.monotonic()
+    estimate = run.graspd(*create)["estimate"]
+    killed_at = follow(run, until=kill_at)
+    run.kill()
+    before = run.shards()
+    down = time.monotonic()
+    ready = run.up()
+    run.graspd(*create)
+    follow(run, until=1.0)
+    seconds = time.monotonic() - start
+    after = run.shards()
+    found, cells = run.datasets().dataset(DATASET), list(run.datasets().cells(DATASET))
+    check = run.graspd("index", "rebuild", "--check", "--data-dir", str(data_dir / "data"))
+    run.stop()
+    facts = {
+        "killed at": f"{100 * killed_at:.0f} % of the tasks, {len(before)} shards in the store",
+        "up again after": f"{ready:.1f} s",
+        "shards made again": str(sum(after.get(name) != facts for name, facts in before.items())),
+        "differences between index and store": str(len(check["differences"])),
+        "wall time": f"{duration(seconds)}, of which {duration(time.monotonic() - down)} after the kill",
+        "worker time": duration(found.seconds),
+        "estimate before the start": duration(estimate["seconds"]),
+        "size": size(found.size_bytes),
+    }
+    out.write_text(page(found, cells, facts, f"--grasps {grasps} --fidelity {fidelity}"))
+    typer.echo(out.read_text())
+
+
+def follow(run: Run, *, until: float) -> float:
+    """Wait until a share of the tasks is done, or the dataset has ended; returns the share."""
+    said = 0.0
+    while True:
+        found = run.datasets().dataset(DATASET)
+        if found.progress - said > 0.02:
+            said = found.progress
+            typer.echo(f"{time.strftime('%H:%M:%S')} {100 * found.progress:.0f} % {found.valid} of {found.tried}")
+        if found.state.is_final or found.tasks_done >= until * found.tasks:
+            return found.tasks_done / found.tasks
+        time.sleep(_POLL_S)
+
+
+def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], options: str) -> str:
+    """The results as Markdown."""
+    at = {(cell.hand, cell.object): cell for cell in cells}
+    lines = [
+        "# Four hands, fourteen objects",
+        "",
+        f"`python -m benchmarks.matrix DATA --data-dir DIR --out docs/results/matrix.md`, {options}",
+        "",
+        f"graspd {PACKAGE_VERSION}, {platform.machine()}, {os.cpu_count()} CPU cores, {found.created[:10]}. URDFs and",
+        "meshes went in as they are, without an option. Every process was killed with -9 in the middle; the same commands",
+        "then went on.",
+        "",
+        "| what | |",
+        "| --- | --- |",
+        *(f"| {name} | {value} |" for name, value in facts.items()),
+        "",
+        "Each cell: valid grasps of those asked for, valid share of the tries, seconds of a worker per valid grasp.",
+        "",
+        f"| object | {' | '.join(found.hands)} |",
+        "| --- " * (len(found.hands) + 1) + "|",
+    ]
+    lines += [f"| {obj} | {' | '.join(_cell(at[hand, obj]) for hand in found.hands)} |" for obj in found.objects]
+    sums = [[cell for cell in cells if cell.hand == hand] for hand in found.hands]
+    lines.append(f"| **all** | {' | '.join(_sum(of_hand) for of_hand in sums)} |")
+    failed = [cell for cell in cells if cell.reason]
+    lines += ["", *(f"- {cell.hand} on {cell.object} failed: {cell.reason}" for cell in failed)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _cell(cell: CellView) -> str:
+    if cell.reason:
+        return "failed"
+    each = f"{cell.seconds / cell.valid:.2f} s" if cell.valid else "-"
+    return f"{cell.valid}/{cell.asked}, {100 * (cell.valid_yield or 0):.0f} %, {each}"
+
+
+def _sum(cells: list[CellView]) -> str:
+    valid, tried = sum(c.valid for c in cells), max(1, sum(c.tried for c in cells))
+    each = f"{sum(c.seconds for c in cells) / valid:.2f} s" if valid else "-"
+    return f"{valid}/{sum(c.asked for c in cells)}, {100 * valid / tried:.0f} %, {each}"
+
+
+if __name__ == "__main__":
+    typer.run(main)
