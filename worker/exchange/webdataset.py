@@ -57,10 +57,10 @@ def write(shards: Shards, folder: Path, *, pictures_a_file: int = 1000) -> list[
 
 def _members(shards: Shards, sample: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
     with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "file"
-        yield "rgb.png", export_png(path, sample["image/rgb"]).read_bytes()
-        yield "segmentation.png", export_png(path, sample["image/segmentation"]).read_bytes()
-        yield "depth.exr", export_exr(path, "Z", [sample["image/depth"]]).read_bytes()
+        png, exr = Path(scratch) / "file.png", Path(scratch) / "file.exr"
+        yield "rgb.png", export_png(png, sample["image/rgb"]).read_bytes()
+        yield "segmentation.png", export_png(png, sample["image/segmentation"]).read_bytes()
+        yield "depth.exr", export_exr(exr, "Z", [sample["image/depth"]]).read_bytes()
     yield "json", json.dumps(_record(shards, sample), allow_nan=False).encode()
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from service.shards import json_attribute, read_shard, write_shard
+from worker.exchange.commands import app as exchange
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.rendering.commands import app as rendering
@@ -137,7 +138,7 @@ def test_neighbours_travel_from_the_scene_to_the_labels_of_the_exported_pictures
     arguments = ["render", str(scene), "--views", "1", "--width", "32", "--height", "24", "--device", "cpu"]
     result = CliRunner().invoke(rendering, [*arguments, "-o", str(views)])
     assert result.exit_code == 0, result.output
-    result = CliRunner().invoke(rendering, ["export", str(views), "--depth", "png", "-o", str(folder), "--json"])
+    result = CliRunner().invoke(exchange, ["export", str(views), "--depth", "png", "-o", str(folder), "--json"])
     assert result.exit_code == 0, result.output
     # Labels, and per picture colour, depth, segmentation and what is known about it.
     assert last_line(result)["files"] == 5
