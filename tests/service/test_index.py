@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from sqlalchemy import delete, update
 from service import names, pipeline
 from service.clock import timestamp
 from service.domain import AssetKind, Lane, Stage, State
-from service.errors import IndexUnavailable, InputError, NotFoundError
+from service.errors import ConflictError, IndexUnavailable, InputError, NotFoundError
 from service.index import tables
 from service.index.filters import GraspFilter, GraspSort
 from service.index.index import Index
@@ -405,3 +407,33 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts, bucket_s
     assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6)
     starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
     assert starts == sorted({t - t % bucket_s for t in (int(datetime.fromisoformat(x).timestamp()) for x in times)})
+
+
+def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts, index_url: str) -> None:
+    """The keeper indexes shards while the API of another process cancels and retries the same job, over and over."""
+    job, _ = pipeline.submit(parts, request(grasps=32 * 12, scenes=1))
+    record = read_record(JobRecord, parts.store, names.job_record(job.id))
+    messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan(record)]
+    other = Parts(parts.settings, parts.store, Index(index_url), parts.queue)
+    done = threading.Event()
+
+    def interfere(change: Callable[[Parts, str], object]) -> None:
+        while not done.is_set():
+            with contextlib.suppress(ConflictError):
+                change(other, job.id)
+            done.wait(0.02)
+
+    threads = [threading.Thread(target=interfere, args=(change,)) for change in (pipeline.cancel, pipeline.retry)]
+    for thread in threads:
+        thread.start()
+    try:
+        for message in messages:
+            parts.index.add_manifest(make_shard(parts.store, message))
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+        other.index.close()
+    assert parts.index.stats().tasks[State.SUCCEEDED] == 24
+    assert parts.index.job(job.id).state is State.SUCCEEDED
+    assert differences(parts.index, parts.store) == []
