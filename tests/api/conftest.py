@@ -16,6 +16,9 @@ from service.queue.memory import MemoryQueue
 from service.settings import Settings
 from service.store import open_store
 from tests.api.factories import add_builtins
+from tests.service.conftest import redis_server, rq_queue
+
+__all__ = ["redis_server", "rq_queue"]
 
 BASE_URL = "http://127.0.0.1:8000"
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 
 import pytest
+from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from api.app import create_app
-from api.keys import KeyFile, Scope
-from service.errors import ConflictError, InputError, NotFoundError
+from api.key_commands import duration
+from api.keys import KeyFile, KeyLimits, Scope
+from service.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from service.parts import Parts
+from service.queue.memory import MemoryQueue
 from service.settings import Settings
 
 JOB = {"hand": "allegro", "object": "mug"}
@@ -121,6 +126,96 @@ def test_a_revoked_name_may_be_used_again(keys: KeyFile) -> None:
 def test_revoking_an_unknown_key_says_so(keys: KeyFile) -> None:
     with pytest.raises(NotFoundError):
         keys.revoke("nobody")
+
+
+def test_a_rotated_key_keeps_its_scope_and_limits_and_loses_its_secret(keys: KeyFile) -> None:
+    old = keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=3))
+    new = keys.rotate("me")
+    found = keys.find(new)
+    assert found is not None
+    assert (found.scope, found.limits.jobs_per_day) == (Scope.SUBMIT, 3)
+    assert keys.find(old) is None
+
+
+def test_both_secrets_open_during_the_grace_of_a_rotation(keys: KeyFile) -> None:
+    old = keys.add("me", Scope.READ)
+    new = keys.rotate("me", grace=timedelta(hours=1))
+    assert keys.find(old) is not None
+    assert keys.find(new) is not None
+    keys.revoke("me")
+    assert (keys.find(old), keys.find(new)) == (None, None)
+
+
+def test_the_grace_of_a_rotation_ends(keys: KeyFile) -> None:
+    old = keys.add("me", Scope.READ)
+    keys.rotate("me", grace=timedelta(microseconds=1))
+    assert keys.find(old) is None
+
+
+def test_a_key_opens_until_it_expires(keys: KeyFile) -> None:
+    assert keys.find(keys.add("later", Scope.READ, lifetime=timedelta(hours=1))) is not None
+    assert keys.find(keys.add("past", Scope.READ, lifetime=timedelta(microseconds=1))) is None
+
+
+def test_keys_made_at_the_same_time_are_all_kept(keys: KeyFile) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        tokens = list(pool.map(lambda i: KeyFile(keys.path).add(f"key-{i}", Scope.READ), range(12)))
+    assert all(keys.find(token) for token in tokens)
+
+
+def test_a_service_whose_last_key_was_revoked_stays_closed(
+    closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile
+) -> None:
+    for scope in Scope:
+        keys.revoke(scope.value)
+    assert closed[0].get("/v1/jobs").status_code == 401
+
+
+def test_a_damaged_key_file_opens_nothing(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
+    keys.path.write_text("{")
+    answer = closed[0].get("/v1/jobs")
+    assert (answer.status_code, answer.json()["type"]) == (503, "/problems/unavailable")
+
+
+@pytest.mark.parametrize("name", ["X-Forwarded-For", "Forwarded", "Via"])
+def test_an_open_service_answers_nobody_behind_a_proxy(http: TestClient, name: str) -> None:
+    answer = http.get("/v1/jobs", headers={name: "203.0.113.9"})
+    assert answer.status_code == 403
+    assert "graspd keys add" in answer.json()["detail"]
+
+
+def test_an_open_service_answers_its_own_machine_only(app: FastAPI) -> None:
+    elsewhere = TestClient(app, base_url="http://127.0.0.1:8000", client=("203.0.113.9", 50000))
+    assert elsewhere.get("/v1/jobs").status_code == 403
+
+
+def test_only_who_may_read_is_told_what_is_wrong_with_a_part(
+    closed: tuple[TestClient, dict[Scope, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> float:
+        raise QueueUnavailable("Redis does not answer at redis://inside:6379")
+
+    monkeypatch.setattr(MemoryQueue, "ping", away)
+    client, tokens = closed
+    assert "inside" not in client.get("/readyz").text
+    assert "inside" in client.get("/readyz", headers=bearer(tokens[Scope.READ])).text
+
+
+def test_metrics_of_a_closed_service_need_a_key(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    client, tokens = closed
+    assert client.get("/metrics").status_code == 401
+    assert client.get("/metrics", headers=bearer(tokens[Scope.READ])).status_code == 200
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90d", 90 * 86400), ("12h", 43200), ("30m", 1800), ("45s", 45)])
+def test_a_length_of_time_is_read(text: str, seconds: int) -> None:
+    assert duration(text).total_seconds() == seconds
+
+
+@pytest.mark.parametrize("text", ["", "90", "d", "-1d", "1w", "1.5h"])
+def test_what_is_no_length_of_time_is_said_so(text: str) -> None:
+    with pytest.raises(InputError, match="90d"):
+        duration(text)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "graspd.example"])
