@@ -65,7 +65,8 @@ tasks: Final = Table(
     Index("tasks_of_job", "job_id", "batch", "position"),
     Index("tasks_by_state", "job_id", "state"),
     Index("tasks_by_shard", "shard_id"),
-    Index("tasks_to_queue", "ready", "queued", "lane", "batch", "created", "job_id"),
+    Index("tasks_waiting", "job_id", "ready", "queued", "batch"),
+    Index("tasks_in_queue", "queued", "ready"),
     Index("tasks_finished", "finished"),
 )
 
