@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from service.metrics.series import series_table
 from service.settings import Settings
 from service.shards import SCHEMAS, ShardKind
 
@@ -42,8 +43,9 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
     "scene": lambda: schema_table("scene"),
     "views": lambda: schema_table("views"),
     "settings": settings_table,
+    "metrics": series_table,
 }
-PAGES: Final = ("README.md", "docs/dataset.md")
+PAGES: Final = ("README.md", "docs/dataset.md", "docs/metrics.md")
 
 
 def renewed(text: str) -> str:
