@@ -39,6 +39,8 @@ class Pictures(Sequence[dict[str, Any]]):
         grasp/base_row (K,) row in the base shard `base_id`
         quality/epsilon and other `grasp_quality` columns (K, ...)
 
+    `object/pose` (7,) is the object's frame in the camera's.
+
     The left eye of a stereo pair stands before its right eye.
     """
 
@@ -116,6 +118,7 @@ class _Scenes:
         self._scene = np.asarray(scene["grasp/scene_index"])[kept]
         self._row = np.asarray(scene["grasp/base_index"])[kept]
         self._pose = np.asarray(scene["grasp/hand_pose"], float)[kept]
+        self._object = np.asarray(scene["scene/object_pose"], float)
         self._columns = {
             name: np.asarray(base[name])[self._row]
             for name in ("grasp/joint_positions", *quality)
@@ -130,4 +133,5 @@ class _Scenes:
         rows = np.flatnonzero(self._scene == scene)
         pose = transforms.compose(transforms.pose_from_matrix(extrinsics), self._pose[rows])
         found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self._base_id}
+        found["object/pose"] = transforms.compose(transforms.pose_from_matrix(extrinsics), self._object[scene])
         return found | {name: column[rows] for name, column in self._columns.items()}

@@ -1,0 +1,132 @@
+"""What the proposals are worth on objects the network has not seen, by the same metrics and referee as datasets.
+
+A proposal says where the hand goes and how it is shaped; it is carried out as DDGC and others do: the fingers open,
+the hand backs off until it touches nothing, advances, and closes until contact. All sources of data are treated alike,
+and a control replaces the proposals by hands that look at the object from anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from examples.train_grasp_predictor.network import Predictor
+from examples.train_grasp_predictor.samples import Example
+from service.transforms import compose, invert, quat_from_matrix, quat_rotate
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.autograsp import kernels
+from worker.planners.autograsp.closing import Closer
+from worker.planners.fast_graspd.pairs import Pair
+from worker.planners.ground import free_starts, grasp_set, ground_of
+from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.judge import judge
+from worker.quality.table import measure
+from worker.simulation.simulation import HandState
+
+Floats = NDArray[np.float64]
+
+#: Proposals of a picture that are carried out: those of the highest scores.
+TAKEN: Final = 4
+#: Share of the way from the proposed joints to the pre-shape that the fingers open.
+OPENING: Final = 0.6
+#: Distances the hand backs off, of which the first that is clear is taken [m].
+BACK_M: Final = tuple(0.01 * k for k in range(13))
+CLEAR_M: Final = 0.002
+STANDOFF_M: Final = 0.005
+
+
+@dataclass(frozen=True)
+class Score:
+    """Means over the grasps of one object; success and the ten best by epsilon as in the paper's tables."""
+
+    grasps: int
+    contact_area_cm2: float
+    intersection_volume_cm3: float
+    epsilon: float
+    wrench_volume: float
+    simulated_displacement_cm: float
+    gsr: float
+
+
+def proposals(network: Predictor, pictures: Sequence[Example]) -> tuple[Floats, Floats]:
+    """Hand poses (N, 7) in the object's frame and joints (N, J) of the best proposals for each picture."""
+    with torch.no_grad():
+        grasps, logits = network(torch.stack([picture.image for picture in pictures]))
+    best = logits.argsort(dim=1, descending=True)[:, :TAKEN]
+    poses, joints = [], []
+    for picture, rows, chosen in zip(pictures, grasps.numpy().astype(float), best.numpy(), strict=True):
+        for row in rows[chosen]:
+            quaternion = quat_from_matrix(orthogonal(row[3:9]))
+            hand = np.concatenate([row[:3] + picture.anchor, quaternion])
+            poses.append(compose(invert(picture.object_pose), hand))
+            joints.append(row[9:])
+    return np.array(poses), np.array(joints)
+
+
+def orthogonal(columns: Floats) -> Floats:
+    """(3, 3) rotation from its first two columns (6,), the first one kept."""
+    x = columns[:3] / max(float(np.linalg.norm(columns[:3])), 1e-9)
+    y = columns[3:] - (columns[3:] @ x) * x
+    y = y / max(float(np.linalg.norm(y)), 1e-9)
+    return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+def carried_out(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> GraspSet:
+    """Grasps from proposals: open, back off until clear, advance, close."""
+    pair = ground_of(hand, obj, "cpu", kernels)
+    q = np.clip(hand.reduce(joints), hand.lower, hand.upper)
+    closes = hand.closing != 0
+    q[:, closes] += OPENING * (np.broadcast_to(hand.preshape, q.shape)[:, closes] - q[:, closes])
+    rotation = poses[:, 3:]
+    pivot = poses[:, :3] - obj.centre_of_mass + quat_rotate(rotation, _palm_centre(hand))
+    return _executed(pair, HandState(pivot, rotation, q))
+
+
+def anywhere(hand: HandModel, obj: ObjectModel, count: int, seed: int) -> GraspSet:
+    """The control: hands that look at a random place of the object, carried out in the same way."""
+    pair = ground_of(hand, obj, "cpu", kernels)
+    return _executed(pair, free_starts(pair, seed=seed, batch=0, indices=range(count)))
+
+
+def score(hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, friction: float = 1.0) -> Score:
+    """Metrics at 5 mm as means of the ten best by epsilon; success over all."""
+    columns = measure(hand, obj, grasps, friction=friction)
+    at = int(np.argmin(np.abs(columns["quality/thresholds_m"] - 0.005)))
+    epsilon = np.asarray(columns["quality/epsilon"], float)[:, at]
+    top = np.argsort(-epsilon)[:10]
+    displaced = simulated_displacement_cm(hand, obj, grasps.take(top))
+    return Score(
+        len(grasps),
+        float(np.asarray(columns["quality/contact_area_cm2"], float)[top, at].mean()),
+        float(np.asarray(columns["quality/intersection_volume_cm3"], float)[top].mean()),
+        float(epsilon[top].mean()),
+        float(np.asarray(columns["quality/wrench_volume"], float)[top, at].mean()),
+        float(np.nanmean(displaced)),
+        float(judge(hand, obj, grasps, level="certificate").success.mean()),
+    )
+
+
+def _executed(pair: Pair, state: HandState) -> GraspSet:
+    closer = Closer(pair, len(state.pivot))
+    hand = pair.hand.model
+    back = -quat_rotate(state.rotation, hand.palm.approach)
+    free = HandState(state.pivot.copy(), state.rotation, state.q)
+    settled = np.zeros(len(state.pivot), bool)
+    for distance in BACK_M:
+        moved = HandState(state.pivot + distance * back, state.rotation, state.q)
+        clear = closer.distances(moved).min(axis=1) > CLEAR_M
+        free.pivot[~settled] = moved.pivot[~settled]
+        settled |= clear
+    return grasp_set(pair, closer.close(closer.approach(free, STANDOFF_M)).state, 0.0, {})
+
+
+def _palm_centre(hand: HandModel) -> Floats:
+    """Palm's centre in the frame of the root link."""
+    return hand.palm.centre

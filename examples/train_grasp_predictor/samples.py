@@ -1,0 +1,89 @@
+"""From a picture with its grasps to what the network sees and what it should say.
+
+The network sees a square crop around the object: colour, depth relative to the object's, and its mask. It answers in
+a frame that follows from the crop alone: the camera's axes, the origin at the anchor, which is the middle of the crop
+at the median depth of the object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch.nn.functional import interpolate
+
+from service.readers import Pictures, Shards
+from service.transforms import quat_to_matrix
+
+#: Side of the crop [px], and how much larger than the object's box it is.
+SIZE: Final = 64
+MARGIN: Final = 1.3
+#: Depth that becomes 1 in the network's input [m].
+DEPTH_UNIT_M: Final = 0.1
+#: Label of the grasped object in segmentations.
+_OBJECT: Final = 2
+
+
+@dataclass(frozen=True)
+class Example:
+    """One picture."""
+
+    image: torch.Tensor
+    """(5, SIZE, SIZE): colour in [0, 1], depth, mask."""
+    grasps: torch.Tensor
+    """(K, 3 + 6 + J): hand position from the anchor [m], first two columns of its rotation, joints [rad]."""
+    anchor: np.ndarray  # type: ignore[type-arg]
+    """(3,) in the camera's frame [m]."""
+    object: str
+    object_pose: np.ndarray  # type: ignore[type-arg]
+    """(7,) object in the camera's frame."""
+
+
+def examples(shards: Shards) -> Iterator[Example]:
+    """All pictures that show enough of their object and have grasps. Table clearance is no matter here."""
+    for sample in Pictures(shards, clear=False, with_grasps_only=True):
+        crop = crop_of(sample)
+        if crop is not None:
+            image, anchor = crop
+            targets = targets_of(sample["grasp/hand_pose"], sample["grasp/joint_positions"], anchor)
+            yield Example(image, targets, anchor, sample["object"], np.asarray(sample["object/pose"]))
+
+
+def crop_of(sample: dict[str, Any]) -> tuple[torch.Tensor, np.ndarray] | None:  # type: ignore[type-arg]
+    """The network's input and the anchor (3,) [m]; None where less than 30 pixels of the object are seen."""
+    mask = sample["image/segmentation"] == _OBJECT
+    if mask.sum() < 30:
+        return None
+    x0, y0, x1, y1 = np.asarray(sample["box/bounding_box_2d_tight"], float)
+    depth = np.asarray(sample["image/depth"], float)
+    middle = float(np.median(depth[mask]))
+    centre, half = np.array([x0 + x1, y0 + y1]) / 2, MARGIN * max(x1 - x0, y1 - y0) / 2
+    near = np.where(np.isfinite(depth), (depth - middle) / DEPTH_UNIT_M, 3.0).clip(-3, 3)
+    planes = np.concatenate([np.moveaxis(sample["image/rgb"] / 255.0, -1, 0), near[None], mask[None]])
+    k = np.asarray(sample["camera/intrinsics"], float)
+    anchor = np.array([*((centre - k[:2, 2]) / np.diag(k)[:2] * middle), middle])
+    return _resampled(planes, centre, half), anchor
+
+
+def targets_of(pose: Any, joints: Any, anchor: Any) -> torch.Tensor:
+    """(K, 3 + 6 + J) from hand poses (K, 7) in the camera's frame and joints (K, J)."""
+    rotation = quat_to_matrix(np.asarray(pose)[:, 3:])
+    columns = np.concatenate([rotation[:, :, 0], rotation[:, :, 1]], axis=1)
+    rows = np.concatenate([np.asarray(pose)[:, :3] - anchor, columns, joints], axis=1)
+    return torch.from_numpy(rows.astype(np.float32))
+
+
+def _resampled(planes: Any, centre: Any, half: float) -> torch.Tensor:
+    """The square around `centre` [px] with half side `half`, at SIZE x SIZE; outside the picture it is empty."""
+    side = max(2, round(2 * half))
+    x, y = (round(float(value)) - side // 2 for value in centre)
+    height, width = planes.shape[1:]
+    out = np.zeros((len(planes), side, side), np.float32)
+    out[3] = 3.0  # nothing there: far
+    a, b = max(0, y), min(height, y + side)
+    c, d = max(0, x), min(width, x + side)
+    out[:, a - y : b - y, c - x : d - x] = planes[:, a:b, c:d]
+    return interpolate(torch.from_numpy(out)[None], size=(SIZE, SIZE), mode="area")[0]
