@@ -1,0 +1,51 @@
+"""docs/operations.md as commands: the blocks marked as tried, and every line that calls graspd."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from tests.conftest import REPOSITORY
+
+TEXT: Final = (REPOSITORY / "docs" / "operations.md").read_text()
+_TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTALL)
+
+
+def tried() -> dict[str, str]:
+    """Shell text of the marked blocks by name."""
+    return dict(_TRIED.findall(TEXT))
+
+
+def calls() -> list[list[str]]:
+    """Arguments of every call of graspd on the page, in blocks and in running text."""
+    inline = re.findall(r"`((?:GRASPD_\w+=\S+ )?graspd [^`]+)`", TEXT)
+    blocks = re.findall(r"^(?:    )?((?:GRASPD_\w+=\S+ )?(?:\.venv/bin/)?graspd [^\n]+)$", TEXT, re.MULTILINE)
+    found = []
+    for line in [*inline, *blocks]:
+        words = shlex.split(line.replace("…", "").rstrip(" &"), comments=True)
+        start = next(i for i, word in enumerate(words) if word.endswith("graspd"))
+        found.append(words[start + 1 :])
+    return [words for words in found if words]
+
+
+def run(name: str, folder: Path, environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    """Run a marked block as a user would, `graspd` being that of this environment; a failing line ends it."""
+    shims = folder / "bin"
+    shims.mkdir(exist_ok=True)
+    shim = shims / "graspd"
+    shim.write_text(f'#!/bin/sh\nexec {sys.executable} -m graspd "$@"\n')
+    shim.chmod(0o755)
+    return subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", tried()[name]],
+        cwd=folder,
+        env=os.environ | {"PATH": f"{shims}:{os.environ['PATH']}", "PYTHONPATH": str(REPOSITORY)} | dict(environment),
+        capture_output=True,
+        text=True,
+        check=False,
+    )

@@ -1,0 +1,132 @@
+"""The steps of docs/operations.md, run as they stand there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import graspd
+from service import pipeline
+from service.domain import State
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.library import publish_builtins
+from service.parts import Parts
+from service.queue.memory import MemoryQueue
+from service.settings import Settings
+from service.store import open_store
+from tests.conftest import REPOSITORY
+from tests.deploy import composition, page
+from tests.fakes import add_assets, request
+from tests.service.test_index import run_all
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Iterator[Parts]:
+    """A data folder with a finished job and one that has not begun."""
+    settings = Settings(data_dir=tmp_path / "data")
+    index = Index(settings.resolved_index_url)
+    parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    add_assets(parts)
+    publish_builtins(parts.store)
+    run_all(parts, pipeline.submit(parts, request(grasps=64, scenes=1))[0].id)
+    pipeline.submit(parts, request(grasps=32, seed=5))
+    yield parts
+    index.close()
+
+
+def names_of(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Parts, tmp_path: Path) -> None:
+    data, fresh = kept.settings.data_dir, tmp_path / "new"
+    (data / "keys.json").write_text("{}")
+    (data / "store" / "shards" / "half-written.h5#123").write_bytes(b"half")
+    where = {"GRASPD_DATA_DIR": str(data), "NEW_DATA_DIR": str(fresh)}
+    for step in ("back-up", "restore"):
+        done = page.run(step, tmp_path, where)
+        assert done.returncode == 0, done.stderr
+    assert names_of(fresh / "store") == names_of(data / "store") - {"shards/half-written.h5#123"}
+    assert (fresh / "keys.json").exists()
+    restored = Index(Settings(data_dir=fresh).resolved_index_url)
+    try:
+        assert differences(restored, kept.store) == []
+        jobs = {job.id: job.state for job in restored.jobs(limit=10).items}
+        assert jobs == {job.id: job.state for job in kept.index.jobs(limit=10).items}
+        assert set(jobs.values()) == {State.SUCCEEDED, State.QUEUED}
+    finally:
+        restored.close()
+
+
+def test_a_back_up_works_where_no_key_was_ever_made(kept: Parts, tmp_path: Path) -> None:
+    done = page.run("back-up", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_damaged_copy_is_noticed(kept: Parts, tmp_path: Path) -> None:
+    where = {"GRASPD_DATA_DIR": str(kept.settings.data_dir), "NEW_DATA_DIR": str(tmp_path / "new")}
+    assert page.run("back-up", tmp_path, where).returncode == 0
+    assert page.run("restore", tmp_path, where).returncode == 0
+    lost = next((tmp_path / "new" / "store" / "shards").rglob("*.json"))
+    lost.unlink()
+    restored = Index(Settings(data_dir=tmp_path / "new").resolved_index_url)
+    try:
+        assert differences(restored, open_store((tmp_path / "new" / "store").as_uri())) != []
+    finally:
+        restored.close()
+
+
+def test_an_older_version_can_start_from_an_empty_index(kept: Parts) -> None:
+    before = {job.id: job.state for job in kept.index.jobs(limit=10).items}
+    empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
+    try:
+        from service.index.rebuild import rebuild
+
+        rebuild(empty, kept.store)
+        assert {job.id: job.state for job in empty.jobs(limit=10).items} == before
+    finally:
+        empty.close()
+
+
+def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
+    done = page.run("keys", tmp_path, {"GRASPD_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "200"})
+    assert done.returncode == 0, done.stderr
+    first, second = re.findall(r"^(gd_\S+)", done.stdout, re.MULTILINE)
+    assert first != second
+    assert first not in (tmp_path / "data" / "keys.json").read_text()
+
+
+@pytest.mark.parametrize("call", page.calls(), ids=" ".join)
+def test_every_command_on_the_page_exists_with_its_options(call: list[str]) -> None:
+    module = next((module for name, module, *_ in graspd.COMMANDS if name == call[0]), None)
+    assert module is not None, f"graspd has no command {call[0]}"
+    command: Any = graspd.load(module, call[0])
+    rest = call[1:]
+    while rest and getattr(command, "commands", None):
+        assert rest[0] in command.commands, f"graspd {call[0]} has no command {rest[0]}"
+        command, rest = command.commands[rest[0]], rest[1:]
+    known = {option for parameter in command.params for option in parameter.opts}
+    assert {word.partition("=")[0] for word in rest if word.startswith("--")} <= known
+
+
+def test_every_profile_service_and_variant_on_the_page_exists() -> None:
+    profiles = {name for service in composition.SERVICES.values() for name in service.get("profiles", ())}
+    assert set(re.findall(r"--profile (\S+)", page.TEXT)) <= profiles
+    assert set(re.findall(r"--scale ([\w-]+)=", page.TEXT)) <= composition.SERVICES.keys()
+    for variant in re.findall(r"apply -k (\S+)", page.TEXT):
+        assert (REPOSITORY / variant / "kustomization.yaml").is_file()
+
+
+def test_every_setting_on_the_page_exists() -> None:
+    known = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
+    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", page.TEXT)) <= known
+
+
+def test_every_file_the_page_links_to_exists() -> None:
+    for target in re.findall(r"\]\(([\w./-]+)\)", page.TEXT):
+        assert (REPOSITORY / "docs" / target).is_file(), target
