@@ -24,7 +24,7 @@ from worker.context import TaskContext
 MEMORY_LIMIT_BYTES: Final = 4 * 2**30
 CPU_LIMIT_S: Final = 25
 #: A child that waits instead of computing is ended by the clock [s].
-WALL_LIMIT_S: Final = 29.0
+WALL_LIMIT_S: Final = 27.0
 _PASSED_ON: Final = ("PATH", "HOME", "LANG", "TMPDIR", "PYTHONPATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV")
 _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed to map")
 _FINDING_BYTES: Final = 2**20

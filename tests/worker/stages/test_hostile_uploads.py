@@ -21,7 +21,8 @@ from service.errors import InputError
 from service.library import publish_asset
 from service.queue.port import EventKind
 from service.store import Store, open_store
-from tests.worker.objects.shapes import sphere, stl
+from service.version import TASK_SCHEMA
+from tests.worker.objects.shapes import join, sphere, stl
 from worker.context import TaskContext
 from worker.runner import Runner
 from worker.stages import ingest
@@ -32,6 +33,8 @@ BOUND_S = 30.0
 #: Children at a time: as many as the smallest machine has cores.
 TOGETHER = 2
 BALL = stl(sphere())
+PLY_POINT = "property float x\nproperty float y\nproperty float z\n"
+PLY_FACE = "property list uchar int vertex_indices\n"
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
@@ -49,7 +52,7 @@ def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: d
         asset = publish_asset(store, kind, "upload", files)
     except InputError as error:
         return {"verdict": "refuse", "message": str(error)}
-    message = IngestMessage(schema_=1, task_id="i", kind=kind, name=Path(filename).stem, digest=asset.digest)
+    message = IngestMessage(schema_=TASK_SCHEMA, task_id="i", kind=kind, name=Path(filename).stem, digest=asset.digest)
     outcome = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None).run(
         message.model_dump(mode="json", by_alias=True), TaskContext(store)
     )
@@ -92,7 +95,7 @@ def huge_promise() -> bytes:
 
 def ply_promise() -> bytes:
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
-    return (header + "property float x\nproperty float y\nproperty float z\nend_header\n").encode() + bytes(64)
+    return (header + PLY_POINT + "end_header\n").encode() + bytes(64)
 
 
 def zip_bomb() -> bytes:
@@ -180,6 +183,30 @@ def test_a_mesh_that_costs_too_much_is_refused_and_the_next_one_is_taken(limits:
     assert time.monotonic() - start < BOUND_S
     sound = {"asset.json": b'{"file": "m.stl"}', **BALL}
     assert ingest.check_in_child(AssetKind.OBJECT, "ball", sound, context)[0]["verdict"] == "accept"
+
+
+def test_a_small_archive_of_ten_million_faces_is_refused() -> None:
+    count = 10_000_000
+    points = f"ply\nformat binary_little_endian 1.0\nelement vertex 3\n{PLY_POINT}"
+    header = f"{points}element face {count}\n{PLY_FACE}end_header\n"
+    face = b"\3" + np.arange(3, dtype="<i4").tobytes()
+    data = zipped({"big.ply": header.encode() + np.eye(3, dtype="<f4").tobytes() + face * count})
+    assert len(data) < 2**20
+    start = time.monotonic()
+    found = upload(open_store("memory://"), AssetKind.OBJECT, "big.zip", data)
+    assert found["verdict"] == "refuse" and "10000000 faces; at most 1000000 are taken" in found["message"]
+    assert time.monotonic() - start < BOUND_S
+
+
+@pytest.mark.slow
+def test_a_mesh_that_takes_an_hour_to_repair_is_refused_within_the_bound() -> None:
+    """220 balls of 4000 faces in one another: each pair of faces that cross is work for the repair."""
+    rng = np.random.default_rng(0)
+    tangle = join(*(sphere(0.04, 64, at=tuple(rng.uniform(-0.02, 0.02, 3))) for _ in range(220)))
+    start = time.monotonic()
+    found = upload(open_store("memory://"), AssetKind.OBJECT, "tangle.stl", stl(tangle)["m.stl"])
+    assert time.monotonic() - start < BOUND_S
+    assert found["verdict"] == "refuse" and f"takes longer than {ingest.CPU_LIMIT_S} s" in found["message"]
 
 
 def test_the_limits_of_a_check_keep_the_promised_bound() -> None:

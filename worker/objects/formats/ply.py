@@ -67,7 +67,8 @@ def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
                 order = ">"
             case ["element", name, count]:
                 elements.append(_Element(name, int(count)))
-                check_face_count(int(count) // 4)
+                # Of a closed mesh there are about half as many vertices as faces.
+                check_face_count(int(count) if name == "face" else int(count) // 4)
             case ["property", "list", count_type, type_, name]:
                 elements[-1].properties.append(_Property(name, _TYPES[type_], _TYPES[count_type]))
             case ["property", type_, name]:
