@@ -38,6 +38,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("evaluate", "worker.quality.commands", "Without a server", "Quality of grasps, judged by an independent engine."),
     ("scene", "worker.scenes.commands", "Without a server", "The object at rest on a table; grasps that fit there."),
     ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
+    ("chart", "worker.studies.chart.commands", "Studies", "Speed against accuracy of methods and fidelities."),
     ("bench", "worker.studies.commands", "Studies", "Grasps per second, and where the time goes."),
     ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
     ("export", "worker.exchange.commands", "Without a server", "Grasps and pictures in the formats of others."),

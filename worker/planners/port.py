@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict
@@ -64,3 +64,10 @@ class Method:
     """The options it takes."""
     uses: tuple[str, ...] = ()
     """Knobs of `Fidelity` that move its grasps; the others are ignored."""
+    quick: Mapping[str, Any] = field(default_factory=dict)
+    """Options with which a call is short: to warm up, and to try things out. Its grasps need not be good."""
+
+    @property
+    def has_fidelities(self) -> bool:
+        """Whether a fidelity changes more than how closely the object's mesh is followed."""
+        return bool(set(self.uses) - {"face_error_m"})

@@ -57,7 +57,7 @@ def bench(
                 )
     pair = pairs.pair_of(hand, load(first.face_error_m), first, device)
     return {
-        "device": _device_name(device),
+        "device": device_name(device),
         "hand": hand.name,
         "object": load(first.face_error_m).name,
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
@@ -109,6 +109,7 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _device_name(device: str) -> str:
+def device_name(device: str) -> str:
+    """The device as people call it."""
     found = wp.get_device(device)
     return str(found.name) if found.is_cuda else f"cpu ({os.cpu_count()} cores)"

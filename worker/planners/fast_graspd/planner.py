@@ -61,7 +61,7 @@ def plan(
         hand, obj, count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads, device=device,
         progress=progress, cancelled=cancelled,
     )  # fmt: skip
-    return _grasps(hand, obj, parts, time.perf_counter() - began)
+    return grasps_of(hand, obj, parts, time.perf_counter() - began)
 
 
 def optimise_batch(
@@ -69,7 +69,17 @@ def optimise_batch(
     device: str, progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
 ) -> list[Part]:  # fmt: skip
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
-    pair = pair_of(hand, obj, fidelity, device)
+    return optimise_pair(
+        pair_of(hand, obj, fidelity, device), count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads,
+        progress=progress, cancelled=cancelled,
+    )  # fmt: skip
+
+
+def optimise_pair(
+    pair: Pair, *, count: int, fidelity: Fidelity, seed: int, batch: int, threads: int,
+    progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
+) -> list[Part]:  # fmt: skip
+    """The same for a pair that is on its device already, and need not be as the fidelity would make it."""
     steps = Steps(count * (_hands(fidelity) + 1), progress, cancelled)
 
     def work(indices: range) -> Part:
@@ -77,7 +87,7 @@ def optimise_batch(
         _work(pair, part, fidelity, seed, batch, steps)
         return part
 
-    return run_parts(cut(count, threads, device, least=PART), work)
+    return run_parts(cut(count, threads, pair.hand.device, least=PART), work)
 
 
 def _hands(fidelity: Fidelity) -> int:
@@ -142,7 +152,8 @@ def _optimize(
     return simulation.state(n)
 
 
-def _grasps(hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float) -> GraspSet:
+def grasps_of(hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float) -> GraspSet:
+    """The parts of a batch as grasps with the postures around them."""
     states = [part.state for part in parts if part.state is not None]
     pivot, rotation, q = (np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q"))
     grasp = posture_of(hand, obj, HandState(pivot, rotation, q))

@@ -66,4 +66,5 @@ METHOD: Final = Method(
     planner=_planner,
     options=Graspd2022Options,
     uses=("face_error_m",),
+    quick={"steps": 60},
 )

@@ -69,4 +69,5 @@ METHOD: Final = Method(
     planner=_planner,
     options=GraspitOptions,
     uses=("face_error_m",),
+    quick={"steps": FIRST_STEP + 400},
 )

@@ -1,0 +1,93 @@
+"""Charts of speed against accuracy in the store, and the cheapest setting that a chart promises for a wanted accuracy.
+
+A chart is an immutable object `charts/{created}.json`; the last by name is the one that counts.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from service.domain import OFFERED
+from service.errors import InputError
+from service.store import Store
+
+PREFIX: Final = "charts"
+#: Accuracies that a target may name, and whether more is better.
+METRICS: Final = {"gsr": True, "epsilon": True, "pd_mm": False}
+
+_TARGET: Final = re.compile(r"\s*(gsr|epsilon|pd_mm)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
+
+
+def publish(store: Store, chart: Mapping[str, Any]) -> str:
+    """Put a chart beside the earlier ones; its key."""
+    key = f"{PREFIX}/{re.sub(r'[^0-9A-Za-z]', '', str(chart['created']))}.json"
+    store.put(key, json.dumps(chart, allow_nan=False).encode())
+    return key
+
+
+def latest(store: Store) -> dict[str, Any] | None:
+    """The chart that was published last; None where there is none."""
+    keys = [entry.key for entry in store.list(PREFIX) if entry.key.endswith(".json")]
+    return dict(json.loads(store.get(max(keys)))) if keys else None
+
+
+def parse_target(text: str) -> tuple[str, float]:
+    """`gsr>=0.6` as its metric and bound.
+
+    Raises:
+        InputError: another form, or a bound on the side where it would ask for a worse grasp.
+    """
+    found = _TARGET.fullmatch(text)
+    if found is None:
+        raise InputError(f"{text!r} is no target; write gsr>=0.6, epsilon>=0.2 or pd_mm<=1")
+    metric, sign, bound = found.groups()
+    if (sign == ">=") != METRICS[metric]:
+        raise InputError(f"{text!r}: write {metric}{'>=' if METRICS[metric] else '<='}{bound}")
+    return metric, float(bound)
+
+
+def cheapest(
+    chart: Mapping[str, Any], target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
+) -> str:
+    """The fidelity of a method with most valid grasps per second among those that meet a target.
+
+    What was measured of this very hand and object counts; else of this hand; else everything.
+
+    Args:
+        chart: as `graspd chart` writes it.
+        target: see `parse_target`.
+        method: the planner.
+        hand: name of the hand.
+        object_: name of the object.
+        offered: fidelities to choose from.
+
+    Raises:
+        InputError: no such target, nothing measured of the method, or nothing that meets the target.
+    """
+    metric, bound = parse_target(target)
+    runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in offered]
+    known = [run for run in runs if run.get(metric) is not None]
+    for same in (("hand", "object"), ("hand",), ()):
+        wanted = {"hand": hand, "object": object_}
+        near = [run for run in known if all(run[name] == wanted[name] for name in same)]
+        if near:
+            break
+    else:
+        raise InputError(f"the stored chart has no run of {method}; run `graspd chart --publish`, or name a fidelity")
+    means = {
+        fidelity: (_mean(near, fidelity, "valid_per_second"), _mean(near, fidelity, metric))
+        for fidelity in dict.fromkeys(run["fidelity"] for run in near)
+    }
+    good = [name for name, (_, value) in means.items() if (value >= bound if METRICS[metric] else value <= bound)]
+    if not good:
+        best = (max if METRICS[metric] else min)(value for _, value in means.values())
+        raise InputError(f"no fidelity of {method} meets {target}; the best measured {metric} is {best:.3g}")
+    return max(good, key=lambda name: means[name][0])
+
+
+def _mean(runs: Sequence[Mapping[str, Any]], fidelity: str, name: str) -> float:
+    values = [float(run[name] or 0.0) for run in runs if run["fidelity"] == fidelity]
+    return sum(values) / len(values)

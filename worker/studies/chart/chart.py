@@ -1,0 +1,97 @@
+"""The run: every setting on every pair, repeats taken in turn so that a busy moment of the machine hits all alike."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from service.clock import timestamp
+from service.version import PACKAGE_VERSION
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import decompose
+from worker.studies.bench import device_name
+from worker.studies.chart.cells import FRICTION, THRESHOLD_M, Cell, Setting
+from worker.studies.chart.statistics import figures, plain, summed
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Thing:
+    """An object to be loaded at the error bound [m] that a fidelity asks for."""
+
+    name: str
+    load: Callable[[float], ObjectModel]
+
+
+def chart(
+    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], *, repeats: int,
+    say: Say = lambda line: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Run everything.
+
+    Args:
+        hands: the hands.
+        things: the objects.
+        settings: what to compare.
+        repeats: timed calls of each setting on each pair.
+        say: told of each cell as it ends.
+
+    Returns:
+        `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `device`, `created`.
+    """
+    runs: list[dict[str, Any]] = []
+    for thing in things:
+        for hand in hands:
+            cells = [_cell(setting, hand, thing) for setting in settings]
+            for cell in cells:
+                cell.warm_up()
+            for _ in range(repeats):
+                for cell in cells:
+                    cell.repeat()
+            for cell in cells:
+                cell.time_first(cell.setting.threads or os.cpu_count() or 1)
+                runs.append(_row(cell, hand, thing))
+                say(_line(runs[-1]))
+    return {
+        "created": timestamp(),
+        "device": device_name(settings[0].device),
+        "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
+        "threads": settings[0].threads or os.cpu_count(),
+        "referee": {"protocol": "dexgraspbench", "level": "certificate"},
+        "friction": FRICTION,
+        "threshold_m": THRESHOLD_M,
+        "runs": runs,
+        "summary": summed(runs),
+    }
+
+
+def _cell(setting: Setting, hand: HandModel, thing: Thing) -> Cell:
+    obj = thing.load(setting.knobs.face_error_m)
+    return Cell(setting, hand, obj, decompose(obj))
+
+
+def _row(cell: Cell, hand: HandModel, thing: Thing) -> dict[str, Any]:
+    setting = cell.setting
+    return {
+        "method": setting.method,
+        "fidelity": setting.fidelity,
+        "hand": hand.name,
+        "object": thing.name,
+        "options": dict(setting.options),
+        **figures(cell),
+        "best": {key: plain(value) for key, value in cell.best().items()},
+    }
+
+
+def _line(run: dict[str, Any]) -> str:
+    return (
+        f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
+        f"{run['valid_per_second']:8.3f} valid/s  GSR {run['gsr']:.2f}  eps {run['epsilon']:.3f}  "
+        f"PD {run['pd_mm']:.2f} mm"
+    )

@@ -1,0 +1,139 @@
+"""The chart's pictures: accuracy over speed with bars and Pareto front; accuracy over speed for each knob."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+Row = Mapping[str, Any]
+
+#: Title, key, whether more is better.
+PANELS: Final = (
+    ("Success in MuJoCo", "gsr", True),
+    ("ε (median)", "epsilon", True),
+    ("Penetration, mm (median; less is better)", "pd_mm", False),
+)
+COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
+MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
+INK: Final = "#1f2937"
+
+
+def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
+    """Accuracies over valid grasps per second, and success over the seconds to the first valid grasp."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 8.2), layout="constrained")
+    panels = figure.subplots(2, 2)
+    styles = _styles(rows)
+    for axes, (title, key, more) in zip(panels.flat[:3], PANELS, strict=True):
+        _panel(axes, rows, styles, x="valid_per_second", y=key)
+        _front(axes, rows, key, more)
+        axes.set_xlabel("valid grasps per second")
+        axes.set_title(title, loc="left", fontsize=11)
+    last = panels.flat[3]
+    _panel(last, [r for r in rows if r["seconds_to_first_valid"]], styles, x="seconds_to_first_valid", y="gsr")
+    last.set_xlabel("seconds to the first valid grasp (less is better)")
+    last.set_title("Success in MuJoCo", loc="left", fontsize=11)
+    for axes in (panels.flat[0], last):
+        axes.set_ylim(0, 1.02)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    for file in files:
+        figure.savefig(file, dpi=150)
+
+
+def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each method; its fidelities share them."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
+
+
+def _panel(axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], *, x: str, y: str) -> None:
+    shown: set[str] = set()
+    labels = []
+    for row in rows:
+        if not row[x]:
+            continue  # without one valid grasp there is no place on a logarithmic axis
+        colour, marker = styles[row["method"]]
+        bars = {f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row}
+        axes.errorbar(
+            row[x], row[y], **bars, fmt=marker, color=colour, ecolor=colour, elinewidth=1, capsize=2, markersize=7,
+            markeredgecolor="white", label=None if row["method"] in shown else row["method"], zorder=3,
+        )  # fmt: skip
+        shown.add(row["method"])
+        labels.append((row[x], row[y], _label(row, rows), colour))
+    _logarithmic(axes, [row[x] for row in rows if row[x]])
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    for at_x, at_y, text, colour in labels:
+        axes.annotate(text, (at_x, at_y), xytext=(7, 6), textcoords="offset points", fontsize=8, color=colour)
+
+
+def _logarithmic(axes: Any, values: Sequence[float]) -> None:
+    """A logarithmic axis of at least a decade, with plain numbers, and room for a label on the right."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    low, high = min(values, default=1.0), max(values, default=1.0)
+    wider = max(1.0, (10 / (high / low)) ** 0.5)
+    axes.set_xlim(low / wider / 1.4, high * wider * 2.2)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _error(row: Row, key: str) -> list[list[float]]:
+    return [[max(0.0, row[key] - row[f"{key}_low"])], [max(0.0, row[f"{key}_high"] - row[key])]]
+
+
+def _label(row: Row, rows: Sequence[Row]) -> str:
+    """The fidelity, with the batch where there are several; the method's own name where it has one setting."""
+    own = [r for r in rows if r["method"] == row["method"]]
+    if len(own) == 1:
+        return str(row["method"])
+    several = len({r["batch"] for r in own}) > 1
+    return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
+
+
+def _front(axes: Any, rows: Sequence[Row], key: str, more: bool) -> None:
+    front = sorted(
+        (r for r in rows if key in r["front"] and r["valid_per_second"]), key=lambda r: r["valid_per_second"]
+    )
+    axes.step(
+        [r["valid_per_second"] for r in front], [r[key] for r in front], where="pre", color=INK, linewidth=1,
+        linestyle="--", alpha=0.6, zorder=1, label="Pareto front",
+    )  # fmt: skip
+
+
+def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
+    """A panel per knob: success over speed, a point per value."""
+    from matplotlib.figure import Figure
+
+    knobs = list(dict.fromkeys(row["knob"] for row in rows))
+    columns = 3
+    lines = -(-len(knobs) // columns)
+    figure = Figure(figsize=(11, 3.1 * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False, sharey=True)
+    for axes, knob in zip(panels.flat, knobs, strict=False):
+        own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["grasps_per_second"])
+        axes.plot([r["grasps_per_second"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
+        for row in own:
+            axes.errorbar(
+                row["grasps_per_second"], row["gsr"], yerr=_error(row, "gsr"), fmt="o", color=COLOURS[0], capsize=2,
+                elinewidth=1, markerfacecolor=COLOURS[0] if row["default"] else "white", markersize=6,
+            )  # fmt: skip
+            axes.annotate(
+                str(row["value"]), (row["grasps_per_second"], row["gsr"]), xytext=(5, 6), textcoords="offset points",
+                fontsize=8,
+            )  # fmt: skip
+        axes.set_title(knob, loc="left", fontsize=10)
+        axes.set_ylim(0, 1.05)
+        axes.margins(x=0.18)
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in panels.flat[len(knobs) :]:
+        axes.set_visible(False)
+    figure.supxlabel("raw grasps per second", fontsize=10)
+    figure.supylabel("success in MuJoCo", fontsize=10)
+    figure.savefig(file, dpi=150)

@@ -1,0 +1,13 @@
+"""What only a comparison needs of a device."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def forget(active_in: wp.array(dtype=wp.int32), count_out: wp.array(dtype=wp.int32)):
+    """No contacts yet. Launch over B."""
+    b = wp.tid()
+    if active_in[b] == 1:
+        count_out[b] = 0

@@ -1,0 +1,168 @@
+"""A chart as JSON, CSV, Markdown and pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from worker.studies.chart.figure import draw, draw_sweeps
+
+Row = Mapping[str, Any]
+
+#: Columns of the CSV file, one row per run.
+COLUMNS: Final = (
+    "method", "fidelity", "batch", "hand", "object", "grasps", "valid", "repeats", "grasps_per_second",
+    "valid_per_second", "valid_per_second_low", "valid_per_second_high", "seconds_to_first_valid", "gsr", "gsr_low",
+    "gsr_high", "epsilon", "epsilon_low", "epsilon_high", "pd_mm", "pd_mm_low", "pd_mm_high", "spd_mm", "ca_cm2",
+    "iv_cm3", "wrench_volume",
+)  # fmt: skip
+
+
+def write(chart: Row, folder: Path) -> list[Path]:
+    """chart.json, chart.csv, chart.md, chart.png and chart.svg in a folder; sweeps.png where knobs were swept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "chart.json").write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
+    with (folder / "chart.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(chart["runs"])
+    files = [folder / name for name in ("chart.json", "chart.csv", "chart.md", "chart.png", "chart.svg")]
+    draw(chart["summary"], files[3:])
+    if chart.get("sweeps"):
+        files.append(folder / "sweeps.png")
+        draw_sweeps(chart["sweeps"], files[-1])
+    files[2].write_text(markdown(chart) + "\n")
+    return files
+
+
+def markdown(chart: Row) -> str:
+    """The chart as a page: what was run, one table per question."""
+    parts = [_head(chart), summary_table(chart["summary"]), _ratios(chart["summary"])]
+    parts += ["## Each hand and object", runs_table(chart["runs"])]
+    parts += [
+        "## The best ten by epsilon",
+        "Means over each pair's best ten grasps by ε (as the paper's table 2 takes them), then over objects.",
+        best_table(chart["runs"]),
+    ]
+    if chart.get("sweeps"):
+        parts += ["## What each knob costs and buys", "![Knobs](sweeps.png)", sweeps_table(chart["sweeps"])]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _head(chart: Row) -> str:
+    hands, objects = (", ".join(dict.fromkeys(r[name] for r in chart["runs"])) for name in ("hand", "object"))
+    command = f"    {chart['command']}\n\n" if chart.get("command") else ""
+    return (
+        f"# Speed against accuracy\n\n{command}{chart['device']}, {chart['threads']} threads, graspd "
+        f"{chart['versions']['graspd']}, Warp {chart['versions']['warp']}, {chart['created']}. Hands: {hands}. "
+        f"Objects: {objects}. Warm, repeats in turn. Valid: holds in MuJoCo (DexGraspBench protocol, level "
+        f"*{chart['referee']['level']}*). Speed counts planner and postures, not the referee. "
+        f"ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
+        "medians of a pair's grasps, then means over the pairs. Bars and ± are 95 % (bootstrap).\n\n"
+        "![Speed against accuracy](chart.png)"
+    )
+
+
+def summary_table(rows: Sequence[Row]) -> str:
+    """A row per method and fidelity, the fastest first; bold: on the Pareto front of that accuracy against speed."""
+    lines = [
+        "| method | fidelity | batch | valid/s | raw/s | first valid s | GSR | ε | penetration mm | grasps |",
+        "| --- | --- | --: | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    for row in sorted(rows, key=lambda r: -r["valid_per_second"]):
+        cells = [row["method"], row["fidelity"], row["batch"], _with_bar(row, "valid_per_second", ".3g")]
+        cells += [f"{row['grasps_per_second']:.3g}", _first(row["seconds_to_first_valid"])]
+        for key, form in (("gsr", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f")):
+            text = _with_bar(row, key, form)
+            cells.append(f"**{text}**" if key in row["front"] else text)
+        lines.append("| " + " | ".join(map(str, [*cells, row["grasps"]])) + " |")
+    return "\n".join(lines)
+
+
+def _with_bar(row: Row, key: str, form: str) -> str:
+    half = (row[f"{key}_high"] - row[f"{key}_low"]) / 2
+    return f"{row[key]:{form}} ± {half:.1g}" if form == ".3g" else f"{row[key]:{form}} ± {half:{form}}"
+
+
+def _first(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2g}"
+
+
+def _ratios(rows: Sequence[Row]) -> str:
+    """How many times more valid grasps per second `fast_graspd`'s default makes than each other method."""
+    own = [r for r in rows if (r["method"], r["fidelity"]) == ("fast_graspd", "standard")]
+    others = [r for r in rows if r["method"] != "fast_graspd"]
+    if not own or not others:
+        return ""
+    best = max(own, key=lambda r: r["valid_per_second"])
+    lines = [
+        "fast_graspd at its default (standard) against each other method, same run:",
+        "",
+        "| against | valid/s | GSR | ε | penetration mm |",
+        "| --- | --: | --: | --: | --: |",
+    ]
+    for row in others:
+        speed = row["valid_per_second"]
+        times = f"× {best['valid_per_second'] / speed:.3g}" if speed else "none valid"
+        lines.append(
+            f"| {row['method']} {row['fidelity']} | {times} | {best['gsr'] - row['gsr']:+.2f} "
+            f"| {best['epsilon'] - row['epsilon']:+.3f} | {best['pd_mm'] - row['pd_mm']:+.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def runs_table(runs: Sequence[Row]) -> str:
+    """A row per run."""
+    lines = [
+        "| hand | object | method | fidelity | valid/s | GSR | ε | penetration mm | self mm | contact cm² |",
+        "| --- | --- | --- | --- | --: | --: | --: | --: | --: | --: |",
+    ]
+    lines += [
+        f"| {run['hand']} | {run['object']} | {run['method']} | {run['fidelity']} | {run['valid_per_second']:.3g} "
+        f"| {run['gsr']:.2f} | {run['epsilon']:.3f} | {run['pd_mm']:.2f} | {run['spd_mm']:.2f} | {run['ca_cm2']:.1f} |"
+        for run in sorted(runs, key=lambda r: (r["hand"], r["object"]))
+    ]
+    return "\n".join(lines)
+
+
+def best_table(runs: Sequence[Row]) -> str:
+    """The layout of the paper's table 2: contact area, intersection volume, ε, wrench volume, displacement per hand."""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for run in runs:
+        groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])
+    lines = [
+        "| hand | method | fidelity | CA cm² ↑ | IV cm³ ↓ | ε ↑ | Vol ↑ | SD cm ↓ |",
+        "| --- | --- | --- | --: | --: | --: | --: | --: |",
+    ]
+    for (hand, method, fidelity), rows in sorted(groups.items()):
+        mean = {
+            key: _mean([row[key] for row in rows]) for key in ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm")
+        }
+        lines.append(
+            f"| {hand} | {method} | {fidelity} | {mean['ca_cm2']:.1f} | {mean['iv_cm3']:.2f} | {mean['epsilon']:.3f} "
+            f"| {mean['wrench_volume']:.2f} | {mean['sd_cm']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def _mean(values: Sequence[float | None]) -> float:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else float("nan")
+
+
+def sweeps_table(sweeps: Sequence[Row]) -> str:
+    """A row per value of each knob: gain in speed and price in accuracy against the default's row."""
+    lines = [
+        "| knob | value | raw grasps/s | speed | GSR | ε | penetration mm |",
+        "| --- | --- | --: | --: | --: | --: | --: |",
+    ]
+    lines += [
+        f"| {row['knob']} | {row['value']}{' (default)' if row['default'] else ''} "
+        f"| {row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
+        f"| {_with_bar(row, 'epsilon', '.3f')} | {_with_bar(row, 'pd_mm', '.2f')} |"
+        for row in sweeps
+    ]
+    return "\n".join(lines)

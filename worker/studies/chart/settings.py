@@ -1,0 +1,49 @@
+"""From names on the command line to what the chart runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from service.domain import FIDELITIES
+from service.errors import InputError
+from worker.planners import method, planner
+from worker.studies.chart.cells import Setting
+
+#: Label of methods that know no fidelities: they run as their source has them.
+LABEL: Final = "as published"
+
+
+def settings_of(
+    methods: Sequence[str], fidelities: Sequence[str], *, batches: Sequence[int], peer_batch: int,
+    options: Sequence[str], quick: bool, threads: int, device: str,
+) -> list[Setting]:  # fmt: skip
+    """A setting for every method, fidelity and batch; methods without fidelities have one each.
+
+    Raises:
+        InputError: unknown method, or an option that is not of one of them.
+    """
+    given = _options_of(options, methods)
+    found: list[Setting] = []
+    for name in methods:
+        known = method(name)
+        own = {**(known.quick if quick else {}), **given.get(name, {})}
+        planner(name, own)
+        common: dict[str, Any] = {"options": own, "warm": known.quick, "threads": threads, "device": device}
+        if known.has_fidelities:
+            found += [Setting(name, f, FIDELITIES[f], batch=b, **common) for f in fidelities for b in batches]
+        else:
+            found.append(Setting(name, LABEL, FIDELITIES["standard"], batch=peer_batch, **common))
+    return found
+
+
+def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
+    """`METHOD:NAME=VALUE` by method."""
+    found: dict[str, dict[str, str]] = {}
+    for text in texts:
+        name, colon, rest = text.partition(":")
+        option, equals, value = rest.partition("=")
+        if not colon or not equals or name not in methods:
+            raise InputError(f"--option {text!r}: write METHOD:NAME=VALUE with one of {', '.join(methods)}")
+        found.setdefault(name, {})[option] = value
+    return found

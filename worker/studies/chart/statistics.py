@@ -1,0 +1,138 @@
+"""Figures of a cell with their error bars, sums over cells, and the Pareto front."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.studies.chart.cells import Cell
+
+Floats = NDArray[np.float64]
+
+#: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
+DRAWS: Final = 400
+BAR: Final = (2.5, 97.5)
+#: Accuracies: whether more is better.
+METRICS: Final = {"gsr": True, "epsilon": True, "pd_mm": False}
+#: Of these the median of a cell's grasps counts; of `gsr` the mean.
+MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
+
+
+def figures(cell: Cell) -> dict[str, Any]:
+    """The keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
+    held = np.concatenate(cell.success).astype(float)
+    seconds, batch = np.array(cell.seconds), cell.setting.batch
+    draws = _draws(cell)
+    row: dict[str, Any] = {
+        "seconds": [round(s, 4) for s in cell.seconds],
+        "grasps": len(held),
+        "valid": int(held.sum()),
+        "grasps_per_second": len(held) / seconds.sum(),
+        "seconds_to_first_valid": first_valid(float(held.mean()), cell.first_call_s, cell.first_call_grasps),
+        "valid_per_second": held.sum() / seconds.sum(),
+        "gsr": held.mean(),
+        "batch": batch,
+        "repeats": len(seconds),
+    }
+    row |= {key: float(np.median(cell.values(key))) for key in MEDIANS}
+    for key, values in draws.items():
+        row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
+    return {key: plain(value) for key, value in row.items()}
+
+
+def first_valid(share: float, seconds: float, grasps: int) -> float | None:
+    """Expected seconds until a call of so many grasps, made again and again, has a valid one; None: never seen one."""
+    if share <= 0 or not np.isfinite(seconds):
+        return None
+    return seconds / (1.0 - (1.0 - share) ** grasps)
+
+
+def _draws(cell: Cell) -> dict[str, Floats]:
+    """Bootstrap: repeats with replacement, then grasps within each."""
+    rng = np.random.default_rng(0)
+    repeats = len(cell.seconds)
+    out: dict[str, list[float]] = {key: [] for key in ("valid_per_second", "gsr", "epsilon", "pd_mm")}
+    for _ in range(DRAWS):
+        chosen = rng.integers(repeats, size=repeats)
+        rows = [rng.integers(len(cell.success[r]), size=len(cell.success[r])) for r in chosen]
+        held = np.concatenate([cell.success[r][i] for r, i in zip(chosen, rows, strict=True)])
+        out["gsr"].append(float(held.mean()))
+        out["valid_per_second"].append(float(held.sum() / sum(cell.seconds[r] for r in chosen)))
+        for key in ("epsilon", "pd_mm"):
+            values = [cell.columns[r][key][i] for r, i in zip(chosen, rows, strict=True)]
+            out[key].append(float(np.median(np.concatenate(values))))
+    return {key: np.array(values) for key, values in out.items()}
+
+
+def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per method, fidelity and batch, over all hands and objects.
+
+    Speed is all valid grasps over all seconds; accuracies are means over the pairs, whose bars shrink accordingly.
+    """
+    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for run in runs:
+        groups.setdefault((run["method"], run["fidelity"], run["batch"]), []).append(run)
+    rows = []
+    for (method, fidelity, batch), own in groups.items():
+        valid, seconds = sum(r["valid"] for r in own), sum(sum(r["seconds"]) for r in own)
+        firsts = [r["seconds_to_first_valid"] for r in own]
+        row: dict[str, Any] = {"method": method, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
+        row["grasps"] = sum(r["grasps"] for r in own)
+        row["grasps_per_second"] = row["grasps"] / seconds
+        # Of pairs without a valid grasp nobody knows how long they take: a mean without them would flatter.
+        row["seconds_to_first_valid"] = None if None in firsts else float(np.mean(firsts))
+        for key in METRICS:
+            values = np.array([r[key] for r in own], float)
+            row[key] = float(values.mean())
+            row[f"{key}_low"], row[f"{key}_high"] = _bar(own, key)
+        row["valid_per_second"] = valid / seconds
+        low, high = (_ratio_bar(own, end) for end in ("low", "high"))
+        row["valid_per_second_low"], row["valid_per_second_high"] = low, high
+        rows.append({key: plain(value) for key, value in row.items()})
+    for key, more in METRICS.items():
+        # Who makes no valid grasp is on no front: a hand that touches nothing does not penetrate either.
+        able = [row for row in rows if row["valid_per_second"]]
+        front = pareto([(row["valid_per_second"], row[key] if more else -row[key]) for row in able])
+        for row in rows:
+            row.setdefault("front", [])
+        for index in front:
+            able[index]["front"].append(key)
+    return rows
+
+
+def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
+    """Bar of a mean of independent cells: their half-widths added in quadrature."""
+    mean = float(np.mean([r[key] for r in runs]))
+    down = np.sqrt(np.sum([(r[key] - r[f"{key}_low"]) ** 2 for r in runs])) / len(runs)
+    up = np.sqrt(np.sum([(r[f"{key}_high"] - r[key]) ** 2 for r in runs])) / len(runs)
+    return mean - float(down), mean + float(up)
+
+
+def _ratio_bar(runs: Sequence[dict[str, Any]], end: str) -> float:
+    """Bar of valid grasps over seconds, each cell's weighed by its seconds."""
+    weight = np.array([sum(r["seconds"]) for r in runs])
+    value = np.array([r["valid_per_second"] for r in runs])
+    off = np.array([r[f"valid_per_second_{end}"] for r in runs]) - value
+    spread = float(np.sqrt(np.sum((weight * off) ** 2)) / weight.sum())
+    return float((weight * value).sum() / weight.sum()) + (spread if end == "high" else -spread)
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
+    """Indices of points (more, more) that no other point beats: as good in both and better in one."""
+    return {
+        index
+        for index, (x, y) in enumerate(points)
+        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
+    }
+
+
+def plain(value: Any) -> Any:
+    """A JSON value: six significant digits, None for what is no number."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    return value

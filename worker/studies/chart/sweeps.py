@@ -1,0 +1,163 @@
+"""fast_graspd's knobs turned one at a time: what each costs in accuracy and gains in speed.
+
+Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
+simulations share one closest-point query per hand point (as they do) or ask M times (as the paper's code does). There
+is no float64 path to compare float32 with: tests hold the kernels against float64 references instead.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final
+
+import warp as wp
+
+from service.domain import FIDELITIES, Fidelity
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.pairs import Pair, Side, pair_of
+from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
+from worker.quality.referee.decomposition import decompose
+from worker.simulation.simulation import LossOptions, Simulation
+from worker.studies.chart import kernels
+from worker.studies.chart.cells import Cell, Setting
+from worker.studies.chart.chart import Thing
+from worker.studies.chart.statistics import figures, plain
+
+Say = Callable[[str], None]
+Change = Callable[[Pair], Pair]
+
+DEFAULT: Final = FIDELITIES["standard"]
+
+
+class AskingEach(Simulation):
+    """Every simulated velocity asks for the distances anew; the answers are the same."""
+
+    def _record_kinematics(self) -> None:
+        super()._record_kinematics()
+        gather = self._commands[-1]
+        for _ in range(self.options.velocities - 1):
+            self._launch(kernels.forget, self.capacity, [self.active, self.contacts])
+            self._commands.append(gather)
+
+
+@dataclass(frozen=True)
+class AskingPair(Pair):
+    """A pair whose simulations share no queries."""
+
+    def simulation(self, side: Side, capacity: int) -> Simulation:
+        return AskingEach(self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One knob at one value."""
+
+    knob: str
+    value: str
+    fidelity: Fidelity = DEFAULT
+    change: Change | None = None
+
+    @property
+    def default(self) -> bool:
+        return self.fidelity == DEFAULT and self.change is None
+
+
+def _same(pair: Pair) -> Pair:
+    return pair
+
+
+def _options(**changes: Any) -> Change:
+    def change(pair: Pair) -> Pair:
+        return replace(pair, options=replace(pair.options, **changes))
+
+    return change
+
+
+def _asking(pair: Pair) -> Pair:
+    return AskingPair(pair.coarse, pair.fine, pair.options, pair.hand)
+
+
+def turns(quick: bool = False) -> list[Turn]:
+    """All knobs; each has the default among its values."""
+
+    def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[Turn]:
+        return [Turn(name, text, DEFAULT.model_copy(update=change)) for text, change in values]
+
+    def points(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
+        return f"{coarse}, {fine}", {"coarse_points": coarse, "fine_points": fine}
+
+    def iterations(coarse: int, fine: int) -> tuple[str, dict[str, Any]]:
+        return f"{coarse} + {fine}", {"coarse_iterations": coarse, "fine_iterations": fine}
+
+    def starts(count: int, finalists: int) -> tuple[str, dict[str, Any]]:
+        return f"{count}, {finalists}", {"starts": count, "finalists": finalists}
+
+    found = [
+        *knob("hand points", [points(64, 500), points(128, 1000), points(256, 2000), points(512, 4000)]),
+        *knob("face error bound, mm", [(f"{1e3 * e:g}", {"face_error_m": e}) for e in (0, 1e-4, 3e-4, 1e-3, 3e-3)]),
+        *knob("iterations", [iterations(25, 10), iterations(50, 20), iterations(100, 40), iterations(200, 80)]),
+        *knob("starts, finalists", [starts(1, 1), starts(2, 1), starts(4, 2), starts(8, 4)]),
+        *knob("contact solver", [(s, {"contact_solver": s}) for s in ("direct", "jacobi", "gauss_seidel")]),
+    ]
+    passes = LossOptions().passes
+    found += [Turn("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)]
+    found += [Turn("queries", "shared"), Turn("queries", "one per velocity", change=_asking)]
+    found += [
+        Turn("culling", "grid and band"),
+        Turn("culling", "band", change=_options(exact_below=1.0)),
+        Turn("culling", "none", change=_options(exact_below=1.0, band=0.3)),
+    ]
+    return found[:2] + found[-5:-3] if quick else found
+
+
+def sweep(
+    hand: HandModel, thing: Thing, *, batch: int, repeats: int, quick: bool, threads: int, device: str,
+    say: Say = lambda line: None,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
+
+    Values are run in turn, repeat by repeat. `speedup` is raw grasps per second over the default's.
+    """
+    wp.load_module(module=kernels, device=device)
+    default = Turn("", "default")
+    cells: dict[tuple[str, str], Cell] = {}
+    for turn in [default, *turns(quick)]:
+        if turn is default or not turn.default:
+            cells[turn.knob, turn.value] = _cell(turn, hand, thing, batch, threads, device)
+    for cell in cells.values():
+        cell.warm_up()
+    for _ in range(repeats):
+        for cell in cells.values():
+            cell.repeat()
+    base = figures(cells[default.knob, default.value])
+    rows = []
+    for turn in turns(quick):
+        found = base if turn.default else figures(cells[turn.knob, turn.value])
+        faster = found["grasps_per_second"] / base["grasps_per_second"]
+        rows.append(
+            {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
+            | {"speedup": plain(faster), **found}
+        )
+        say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
+    return rows
+
+
+def _cell(turn: Turn, hand: HandModel, thing: Thing, batch: int, threads: int, device: str) -> Cell:
+    obj = thing.load(turn.fidelity.face_error_m)
+    run = partial(_run, turn=turn, threads=threads, device=device)
+    setting = Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, threads=threads, device=device, run=run)
+    return Cell(setting, hand, obj, decompose(obj))
+
+
+def _run(
+    hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, threads: int, device: str
+) -> GraspSet:
+    began = time.perf_counter()
+    pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, device))
+    parts = optimise_pair(pair, count=count, fidelity=turn.fidelity, seed=seed, batch=0, threads=threads)
+    return grasps_of(hand, obj, parts, time.perf_counter() - began)
