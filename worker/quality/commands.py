@@ -16,7 +16,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
 from worker.quality.evaluate import Protocol, combine, evaluate
 from worker.quality.referee.key import Level
-from worker.quality.sources import load_case
+from worker.quality.sources import expand, load_case
 
 app = typer.Typer(add_completion=False)
 
@@ -31,7 +31,8 @@ _COLUMNS: Final = (
 @reporting_errors
 def evaluate_command(
     files: Annotated[
-        list[Path], typer.Argument(help="Base shards, reference-grasp JSON files, DexGraspBench folders.")
+        list[Path],
+        typer.Argument(help="Base shards, reference-grasp JSON files, folders of either, DexGraspBench folders."),
     ],
     protocol: Annotated[
         str, typer.Option(help="dexgraspbench, or displacement: no pushes, only the slip in 0.15 s.")
@@ -60,7 +61,7 @@ def evaluate_command(
                TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
-        for file in files:
+        for file in (one for path in files for one in expand(path)):
             case = load_case(file, hand=hand, obj=object)
             row = evaluate(
                 case,

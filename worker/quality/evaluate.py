@@ -42,8 +42,9 @@ def evaluate(
     """One row of numbers, None where a number does not exist: too thin an object has no verdict.
 
     Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
-    making and judging them), pd_mm and spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume,
-    cdc_mm, sd_cm: medians; diversity: variance explained by the first principal component.
+    making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
+    self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
+    the first principal component.
     """
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(
@@ -73,18 +74,21 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
         return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_referee", "agreement_published"))
     held = int(verdicts.success.sum())
     made = case.seconds
+    whole = None if made is None else made + (0.0 if case.judged else seconds)
     row: dict[str, Any] = {
         "level": verdicts.level,
         "gsr": _plain(held / len(case.grasps)),
         "osr": float(held > 0),
-        "sgs": _plain(held / (made + seconds)) if made else None,
-        "sgs_without_referee": _plain(held / made) if made else None,
+        "sgs": _plain(held / whole) if whole else None,
+        "sgs_without_referee": _plain(held / made) if made and not case.judged else None,
         "referee_seconds": _plain(seconds),
+        "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
         "agreement_published": None,
     }
     if case.published is not None and (known := case.published >= 0).any():
+        row["published"] = int(known.sum())
         row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
     return row
 
@@ -117,33 +121,37 @@ def _plain(value: float) -> float:
     return round(float(value), 6)
 
 
+#: Numbers of a row that several rows have a median of.
+_MEDIANS: Final = (
+    "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity",
+)  # fmt: skip
+
+
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """One row for several objects: rates over all grasps, osr over objects, medians of the objects' medians."""
     if len(rows) == 1:
         return dict(rows[0])
-    total = sum(row["n"] for row in rows)
-    out: dict[str, Any] = {
-        "n": total,
-        "protocol": rows[0]["protocol"],
-        "level": rows[0]["level"],
-        "hard": rows[0]["hard"],
-    }
+    out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
+    for key in ("protocol", "level", "hard", "mu"):
+        # What the rows do not agree on has no one value.
+        out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
     judged = [row for row in rows if row["gsr"] is not None]
-    share = sum(row["gsr"] * row["n"] for row in judged) / max(1, sum(row["n"] for row in judged))
-    out["gsr"] = _plain(share) if judged else None
-    out["osr"] = _plain(sum(row["osr"] for row in judged) / len(judged)) if judged else None
-    for key in (
-        "sgs",
-        "pd_mm",
-        "spd_mm",
-        "ca_cm2",
-        "iv_cm3",
-        "epsilon",
-        "wrench_volume",
-        "cdc_mm",
-        "sd_cm",
-        "diversity",
-    ):
+    out["gsr"] = _rate(judged, "gsr", "n")
+    out["osr"] = _plain(float(np.mean([row["osr"] for row in judged]))) if judged else None
+    out["agreement_published"] = _rate(judged, "agreement_published", "published")
+    for key in ("sgs", "sgs_without_referee"):
+        # Held grasps over the seconds of all rows together.
+        timed = [row for row in judged if row[key]]
+        seconds = sum(row["gsr"] * row["n"] / row[key] for row in timed)
+        out[key] = _plain(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
+    for key in _MEDIANS:
         known = [row[key] for row in rows if row[key] is not None]
         out[key] = _plain(float(np.median(known))) if known else None
     return out
+
+
+def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
+    """Mean of the rows that have the key, weighed by the number of grasps it is a rate of."""
+    known = [row for row in rows if row[key] is not None]
+    total = sum(row[weight] for row in known)
+    return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None

@@ -31,8 +31,24 @@ class Case:
     """Coulomb coefficient the file states for its metrics."""
     seconds: float | None = None
     """What making the grasps took, where it is known."""
+    judged: bool = False
+    """Whether those seconds hold the referee's work on them already."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
+
+
+def expand(path: Path) -> list[Path]:
+    """What a path stands for: itself; or, for a folder without `.npy` files, all shards and reference grasps below it.
+
+    Raises:
+        InputError: a folder without any grasps.
+    """
+    if not path.is_dir() or any(path.rglob("*.npy")):
+        return [path]
+    found = sorted(file for suffix in ("*.h5", "*.json") for file in path.rglob(suffix))
+    if not found:
+        raise InputError(f"{path} has no shards (.h5), reference grasps (.json) or DexGraspBench files (.npy)")
+    return found
 
 
 def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
@@ -71,6 +87,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
         path.name, model, thing, grasps,
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
+        judged="verdict_level" in said,
     )  # fmt: skip
 
 

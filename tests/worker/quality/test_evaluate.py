@@ -21,7 +21,7 @@ from worker.hands.surface import piece_distance
 from worker.quality.commands import app
 from worker.quality.evaluate import combine, evaluate
 from worker.quality.postures import pregrasp, squeeze
-from worker.quality.sources import Case, load_case
+from worker.quality.sources import Case, expand, load_case
 from worker.transforms import apply, invert
 
 CONTRACT = {
@@ -67,6 +67,44 @@ def test_several_objects_are_weighed_by_their_grasps(tmp_path: Path) -> None:
     assert whole["osr"] == 0.5
 
 
+def test_seconds_of_several_objects_add_up(tmp_path: Path) -> None:
+    row = {**evaluate(plates_case(seconds=1.0), cache=tmp_path), "sgs": 1.0, "sgs_without_referee": 2.0}
+    whole = combine([row, {**row, "sgs": 0.5, "sgs_without_referee": 1.0}])
+    # Two held grasps in 2 s and two in 4 s; without the referee in 1 s and in 2 s.
+    assert whole["sgs"] == pytest.approx(4 / 6)
+    assert whole["sgs_without_referee"] == pytest.approx(4 / 3)
+
+
+def test_seconds_of_grasps_judged_before_hold_the_referee_already(tmp_path: Path) -> None:
+    row = evaluate(plates_case(seconds=1.0, judged=True), cache=tmp_path)
+    assert row["sgs"] == pytest.approx(2.0)
+    assert row["sgs_without_referee"] is None
+
+
+def test_what_rows_do_not_agree_on_has_no_one_value(tmp_path: Path) -> None:
+    row = evaluate(plates_case(), cache=tmp_path)
+    whole = combine([row, {**row, "mu": 0.5}])
+    assert whole["mu"] is None
+    assert whole["level"] == "certificate"
+
+
+def test_agreement_of_several_objects_is_weighed_by_what_is_known(tmp_path: Path) -> None:
+    row = evaluate(plates_case(published=np.array([1, 1, -1], np.int8)), cache=tmp_path)
+    whole = combine([row, {**row, "agreement_published": 0.0, "published": 6}])
+    assert whole["agreement_published"] == pytest.approx(0.25)
+
+
+def test_folder_stands_for_the_files_in_it(shared_data: Path) -> None:
+    found = expand(shared_data / "reference_grasps")
+    assert len(found) == 8
+    assert found[0].name == "003_cracker_box.json"
+
+
+def test_folder_without_grasps_is_refused_with_what_it_should_hold(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no shards"):
+        expand(tmp_path)
+
+
 def test_published_grasps_are_read_with_their_results(shared_data: Path) -> None:
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     assert len(case.grasps) == 22
@@ -101,8 +139,8 @@ def bench_folder(folder: Path, **change: object) -> Path:
 
 @pytest.fixture
 def known_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.quality.sources.hand_from_path", lambda path: HAND)
-    monkeypatch.setattr("worker.quality.sources.object_from_path", lambda path: BOX)
+    monkeypatch.setattr("worker.exchange.dexgraspbench.hand_from_path", lambda path: HAND)
+    monkeypatch.setattr("worker.exchange.dexgraspbench.scaled_object", lambda path, scale: BOX)
 
 
 @pytest.mark.usefixtures("known_pair")
