@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from service.errors import NotFoundError
 from service.store import Store
 
-KEY: Final = "charts/latest.json"
+FOLDER: Final = "charts"
 WIDTH: Final = 860
 HEIGHT: Final = 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
@@ -81,9 +81,10 @@ class Drawing:
 
 
 def load(store: Store) -> Measured | None:
-    """The last chart; None where there is none that can be read."""
+    """The chart that was published last; None where there is none that can be read. Their names begin with the date."""
+    keys = [entry.key for entry in store.list(FOLDER) if entry.key.endswith(".json")]
     try:
-        return Measured.model_validate_json(store.get(KEY))
+        return Measured.model_validate_json(store.get(max(keys))) if keys else None
     except (NotFoundError, ValidationError):
         return None
 

@@ -14,13 +14,22 @@
     }
   }
 
+  /** What stands in a fresh region for an element of the old one. */
+  function twin(region, element) {
+    const name = (attribute) => (element.getAttribute(attribute) ? `[${attribute}="${CSS.escape(element.getAttribute(attribute))}"]` : "");
+    const mark = name("id") || `${name("name")}${name("value")}${name("href")}`;
+    return mark && region.querySelector(element.localName + mark);
+  }
+
   function swap(text) {
     let changed = false;
     document.dispatchEvent(new Event("graspd:swapping"));
     const fresh = new DOMParser().parseFromString(text, "text/html");
     for (const region of document.querySelectorAll("[data-live]")) {
       const next = fresh.getElementById(region.id);
-      if (!next || region.contains(document.activeElement) && document.activeElement.matches("input, select")) continue;
+      const focused = region.contains(document.activeElement) ? document.activeElement : null;
+      // Nobody's typing is taken away.
+      if (!next || focused?.matches("input:not([type=checkbox], [type=radio]), select")) continue;
       if (next.outerHTML === region.dataset.was) continue;
       const was = next.outerHTML;
       sayTimes(next);
@@ -28,6 +37,7 @@
       const shown = document.getElementById(next.id);
       shown.dataset.was = was;
       showCopies(shown);
+      if (focused) twin(shown, focused)?.focus();
       changed = true;
     }
     if (changed) document.dispatchEvent(new Event("graspd:swapped"));

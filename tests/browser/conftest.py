@@ -1,0 +1,112 @@
+"""Headless Chromium on the dashboard: of an application in this process, or of a whole service with the real engine."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from service.settings import Settings
+from service.supervisor import Supervisor
+from tests.api.conftest import app, parts, settings
+
+__all__ = ["app", "parts", "settings"]
+
+#: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
+ARGUMENTS = (
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+READY_S = 60.0
+
+
+@pytest.fixture
+def address(app: FastAPI) -> Iterator[str]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    server.should_exit = True
+    thread.join()
+    listener.close()
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """One browser for all tests; each gets a context of its own."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra: pip install graspd[browser]")
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no Chromium on this machine: apt-get install chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=list(ARGUMENTS))
+        yield browser
+        browser.close()
+
+
+class Watch:
+    """What must not happen on any page: errors in the console, and requests to anywhere else."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.trouble: list[str] = []
+
+    def __call__(self, page: Any) -> Any:
+        page.on("console", lambda message: self._say(message.text) if message.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: self._say(str(error)))
+        page.on("request", lambda request: None if self._is_own(request.url) else self._say(request.url))
+        return page
+
+    def _is_own(self, url: str) -> bool:
+        return url.startswith((self.address, "data:", "blob:"))
+
+    def _say(self, text: str) -> None:
+        # Drivers talk about speed, which is no fault of the page.
+        if "GPU stall" not in text:
+            self.trouble.append(text)
+
+
+@pytest.fixture
+def page(address: str, chromium: Any) -> Iterator[Any]:
+    """A page of the application in this process; the test fails if anything went wrong on it."""
+    watch = Watch(address)
+    context = chromium.new_context(base_url=address, viewport={"width": 1440, "height": 900})
+    yield watch(context.new_page())
+    context.close()
+    assert watch.trouble == []
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a whole service: Redis, API, keeper, and a worker with the real engine on the CPU."""
+    wanted = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0, device="cpu", keeper_interval_s=0.5)
+    worker = (sys.executable, "-m", "graspd", "worker")
+    supervisor = Supervisor(wanted, workers=1, worker_command=worker)
+    supervisor.start()
+    try:
+        supervisor.wait_ready(READY_S)
+        yield supervisor.api_url
+    finally:
+        supervisor.stop()
+
+
+@pytest.fixture
+def real_page(service: str, chromium: Any, tmp_path: Path) -> Iterator[Any]:
+    """A page of the whole service."""
+    watch = Watch(service)
+    context = chromium.new_context(base_url=service, viewport={"width": 1440, "height": 900}, accept_downloads=True)
+    yield watch(context.new_page())
+    context.close()
+    assert watch.trouble == []

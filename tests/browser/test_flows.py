@@ -1,0 +1,116 @@
+"""What users do, on a whole service with the real engine: from a file of their own to a grasp in 3D and its shard."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+
+from service.assets import builtin_files
+from service.domain import AssetKind
+
+pytestmark = pytest.mark.browser
+
+#: Eight draft grasps take about ten seconds on two cores; the rest is a busy machine.
+WORK_MS = 150_000
+CHECK_MS = 60_000
+SHOWN_MS = 60_000
+
+
+def test_a_user_submits_watches_filters_inspects_downloads_cancels_and_retries(real_page: Any, tmp_path: Path) -> None:
+    page = real_page
+    mesh = tmp_path / "my block.stl"
+    mesh.write_bytes(builtin_files(AssetKind.OBJECT, "block")["block.stl"])
+
+    page.goto("/submit")
+    page.set_input_files("#file", mesh)
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=bad]", timeout=CHECK_MS)
+    assert "already known as 'block'" in page.inner_text("[data-thing=object] [data-found]")
+    page.select_option("#hand", "barrett")
+    page.select_option("#object", "block")
+    page.wait_for_selector("[data-thing=object] figure[data-state=ready]", timeout=SHOWN_MS)
+    page.fill("#grasps", "8")
+    page.check("input[value=draft]")
+    page.click("text=Submit the job")
+
+    page.wait_for_url("**/jobs/*")
+    job = page.url
+    page.wait_for_selector("#head .succeeded", timeout=WORK_MS)
+    page.wait_for_selector("#best canvas[data-state=ready]", timeout=SHOWN_MS)
+    page.wait_for_selector("#loss .uplot")
+
+    page.click("text=All grasps of this job")
+    page.fill("[name=max_penetration_depth_mm]", "1")
+    page.click("button:has-text('Filter')")
+    page.wait_for_url("**max_penetration_depth_mm=1**")
+    page.wait_for_selector("#found .grasp")
+    page.click("#found .grasp a >> nth=0")
+
+    inspect(page)
+
+    with page.expect_download() as download:
+        page.click("a[download]")
+    download.value.save_as(tmp_path / "shard.h5")
+    with h5py.File(tmp_path / "shard.h5") as shard:
+        assert shard["grasp/hand_pose"].shape[1] == 7
+
+    page.goto("/submit?hand=shadow&object=mug&grasps=640")
+    page.click("text=Submit the job")
+    page.wait_for_url(lambda url: "/jobs/" in url and url != job)
+    page.click("button:has-text('Cancel')")
+    page.wait_for_selector("#head .cancelled")
+    page.click("button:has-text('Retry')")
+    page.wait_for_selector("#head .queued, #head .running")
+    page.click("button:has-text('Cancel')")
+    page.wait_for_selector("#head .cancelled")
+
+
+def inspect(page: Any) -> None:
+    """The 3D view: it draws, its slider moves hand and numbers, its keys turn it."""
+    page.wait_for_selector(".viewer[data-state=ready]", timeout=SHOWN_MS)
+    at_grasp = page.inner_text("[data-say]")
+    assert re.match(r"[1-9]\d* surface points within 1 mm", at_grasp)
+    canvas = page.locator(".viewer canvas")
+    assert colours(canvas) > 50
+    page.click("[data-posture='0']")
+    assert page.get_attribute("input[type=range]", "aria-valuetext") == "pregrasp"
+    assert page.inner_text("[data-say]") != at_grasp
+    before = canvas.screenshot()
+    canvas.focus()
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert canvas.screenshot() != before
+    assert page.locator(".pushes li").count() == 6
+
+
+def colours(canvas: Any) -> int:
+    """Number of different colours on a canvas: one or two mean that nothing was drawn."""
+    import io
+
+    from PIL import Image
+
+    return len(set(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB").resize((200, 150)).getdata()))
+
+
+def test_an_upload_is_checked_at_once_shown_and_a_bad_one_says_why(real_page: Any, tmp_path: Path) -> None:
+    page = real_page
+    bad = tmp_path / "broken.stl"
+    bad.write_bytes(b"solid broken\nfacet normal 0 0 1\nouter loop\nvertex 0 0\nendloop\nendfacet\nendsolid\n")
+    good = tmp_path / "wedge.off"
+    good.write_text(
+        "OFF\n6 8 0\n0 0 0\n.06 0 0\n0 .05 0\n0 0 .08\n.06 0 .08\n0 .05 .08\n"
+        "3 0 2 1\n3 3 4 5\n3 0 1 4\n3 0 4 3\n3 1 2 5\n3 1 5 4\n3 2 0 3\n3 2 3 5\n"
+    )
+    page.goto("/submit")
+    page.set_input_files("#file", bad)
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=bad]", timeout=CHECK_MS)
+    assert "broken.stl" in page.inner_text("[data-thing=object] [data-found]")
+    page.set_input_files("#file", good)
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=good]", timeout=CHECK_MS)
+    assert "60 x 50 x 80 mm" in page.inner_text("[data-thing=object] [data-found]")
+    page.wait_for_selector("[data-thing=object] figure[data-state=ready]", timeout=SHOWN_MS)
+    assert page.input_value("#object") == "wedge"

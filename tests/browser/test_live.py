@@ -1,0 +1,159 @@
+"""The pages in a real browser: they move by themselves, fit every screen, read without scripts, are accessible."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.datasets import actions
+from service.datasets.spec import DatasetRequest
+from service.parts import Parts
+from service.planning import plan
+from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+
+pytestmark = pytest.mark.browser
+
+#: A live page looks again within a second of an event; the rest is a slow machine.
+LIVE_MS = 15_000
+AXE = Path(__file__).parent / "vendor" / "axe.min.js"
+CHART = {
+    "created": "2026-11-21T12:00:00Z",
+    "device": "cpu",
+    "runs": [
+        {"method": "fast_graspd", "fidelity": fidelity, "hand": "allegro", "object": "mug", "valid_per_second": speed,
+         "seconds_to_first_valid": 2.0, "gsr": share, "epsilon": 0.4, "pd_mm": 0.2}
+        for fidelity, speed, share in (("draft", 9.0, 0.6), ("standard", 4.0, 0.8), ("fine", 1.5, 0.85))
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture
+def places(parts: Parts) -> list[str]:
+    """Addresses of every page, over a service in which something of everything has happened."""
+    record = add_job(parts, scenes=1, views=2, stereo=True)
+    shard = finish_all(parts, record)[0].shard_id
+    fail(parts, add_job(parts, seed=9), "a reason " * 30)
+    waiting = add_job(parts, seed=10)
+    add_worker(parts, "worker-1", "idle")
+    wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug", "block"]})
+    actions.create(parts, wanted)
+    parts.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    return [
+        "/", "/datasets", "/datasets/kitchen", "/datasets/kitchen?state=queued", f"/jobs/{record.id}",
+        f"/jobs/{waiting.id}", "/grasps", "/grasps?view=table", "/grasps?min_epsilon=99", f"/grasps/{shard}/0",
+        "/workers", "/chart", "/submit", "/problems", "/login",
+    ]  # fmt: skip
+
+
+def test_a_job_page_follows_its_job_without_a_reload(page: Any, parts: Parts) -> None:
+    record = add_job(parts, scenes=1, views=1)
+    tasks = list(plan(record))
+    page.goto(f"/jobs/{record.id}")
+    page.evaluate("window.stayed = true")
+    page.wait_for_selector("#head .queued")
+    finish(parts, record, tasks[0])
+    page.wait_for_selector("#best .grasp", timeout=LIVE_MS)
+    for task in tasks[1:]:
+        finish(parts, record, task)
+    page.wait_for_selector("#head .succeeded", timeout=LIVE_MS)
+    page.wait_for_selector("#views img", timeout=LIVE_MS)
+    assert page.evaluate("window.stayed") is True
+
+
+def test_the_home_page_shows_a_job_that_comes_later(page: Any, parts: Parts) -> None:
+    page.goto("/")
+    page.wait_for_selector("text=No job yet")
+    record = add_job(parts)
+    page.wait_for_selector(f'a[href="/jobs/{record.id}"]', timeout=LIVE_MS)
+
+
+def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, parts: Parts) -> None:
+    page.goto("/datasets")
+    page.check("input[value='allegro|mug']")
+    finish_all(parts, add_job(parts))
+    page.wait_for_selector("td.succeeded", timeout=LIVE_MS)
+    assert page.is_checked("input[value='allegro|mug']")
+    assert page.inner_text("[data-chosen]") == "1 cell chosen"
+
+
+def test_a_press_on_a_head_takes_the_column_and_submits_its_cells(page: Any) -> None:
+    page.goto("/datasets")
+    page.click("thead button:has-text('allegro')")
+    assert page.inner_text("[data-chosen]") == "3 cells chosen"
+    page.click(".act button[value=submit]")
+    page.wait_for_selector("text=3 jobs submitted")
+    assert page.locator("td.queued").count() == 3
+
+
+def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, parts: Parts) -> None:
+    finish_all(parts, add_job(parts, grasps=96))
+    page.goto("/grasps?view=table")
+    page.evaluate("window.stayed = true")
+    page.select_option("#valid", "false")
+    page.wait_for_selector("#found .badge:has-text('rejected')")
+    page.wait_for_url("**valid=false**")
+    assert page.locator("#found .badge:has-text('valid')").count() == 0
+    assert page.evaluate("window.stayed") is True
+
+
+def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, parts: Parts) -> None:
+    record = add_job(parts)
+    finish_all(parts, record)
+    page.goto(f"/jobs/{record.id}")
+    bar = page.locator("svg.hist a").first
+    count = int(bar.get_attribute("aria-label").split()[0])
+    page.goto(bar.get_attribute("href") + "&view=table")
+    assert page.locator("#found tbody tr").count() == count
+
+
+def test_no_page_scrolls_sideways(page: Any, places: list[str]) -> None:
+    for width in (390, 768, 1440):
+        page.set_viewport_size({"width": width, "height": 800})
+        for path in places:
+            page.goto(path)
+            assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), (path, width)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_page_has_a_serious_accessibility_finding(page: Any, places: list[str], scheme: str) -> None:
+    page.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+    found = []
+    for path in places:
+        page.goto(path)
+        page.evaluate(AXE.read_text())
+        result = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
+        found += [
+            f"{path}: {entry['id']}: {[node['html'][:160] for node in entry['nodes'][:3]]}"
+            for entry in result["violations"]
+            if entry["impact"] in ("serious", "critical")
+        ]
+    assert found == []
+
+
+def _text_of(page: Any, path: str) -> str:
+    page.goto(path)
+    return str(page.inner_text("main"))
+
+
+def test_every_page_reads_without_javascript(address: str, page: Any, places: list[str]) -> None:
+    context = page.context.browser.new_context(java_script_enabled=False, base_url=address)
+    plain = context.new_page()
+    texts = {path: _text_of(plain, path) for path in places}
+    context.close()
+    assert all(len(text) > 40 for text in texts.values())
+    of: Callable[[str], str] = lambda start: next(text for path, text in texts.items() if path.startswith(start))  # noqa: E731
+    assert "Penetration" in of("/grasps/")
+    assert "allegro × mug" in of("/grasps")
+    assert "kitchen" in of("/datasets")
+    assert "standard" in of("/chart")
+
+
+def test_an_error_is_a_page_of_its_own(page: Any) -> None:
+    answer = page.request.get("/jobs/nonsense", headers={"Accept": "text/html"})
+    assert answer.status == 404
+    assert "there is no job" in answer.text()
+    assert "Back to the overview" in answer.text()
