@@ -202,7 +202,7 @@ class Asset(Model):
 
 
 class Origin(Model):
-    """Where a job came from, for the logs and traces of its tasks; nothing is decided by it."""
+    """Where a job came from, for the logs and traces of its tasks; keys share the queue evenly."""
 
     request: str = Field("", max_length=64, description="id of the HTTP request")
     key: str = Field("", max_length=64, description="name of the API key")
@@ -251,7 +251,7 @@ class IngestMessage(Model):
 
 
 class Lane(StrEnum):
-    """Priority of a task: a worker takes `bulk` only when nothing `interactive` waits."""
+    """Priority of a task: `interactive` goes first, but for every fourth task that a worker takes."""
 
     INTERACTIVE = "interactive"
     BULK = "bulk"

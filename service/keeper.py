@@ -23,6 +23,7 @@ from service.pipeline import queue_tasks
 from service.planning import ingest_id, ingest_message
 from service.queue.port import Event, EventKind
 from service.reaper import Reaper
+from service.turns import Turns
 
 log = logging.getLogger(__name__)
 PART: Final = "keeper"
@@ -41,6 +42,7 @@ class Keeper:
         self._reaper = Reaper(parts, self._indexer, clock=clock)
         self._planner = Planner(parts, clock=clock)
         self._has_plans = False
+        self._turns = Turns()
         self._backlog: deque[tuple[str, Event]] = deque()
         self._started = False
         self._clock = clock
@@ -132,7 +134,7 @@ class Keeper:
         now = time.time()
         for lane in Lane:
             room = self._parts.settings.queue_window - sum(n for (of, _), n in depths.items() if of is lane)
-            ready = self._parts.index.ready_tasks(lane, now=now, limit=room) if room > 0 else []
+            ready = self._parts.index.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
             # After a rebuild the index does not know what is in the queue already.
             self._parts.index.set_queued([task.task.id for task in ready if task.task.id in present])
             queue_tasks(self._parts, [task for task in ready if task.task.id not in present], again=True)

@@ -60,13 +60,29 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     max_connection_wait_time = 2.0
     log_result_lifespan = False
 
-    def __init__(self, queue: RqQueue, runner: Runner, heart: Heartbeat, surroundings: Surroundings, **rq: Any) -> None:
-        super().__init__(connection=queue.connection, serializer=JSONSerializer, worker_ttl=_WORKER_TTL_S, **rq)
+    def __init__(
+        self,
+        queue: RqQueue,
+        runner: Runner,
+        heart: Heartbeat,
+        surroundings: Surroundings,
+        *,
+        stages: Collection[Stage],
+        name: str,
+    ) -> None:
+        super().__init__(
+            queues=queue_names(stages),
+            name=name,
+            connection=queue.connection,
+            serializer=JSONSerializer,
+            worker_ttl=_WORKER_TTL_S,
+        )
         self.log_job_description = False
         self._queue = queue
         self._runner = runner
         self._heart = heart
         self._surroundings = surroundings
+        self._stages, self._taken = stages, 0
         self._context: TaskContext | None = None
         self._outcome: Event | None = None
         AllowedJob.function = self._run_task
@@ -106,6 +122,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def _run_task(self, message: dict[str, Any]) -> None:
         assert self._context is not None
         self._outcome = self._runner.run(message, self._context)
+
+    def reorder_queues(self, reference_queue: Any) -> None:
+        """RQ calls this after each task it took: which lane comes first for the next one."""
+        self._taken += 1
+        queues = {queue.name: queue for queue in self.queues}
+        self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken)]
 
     def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
         """RQ's way to stop a task: there is no child to kill, so the task is asked."""
@@ -207,7 +229,7 @@ def run_worker(
     heart = Heartbeat(queue.connection, _first_beat(name, device, stages), lease_s=settings.lease_s)
     runner = Runner(table if table is not None else stage_table(), worker=name, publish=queue.publish)
     surroundings = Surroundings(settings, store, device)
-    worker = GraspWorker(queue, runner, heart, surroundings, queues=queue_names(stages), name=name)
+    worker = GraspWorker(queue, runner, heart, surroundings, stages=stages, name=name)
     heart.start()
     device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
     try:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Column, ColumnElement, or_, select
+from sqlalchemy import Column, ColumnElement, exists, or_, select
 
 from service.domain import AssetKind, Lane, Stage, State
 from service.index.database import Database
 from service.index.tables import assets, jobs, tasks
 from service.planning import MAX_BACKOFF_S, PlannedTask
 from service.records import JobRecord
+from service.turns import Turns, WaitingJob, interleave
 
 
 @dataclass(frozen=True)
@@ -39,25 +41,34 @@ class ReadyCheck:
 class Feed(Database):
     """Reads of the keeper."""
 
-    def ready_tasks(self, lane: Lane, *, now: float, limit: int) -> list[ReadyTask]:
-        """Tasks to be queued: batch by batch over all jobs, so that no job waits behind all of another."""
+    def waiting_jobs(self, lane: Lane, *, now: float) -> list[WaitingJob]:
+        """Jobs with tasks that may be queued, oldest first."""
+        due = _due(tasks.c.not_before, now)
+        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
         query = (
-            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
-            .join(jobs, jobs.c.id == tasks.c.job_id)
-            .where(tasks.c.ready.is_(True), tasks.c.queued.is_(False), tasks.c.lane == lane.value)
-            .where(_due(tasks.c.not_before, now))
-            .order_by(tasks.c.batch, tasks.c.created, tasks.c.job_id)
-            .limit(limit)
+            select(jobs.c.id, jobs.c.origin)
+            .where(jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.lane == lane.value, waiting)
+            .order_by(jobs.c.created, jobs.c.id)
         )
         with self.reading() as connection:
-            return [_ready(row) for row in connection.execute(query).mappings()]
+            return [WaitingJob(job, (origin or {}).get("key", "")) for job, origin in connection.execute(query)]
 
-    def ready_of_job(self, job_id: str, *, limit: int) -> list[ReadyTask]:
-        """The first tasks of one job that may be queued."""
+    def ready_tasks(self, lane: Lane, turns: Turns, *, now: float, limit: int) -> list[ReadyTask]:
+        """At most `limit` tasks to be queued: in turn those of each key, and of each job of a key."""
+        of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
+        for job, share in turns.order(self.waiting_jobs(lane, now=now), limit):
+            of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])
+        chosen = interleave([interleave(of_jobs) for of_jobs in of_key.values()])[:limit]
+        turns.served([job for job, _ in chosen])
+        return [task for _, task in chosen]
+
+    def ready_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
+        """The first tasks of one job that may be queued; at a time, or none of them heeding its back-off."""
+        due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
             select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
             .join(jobs, jobs.c.id == tasks.c.job_id)
-            .where(tasks.c.job_id == job_id, tasks.c.ready.is_(True), tasks.c.queued.is_(False))
+            .where(tasks.c.job_id == job_id, *_WAITING, *due)
             .order_by(tasks.c.batch)
             .limit(limit)
         )
@@ -112,6 +123,9 @@ class Feed(Database):
         query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
         with self.reading() as connection:
             return list(connection.scalars(query))
+
+
+_WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
 def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:

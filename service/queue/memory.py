@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from service.domain import Lane, Stage
 from service.metrics.queue_now import QueueNow, WorkerPulse
-from service.queue.port import Event, Lease, Message, WorkerBeat
+from service.queue.port import Event, Lease, Message, WorkerBeat, lane_order
 
 
 @dataclass
@@ -35,6 +35,7 @@ class MemoryQueue:
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
     _sums: dict[str, float] = field(default_factory=dict)
+    _taken: Counter[str] = field(default_factory=Counter)
     _read: int = 0
     _acknowledged: set[str] = field(default_factory=set)
     _numbers: itertools.count[int] = field(default_factory=itertools.count)
@@ -126,11 +127,12 @@ class MemoryQueue:
         """Nothing to give back."""
 
     def take(self, worker: str, *, wait_s: float = 0.0) -> Delivery | None:
-        """The next task, interactive ones first; it is leased to the worker."""
+        """The next task, in the order of `lane_order`; it is leased to the worker."""
         deadline = time.monotonic() + wait_s
         while True:
-            for lane in Lane:
+            for lane in lane_order(self._taken[worker]):
                 if self._lanes[lane]:
+                    self._taken[worker] += 1
                     message = self._lanes[lane].pop(0)
                     delivery = Delivery(message, worker, f"{message.task_id}/{next(self._numbers)}")
                     self._held[delivery.key] = delivery

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
+from typing import Final, Protocol
 
 from pydantic import ConfigDict
 
@@ -13,6 +13,16 @@ from service.domain import IngestMessage, Lane, Model, Stage, TaskMessage
 from service.metrics.queue_now import QueueNow
 
 Message = TaskMessage | IngestMessage
+
+
+#: Of so many tasks a worker looks for one in bulk first: a steady flow of interactive work must not end all other.
+BULK_EVERY: Final = 4
+
+
+def lane_order(taken: int) -> tuple[Lane, ...]:
+    """In which order a worker that took so many tasks before looks for the next one."""
+    lanes = (Lane.INTERACTIVE, Lane.BULK)
+    return lanes[::-1] if taken % BULK_EVERY == BULK_EVERY - 1 else lanes
 
 
 class EventKind(StrEnum):

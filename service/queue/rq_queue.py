@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from itertools import product
 from typing import Any, Final
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from redis import Redis
 from redis.backoff import ExponentialBackoff
 from redis.exceptions import RedisError, ResponseError
@@ -26,7 +26,7 @@ from service.embedded import redis_url
 from service.errors import QueueUnavailable
 from service.metrics.queue_now import QueueNow, read_queue
 from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
-from service.queue.port import Event, Lease, Message, WorkerBeat
+from service.queue.port import Event, Lease, Message, WorkerBeat, lane_order
 from service.settings import Settings
 
 EVENTS: Final = "graspd:events"
@@ -35,6 +35,7 @@ EVENTS_KEPT: Final = 50_000
 WORKERS: Final = "graspd:workers"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
+_BEAT: Final = TypeAdapter(WorkerBeat)
 _GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
 _SOCKET_TIMEOUT_S: Final = 10.0
@@ -145,8 +146,7 @@ class RqQueue:
         with _mapped():
             names = sorted(name.decode() for name in self.connection.smembers(WORKERS))
             found = self.connection.mget([worker_key(name) for name in names]) if names else []
-        beats = [json.loads(data) for data in found if data is not None]
-        return [WorkerBeat(**beat | {"stages": tuple(map(Stage, beat["stages"]))}) for beat in beats]
+        return [beat for data in found if data is not None and (beat := _beat(data)) is not None]
 
     def publish(self, event: Event) -> None:
         with _mapped():
@@ -263,9 +263,9 @@ def queue_name(lane: Lane, stage: Stage) -> str:
     return f"{lane.value}-{stage.value}"
 
 
-def queue_names(stages: Collection[Stage]) -> list[str]:
-    """Queues of a worker that serves these stages, in the order in which it takes tasks."""
-    return [queue_name(lane, stage) for lane in Lane for stage in _STAGE_ORDER if stage in stages]
+def queue_names(stages: Collection[Stage], taken: int = 0) -> list[str]:
+    """Queues of a worker that serves these stages, in the order in which it takes its next task after `taken`."""
+    return [queue_name(lane, stage) for lane in lane_order(taken) for stage in _STAGE_ORDER if stage in stages]
 
 
 def rq_id(task_id: str, attempt: int) -> str:
@@ -300,6 +300,13 @@ def _message(data: bytes | None) -> Message | None:
         _name, _instance, (raw, *_), _options = json.loads(zlib.decompress(data))
         return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
     except Exception:  # forged data may fail anywhere
+        return None
+
+
+def _beat(data: bytes) -> WorkerBeat | None:
+    try:
+        return _BEAT.validate_json(data)
+    except ValidationError:  # forged, or of a worker much newer or older than this
         return None
 
 

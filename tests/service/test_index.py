@@ -17,7 +17,7 @@ from sqlalchemy import delete, update
 
 from service import names, pipeline
 from service.clock import timestamp
-from service.domain import AssetKind, Lane, Stage, State
+from service.domain import AssetKind, Lane, Origin, Stage, State
 from service.errors import ConflictError, IndexUnavailable, InputError, NotFoundError
 from service.index import tables
 from service.index.filters import GraspFilter, GraspSort
@@ -31,6 +31,8 @@ from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, put_record, read_record
 from service.settings import Settings
 from service.store import open_store
+from service.turns import Turns
+from service.version import STAGE_REVISIONS
 from tests.fakes import add_assets, make_shard, request
 from tests.servers import PostgresServer
 
@@ -251,14 +253,45 @@ def test_the_service_in_numbers(parts: Parts) -> None:
     assert sum(bucket.grasps for bucket in made) == 32
 
 
-def test_what_is_ready_is_fed_batch_by_batch_over_all_jobs(parts: Parts) -> None:
+def test_the_jobs_of_a_key_are_fed_in_turn_and_each_batch_by_batch(parts: Parts) -> None:
     window = parts.settings.model_copy(update={"queue_window": 1})
     small = Parts(window, parts.store, parts.index, parts.queue)
     for seed in range(2):
         pipeline.submit(small, request(grasps=320, seed=seed), lane=Lane.BULK)
-    ready = parts.index.ready_tasks(Lane.BULK, now=time.time(), limit=100)
-    assert [task.task.batch for task in ready] == sorted(task.task.batch for task in ready)
-    assert {task.job.id for task in ready[:3]} == {task.job.id for task in ready}
+    ready = parts.index.ready_tasks(Lane.BULK, Turns(), now=time.time(), limit=10)
+    assert len(ready) == 10
+    for job in {task.job.id for task in ready}:
+        batches = [task.task.batch for task in ready if task.job.id == job]
+        assert batches == sorted(batches)
+        assert len(batches) == 5
+    assert len({task.job.id for task in ready[:2]}) == 2
+
+
+def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(parts: Parts) -> None:
+    for seed in range(5):
+        _submit_as(parts, "greedy", seed)
+    _submit_as(parts, "modest", 9)
+    turns = Turns()
+    owners: list[str] = []
+    for limit in (1, 2, 3, 10, 4):  # room as it comes up, round by round
+        ready = parts.index.ready_tasks(Lane.BULK, turns, now=time.time(), limit=limit)
+        parts.index.set_queued([task.task.id for task in ready])
+        owners += [task.job.origin.key for task in ready if task.job.origin is not None]
+    assert owners.count("greedy") == owners.count("modest") == 10
+
+
+_PAIR = ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
+
+
+def _submit_as(parts: Parts, key: str, seed: int) -> None:
+    """A bulk job of 20 batches, none of them in the queue yet."""
+    hand, obj = (parts.index.asset(kind, name).digest for kind, name in _PAIR)
+    record = JobRecord(
+        id=f"{seed:032x}", request=request(grasps=640, seed=seed), revisions=dict(STAGE_REVISIONS), hand_digest=hand,
+        object_digest=obj, lane=Lane.BULK, created=timestamp(), origin=Origin(key=key),
+    )  # fmt: skip
+    put_record(parts.store, names.job_record(record.id), record)
+    parts.index.add_job(record)
 
 
 def test_a_clock_set_back_does_not_strand_a_task(parts: Parts) -> None:
@@ -266,9 +299,9 @@ def test_a_clock_set_back_does_not_strand_a_task(parts: Parts) -> None:
     task = parts.index.tasks(job=job.id).items[0]
     a_year = 365 * 86400
     parts.index.set_waiting([task.id], not_before=time.time() + 60)
-    assert parts.index.ready_tasks(Lane.INTERACTIVE, now=time.time(), limit=9) == []
+    assert parts.index.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9) == []
     parts.index.set_waiting([task.id], not_before=time.time() + a_year)
-    assert len(parts.index.ready_tasks(Lane.INTERACTIVE, now=time.time(), limit=9)) == 1
+    assert len(parts.index.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9)) == 1
 
 
 def test_two_jobs_that_need_one_shard_both_profit_from_it(parts: Parts) -> None:

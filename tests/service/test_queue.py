@@ -15,7 +15,7 @@ from service.clock import timestamp
 from service.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.memory import MemoryQueue
-from service.queue.port import Event, EventKind, TaskQueue, WorkerBeat
+from service.queue.port import BULK_EVERY, Event, EventKind, TaskQueue, WorkerBeat
 from service.queue.rq_queue import RqQueue, queue_names, worker_key
 from tests.fakes import request
 from worker.context import StopReason, TaskContext
@@ -73,6 +73,7 @@ class RqSide:
     execution: Any = None
     job: Any = None
     state: str = ""
+    taken: int = 0
     context: TaskContext = field(default_factory=lambda: TaskContext(None))  # type: ignore[arg-type]
 
     @property
@@ -86,12 +87,13 @@ class RqSide:
         self.state = state
 
     def take(self) -> TaskMessage | None:
-        queues = [AllowedQueue.open(name, self.connection) for name in queue_names(tuple(Stage))]
+        queues = [AllowedQueue.open(name, self.connection) for name in queue_names(tuple(Stage), self.taken)]
         found = AllowedQueue.dequeue_any(
             queues, None, connection=self.connection, job_class=AllowedJob, serializer=queues[0].serializer
         )
         if found is None:
             return None
+        self.taken += 1
         self.job = found[0]
         prepare_execution(self, self.job)  # type: ignore[arg-type]
         with self.connection.pipeline() as pipe:
@@ -141,13 +143,26 @@ def test_tasks_come_out_as_they_went_in(sides: tuple[TaskQueue, Worker]) -> None
     assert worker.take() == task("b")
 
 
-def test_an_interactive_task_goes_before_all_bulk(sides: tuple[TaskQueue, Worker]) -> None:
+def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[TaskQueue, Worker]) -> None:
     queue, worker = sides
     queue.enqueue([task(f"bulk{i}") for i in range(20)], Lane.BULK)
-    queue.enqueue([task("urgent")], Lane.INTERACTIVE)
-    taken = worker.take()
-    assert taken is not None
-    assert taken.task_id == "urgent"
+    queue.enqueue([task(f"urgent{i}") for i in range(20)], Lane.INTERACTIVE)
+    taken = []
+    for _ in range(3 * BULK_EVERY):
+        found = worker.take()
+        assert found is not None
+        taken.append(found.task_id.rstrip("0123456789"))
+        worker.finish()
+    assert taken == 3 * [*["urgent"] * (BULK_EVERY - 1), "bulk"]
+
+
+def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task(f"bulk{i}") for i in range(2 * BULK_EVERY)], Lane.BULK)
+    for number in range(2 * BULK_EVERY):
+        assert worker.take() == task(f"bulk{number}")
+        worker.finish()
+    assert worker.take() is None
 
 
 def test_a_waiting_task_is_not_queued_twice(sides: tuple[TaskQueue, Worker]) -> None:
@@ -326,3 +341,11 @@ def test_a_lost_consumer_group_is_made_again(rq_queue: RqQueue) -> None:
     rq_queue.connection.flushdb()
     rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
     assert [event.task_id for _, event in rq_queue.consume(limit=9, wait_s=0)] == ["a"]
+
+
+@pytest.mark.parametrize("data", [b"rubbish", b"{}", b"[]", b'{"name": 1}', b"\xff"])
+def test_a_forged_worker_is_left_out_and_hides_no_other(rq_queue: RqQueue, data: bytes) -> None:
+    Heartbeat(rq_queue.connection, beat_of("true"), lease_s=6)._tick(None)
+    rq_queue.connection.sadd("graspd:workers", "forged")
+    rq_queue.connection.set(worker_key("forged"), data)
+    assert [beat.name for beat in rq_queue.workers()] == ["true"]
