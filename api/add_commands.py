@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.add_sets import add_set, files_of_set, name_of_set
+from api.add_sets import add_set, files_of_set, name_of_set, one_of_set, sweep
 from api.hand_files import upload_of
 from api.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
@@ -22,10 +22,11 @@ from service.asset_options import (
     PalmOption,
     PreShapeOption,
     RootOption,
-    ScaleToOption,
+    ScaleSweepOption,
     UnitsOption,
     hand_options,
     object_options,
+    sizes_of,
 )
 from service.cli import JsonFlag, reporting_errors
 from service.domain import AssetKind
@@ -62,7 +63,7 @@ def add_object(
     file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one; or a folder or ZIP of many objects.")],
     name: NameOption = None,
     units: UnitsOption = None,
-    scale_to: ScaleToOption = None,
+    scale_to: ScaleSweepOption = None,
     keep_largest: KeepLargestOption = False,
     allow_open: AllowOpenOption = False,
     density: DensityOption = None,
@@ -72,13 +73,18 @@ def add_object(
     json: JsonFlag = False,
 ) -> None:
     """Upload an object or a whole set of them, wait for the check, and say what was repaired."""
+    sizes = sizes_of(scale_to)
+    one_size = sizes[0] if len(sizes) == 1 else None
     options = object_options(
-        units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
+        units=units, scale_to=one_size, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
     )
-    if files := files_of_set(file):
+    if len(sizes) > 1:
+        swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
+        add_set(swept, name=name or name_of_set(file), prefix=None, options=options, wait=wait, url=url, json=json)
+    elif files := files_of_set(file):
         add_set(files, name=name or name_of_set(file), prefix=name, options=options, wait=wait, url=url, json=json)
-        return
-    _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
+    else:
+        _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
 
 
 def _add(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,13 @@ import typer
 from api.client import Client
 from api.dataset_client import DatasetClient
 from api.reports import open_client
-from api.uploads import UNPACK_FACTOR, name_of_upload
+from api.uploads import UNPACK_FACTOR, json_object, name_of_upload
 from service.asset_summary import verdict_line
 from service.assets import pack
 from service.cli import emit, load_settings
 from service.domain import AssetKind
 from service.errors import InputError
-from service.object_sets import object_set, read_set
+from service.object_sets import SUFFIXES, object_set, read_set
 
 Objects = dict[str, dict[str, bytes]]
 
@@ -38,6 +39,25 @@ def files_of_set(path: Path) -> Objects | None:
         return None
     found = object_set(files)
     return found if path.is_dir() or len(found) > 1 else None
+
+
+def one_of_set(path: Path, name: str | None) -> Objects:
+    """A mesh file as a set of one object; InputError for anything else."""
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        raise InputError(f"several sizes are made of a mesh file or a folder of them, not of {path}")
+    return {name or name_of_upload(path.name): {path.name: path.read_bytes()}}
+
+
+def sweep(objects: Objects, sizes: Sequence[float]) -> Objects:
+    """Each object in each size [m]: `mug` at 0.08 is `mug-80mm`."""
+    made: Objects = {}
+    for name, files in objects.items():
+        mesh = next(file for file in files if file != "asset.json")
+        described = {"file": mesh, **json_object(files.get("asset.json", b"{}"), "asset.json")}
+        for size in sizes:
+            text = json.dumps(described | {"scale_to": size})
+            made[f"{name}-{1000 * size:g}mm"] = files | {"asset.json": text.encode()}
+    return made
 
 
 def name_of_set(path: Path) -> str:

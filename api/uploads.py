@@ -47,12 +47,13 @@ def files_of_upload(
     if "asset.json" not in files:
         files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
     if options:
-        described = _json_object(files["asset.json"], "asset.json") | _json_object(options, "options")
+        described = json_object(files["asset.json"], "asset.json") | json_object(options, "options")
         files["asset.json"] = json.dumps(described).encode()
     return files
 
 
-def _json_object(text: bytes | str, what: str) -> dict[str, Any]:
+def json_object(text: bytes | str, what: str) -> dict[str, Any]:
+    """A JSON object from its text; InputError if it is none."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 import typer
@@ -30,6 +31,12 @@ UnitsOption = Annotated[
 ]
 ScaleToOption = Annotated[
     float | None, typer.Option("--scale-to", help="Scale the longest extent to this many metres.")
+]
+ScaleSweepOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scale-to", help="Scale the longest extent to this many metres; 0.06,0.08,0.1: an object of each size."
+    ),
 ]
 KeepLargestOption = Annotated[bool, typer.Option("--keep-largest", help="Of several components keep the largest.")]
 AllowOpenOption = Annotated[bool, typer.Option("--allow-open", help="Take a mesh that is not watertight.")]
@@ -86,6 +93,17 @@ def object_options(
         "mass": mass,
     }
     return {key: value for key, value in options.items() if value is not None}
+
+
+def sizes_of(text: str | None) -> tuple[float, ...]:
+    """Sizes of `--scale-to` [m]; InputError if one is no positive number."""
+    try:
+        sizes = tuple(dict.fromkeys(float(part) for part in text.split(","))) if text else ()
+    except ValueError:
+        sizes = (0.0,)
+    if not all(0 < size < math.inf for size in sizes):
+        raise InputError(f"--scale-to {text!r} must be a size in metres, or several: 0.06,0.08,0.1")
+    return sizes
 
 
 def _vector(text: str) -> list[float]:

@@ -14,8 +14,10 @@ from api import add_sets
 from api.add_commands import add_object
 from api.add_sets import files_of_set
 from api.client import Client
+from service.asset_options import sizes_of
 from service.assets import pack
 from service.domain import AssetKind
+from service.errors import InputError
 
 STL = b"solid box\nendsolid box\n"
 
@@ -61,6 +63,27 @@ def test_adding_a_set_again_changes_nothing(monkeypatch: pytest.MonkeyPatch, htt
 def test_a_name_goes_before_those_of_the_set(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
     _, told = add(monkeypatch, http, str(folder), "--name", "ycb")
     assert told["refused"] == ["ycb-broken"]
+
+
+def test_a_sweep_makes_an_object_of_each_size_and_a_set_of_them(
+    monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
+) -> None:
+    mesh = folder / "025_mug" / "google_16k" / "nontextured.stl"
+    code, told = add(monkeypatch, http, str(mesh), "--name", "mug", "--scale-to", "0.06,0.08,0.125")
+    assert (code, told["set"]) == (0, "mug")
+    assert http.get("/v1/object-sets/mug").json()["objects"] == ["mug-125mm", "mug-60mm", "mug-80mm"]
+    (folder / "toys").mkdir()
+    for name in ("ball", "rod"):
+        (folder / "toys" / f"{name}.stl").write_bytes(STL + name.encode())
+    code, told = add(monkeypatch, http, str(folder / "toys"), "--scale-to", "0.06,0.08")
+    assert (code, told["set"]) == (0, "toys")
+    assert http.get("/v1/object-sets/toys").json()["objects"] == ["ball-60mm", "ball-80mm", "rod-60mm", "rod-80mm"]
+
+
+@pytest.mark.parametrize("text", ["0", "-0.1", "small", "0.1,", "inf", "nan"])
+def test_a_size_that_is_none_is_a_mistake(text: str) -> None:
+    with pytest.raises(InputError, match="must be a size in metres"):
+        sizes_of(text)
 
 
 def test_a_zip_of_several_meshes_is_a_set_and_of_one_is_an_object(tmp_path: Path) -> None:
