@@ -62,11 +62,11 @@ class Work:
 class Measured:
     """Inputs that were measured; `docs/scaling.md` says with which commands."""
 
-    core_s_per_grasp: float = 0.62
-    """CPU time of a valid grasp: plan, judge, postures, quality [core s]."""
-    core_s_per_scene: float = 1.6
+    core_s_per_grasp: float = 0.36
+    """CPU time of a valid Allegro grasp, standard fidelity: plan, judge, postures, quality [core s]."""
+    core_s_per_scene: float = 0.9
     """CPU time of a scene with the grasps of its batch [core s]."""
-    core_s_per_picture: float = 0.42
+    core_s_per_picture: float = 0.29
     """CPU time of a picture 320 x 240 with all channels [core s]."""
     busy: float = 0.9
     """Share of a worker's time in which it computes: the rest is starts, ends of jobs, waiting."""
@@ -78,13 +78,15 @@ class Measured:
     """Mean over the manifests of the stages."""
     index_bytes_per_grasp: float = 869.0
     """Of all tables and their indexes on SQLite, jobs, tasks and shards included."""
-    redis_ops_per_task: float = 105.0
-    redis_bytes_per_task: float = 19_000.0
+    redis_ops_per_task: float = 109.0
+    redis_bytes_per_task: float = 19_500.0
     """Over the wire, both ways."""
     redis_ops_keeper: float = 34.0
     """Of the keeper while nothing happens [1/s]."""
     redis_ops_worker: float = 9.0
     """Signs of life of one busy worker [1/s]."""
+    keeper_core_s_per_task: float = 0.016
+    """CPU time of the keeper from queueing a task to its rows in the index [core s]."""
     store_reads_per_task: float = 4.0
     """Objects a task reads or asks for: its inputs, whether its output is there."""
 
@@ -120,6 +122,8 @@ class Estimate:
     tasks_per_second: float
     redis_ops_per_second: float
     redis_megabits_per_second: float
+    keeper_cores: float
+    """Share of a core that the one keeper needs; near 1 it is the bottleneck."""
     objects: int
     writes: int
     reads: int
@@ -182,6 +186,7 @@ def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker
         + workers * measured.redis_ops_worker
         + measured.redis_ops_keeper,
         redis_megabits_per_second=rate * measured.redis_bytes_per_task * 8 / 1e6,
+        keeper_cores=rate * measured.keeper_core_s_per_task,
         objects=objects,
         writes=objects,
         reads=reads,

@@ -1,0 +1,104 @@
+"""The cost model: by hand on small numbers, and in step with docs/scaling.md."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from benchmarks.cost_model import Measured, Prices, Work, estimate, main, sizes, table
+from service import pipeline
+from service.parts import Parts
+from service.store import open_store
+from tests.conftest import REPOSITORY
+from tests.fakes import request
+from tests.service.conftest import parts  # noqa: F401
+from tests.service.test_index import run_all
+
+PAGE = (REPOSITORY / "docs" / "scaling.md").read_text()
+ONE_OF_EACH = Measured(
+    core_s_per_grasp=1.0,
+    core_s_per_scene=10.0,
+    core_s_per_picture=100.0,
+    busy=0.5,
+    base_bytes_per_grasp=1.0,
+    scene_bytes=1000.0,
+    picture_bytes=1e6,
+    manifest_bytes=0.0,
+    redis_ops_per_task=86_400.0,
+    redis_ops_worker=1.0,
+    redis_ops_keeper=5.0,
+)
+
+
+def test_the_model_is_the_sum_done_by_hand() -> None:
+    # 64 grasps: 2 batches, 4 scenes, 4 x 3 x 2 = 24 pictures; (64 + 40 + 2400) / 0.5 = 5008 core s.
+    found = estimate(Work(grasps=64, days=1.0, job=32), ONE_OF_EACH, Prices())
+    assert (found.batches, found.tasks, found.jobs, found.pictures) == (2, 6, 2, 24)
+    assert found.core_hours == pytest.approx(5008 / 3600)
+    assert found.cores == 1
+    # 6 tasks in 86400 s at 86400 each, one worker, the keeper.
+    assert found.redis_ops_per_second == pytest.approx(6 + 1 + 5)
+    assert found.gigabytes == pytest.approx((64 + 4 * 1000 + 24 * 1e6) / 1e9)
+    assert (found.objects, found.index_rows) == (14, 64 + 12 + 2)
+
+
+def test_money_is_compute_store_and_service() -> None:
+    prices = Prices(core_hour=3600.0, gb_month=0.0, thousand_writes=1000.0, thousand_reads=0.0, service_hour=1.0)
+    found = estimate(Work(grasps=64, days=1.0, job=32), ONE_OF_EACH, prices)
+    assert found.money_compute == pytest.approx(5008)
+    assert found.money_store == pytest.approx(14)
+    assert found.money_service == pytest.approx(24)
+    assert found.money_per_million == pytest.approx((5008 + 14 + 24) / 64 * 1e6)
+
+
+def test_without_scenes_there_is_one_task_a_batch() -> None:
+    found = estimate(Work(grasps=3200, scenes=0), Measured(), Prices())
+    assert (found.tasks, found.pictures) == (100, 0)
+
+
+def test_half_the_time_needs_twice_the_cores() -> None:
+    slow, fast = (estimate(Work(grasps=10**8, days=days), Measured(), Prices()) for days in (8.0, 4.0))
+    assert fast.cores == pytest.approx(2 * slow.cores, abs=1)
+    assert fast.core_hours == slow.core_hours
+
+
+@pytest.mark.parametrize(("mark", "scenes"), [("cost", 2), ("cost-grasps", 0)])
+def test_the_page_shows_what_the_command_prints(mark: str, scenes: int) -> None:
+    shown = re.search(rf"<!-- {mark} -->\n(.*?)\n<!-- /{mark} -->", PAGE, re.DOTALL)
+    assert shown is not None
+    works = [Work(grasps=count, scenes=scenes) for count in (10**6, 10**8)]
+    assert shown[1] == table([estimate(work, Measured(), Prices()) for work in works])
+
+
+def test_the_inputs_on_the_page_are_those_of_the_model() -> None:
+    inputs = Measured()
+    assert f"| c_grasp | {inputs.core_s_per_grasp} core s |" in PAGE
+    assert f"| c_picture | {inputs.core_s_per_picture} core s |" in PAGE
+    assert f"| c_scene | {inputs.core_s_per_scene} core s |" in PAGE
+    assert f"{inputs.base_bytes_per_grasp:,.0f} B, {inputs.scene_bytes:,.0f} B, {inputs.picture_bytes:,.0f} B" in PAGE
+    assert f"tasks / time × {inputs.redis_ops_per_task:.0f} + workers × {inputs.redis_ops_worker:.0f}" in PAGE
+
+
+def test_sizes_are_measured_on_a_data_folder(parts: Parts, tmp_path: Path) -> None:  # noqa: F811
+    store = open_store((tmp_path / "store").as_uri())
+    kept = Parts(parts.settings, store, parts.index, parts.queue)
+    for entry in [*parts.store.list("assets")]:
+        store.put(entry.key, parts.store.get(entry.key))
+    run_all(kept, pipeline.submit(kept, request(grasps=64))[0].id)
+    shards = list((tmp_path / "store" / "shards" / "base").glob("*.h5"))
+    assert sizes(tmp_path)["base_bytes_per_grasp"] == sum(shard.stat().st_size for shard in shards) / 64
+
+
+def test_a_folder_without_shards_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="no shard"):
+        sizes(tmp_path)
+
+
+def test_every_input_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--grasps", "3200", "--core-hour", "0", "--service-hour", "0", "--core-s-per-grasp", "2", "--json"])
+    (found,) = json.loads(capsys.readouterr().out)["estimates"]
+    assert found["money_compute"] == found["money_service"] == 0
+    assert found["core_hours"] > 3200 * 2 / 3600
