@@ -23,6 +23,7 @@ from worker.objects.model import ObjectModel
 from worker.planners import Cancelled, Progress, synthesize
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.protocol import DIRECTIONS
@@ -248,9 +249,13 @@ class _Work:
         return dict(columns)
 
     def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
-        """Audits by the letter of the first valid grasps, and the robustness of all of them, as far as wished."""
+        """Displacement of all grasps; as far as wished audits of the first valid ones by the letter, and robustness."""
         assert self.pieces is not None
-        columns: Arrays = {}
+        columns: Arrays = {
+            "quality/simulated_displacement_cm": simulated_displacement_cm(
+                self.hand, self.obj, grasps.grasp, pieces=self.pieces.result(), threads=self.threads
+            )
+        }
         common: dict[str, Any] = {"threads": self.threads, "pieces": self.pieces.result(), "cancelled": self.cancelled}
         began = time.perf_counter()
         audited = np.flatnonzero(valid)[: self.request.audits_of(self.batch)]
