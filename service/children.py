@@ -67,9 +67,11 @@ class Child:
             code = self.process.poll()
             if code is None:
                 return
-            if now - self._started > _WELL_AFTER_S:
+            if code == 0 or now - self._started > _WELL_AFTER_S:
                 self._pause = _FIRST_PAUSE_S
-            log.warning("%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
+            # A worker that has done enough ends by itself, with code 0.
+            level = logging.WARNING if code else logging.INFO
+            log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
             self.process = None
             self._not_before = now + self._pause
             self._pause = min(_LONGEST_PAUSE_S, 2 * self._pause)

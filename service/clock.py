@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 
-def timestamp() -> str:
-    """Now, RFC 3339 in UTC with milliseconds; such texts sort by time."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def timestamp(ago_s: float = 0.0) -> str:
+    """Now, or some seconds ago, RFC 3339 in UTC with milliseconds; such texts sort by time."""
+    when = datetime.now(UTC) - timedelta(seconds=ago_s)
+    return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def age_of(when: str) -> float | None:

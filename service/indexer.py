@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Final
 
 from service.clock import timestamp
 from service.domain import AssetKind, Stage, State
-from service.errors import UnavailableError
+from service.errors import InputError, UnavailableError
 from service.library import load_asset, load_check
 from service.manifests import ShardManifest, load_manifest
 from service.metrics.tally import Tally
@@ -46,22 +47,30 @@ class Indexer:
                 progress[event.task_id] = (event.done, event.total, event.message)
                 continue
             progress.pop(event.task_id, None)
-            try:
+            with _left_out(f"event {event.kind} of task {event.task_id}"):
                 if event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
                     made.append(load_manifest(self._parts.store, event.stage, event.output))
                     self._deferrals.pop(event.task_id, None)
                 else:
                     self._apply(event)
-            except UnavailableError:
-                raise
-            except Exception:
-                # Anybody who can write to Redis can put an event there: a bad one must not stop those behind it.
-                log.exception("event %s of task %s is left out", event.kind, event.task_id)
-        if made:
-            self.tell(self._parts.index.add_manifests(made))
-            self._tally.made(made)
+        self._index(made)
         if progress:
-            self._parts.index.set_progress(progress)
+            with _left_out(f"progress of {len(progress)} tasks"):
+                self._parts.index.set_progress(progress)
+
+    def _index(self, made: list[ShardManifest]) -> None:
+        """Shards in one transaction; where the index cannot hold one of them, each by itself."""
+        try:
+            states = self._parts.index.add_manifests(made) if made else {}
+        except InputError:
+            if len(made) == 1:
+                log.exception("shard %s is left out", made[0].shard_id)
+            else:
+                for manifest in made:
+                    self._index([manifest])
+            return
+        self.tell(states)
+        self._tally.made(made)
 
     def tell(self, states: Mapping[str, State]) -> None:
         """Publish the states of jobs where they changed."""
@@ -139,3 +148,14 @@ class Indexer:
             self._parts.index.set_asset_waiting([digest], queued=False, not_before=not_before)
         else:
             self.tell(self._parts.index.set_waiting([event.task_id], not_before=not_before, message=message))
+
+
+@contextmanager
+def _left_out(what: str) -> Iterator[None]:
+    """Anybody who can write to Redis can put an event there: a bad one must not stop those behind it."""
+    try:
+        yield
+    except UnavailableError:
+        raise
+    except Exception:
+        log.exception("%s is left out", what)

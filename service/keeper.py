@@ -8,10 +8,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from service import names
+from service.clock import timestamp
 from service.datasets.planner import Planner
 from service.domain import Lane
 from service.errors import UnavailableError
@@ -28,7 +28,7 @@ from service.turns import Turns
 log = logging.getLogger(__name__)
 PART: Final = "keeper"
 _EVENTS_A_ROUND: Final = 1000
-_FORGET_WORKERS_AFTER: Final = timedelta(hours=1)
+_FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
 _LONGEST_PAUSE_S: Final = 15.0
 
@@ -88,10 +88,11 @@ class Keeper:
     def _look_after_workers(self) -> None:
         self._parts.queue.tidy()
         self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
-        forget = datetime.now(UTC) - _FORGET_WORKERS_AFTER
+        # One that ended as it should says so, but its registration is gone a moment before that is read.
         self._parts.index.set_workers(
             self._parts.queue.workers(),
-            forget_before=forget.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            lost_before=timestamp(self._parts.settings.lease_s),
+            forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
         )
 
     def _start(self) -> None:

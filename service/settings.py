@@ -44,6 +44,12 @@ class Settings(BaseSettings):
     keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
+    worker_max_tasks: int = Field(
+        0, ge=0, description="tasks after which a worker makes room for a fresh one; 0: never"
+    )
+    worker_max_memory_mb: int = Field(
+        0, ge=0, description="resident memory after which it does so [MiB]; 0: half of the machine's"
+    )
     retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
     max_upload_bytes: int = Field(64 * 2**20, gt=0, description="largest hand or object taken over HTTP [bytes]")
     queue_window: int = Field(1000, ge=1, description="tasks kept waiting in the queue; the rest waits in the index")

@@ -17,8 +17,8 @@ from typing import Any, Final
 from redis.exceptions import RedisError
 
 from service.clock import timestamp
-from service.queue.port import WorkerBeat
-from service.queue.rq_queue import WORKERS, cancel_key, worker_key
+from service.queue.port import Event, EventKind, WorkerBeat
+from service.queue.rq_queue import EVENTS, EVENTS_KEPT, WORKERS, cancel_key, encoded, worker_key
 from worker.context import StopReason, TaskContext
 
 log = logging.getLogger(__name__)
@@ -67,13 +67,15 @@ class Heartbeat:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread and the registration."""
+        """End the thread and the registration, and say that this worker is not lost."""
         self._stop.set()
         self._thread.join(timeout=5.0)
         try:
             with self._connection.pipeline() as pipe:
                 pipe.delete(worker_key(self._beat["name"]))
                 pipe.srem(WORKERS, self._beat["name"])
+                left = Event(kind=EventKind.LEFT, at=timestamp(), worker=self._beat["name"])
+                pipe.xadd(EVENTS, encoded(left), maxlen=EVENTS_KEPT, approximate=True)
                 pipe.execute()
         except RedisError:
             log.debug("Redis was away when the worker left")

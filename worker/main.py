@@ -31,6 +31,7 @@ from service.version import PACKAGE_VERSION
 from worker.context import StopReason, TaskContext
 from worker.devices import Device
 from worker.heartbeat import LEASE_KEPT_S, Heartbeat, Hold
+from worker.memory import limit_mb, resident_mb
 from worker.runner import Runner, StageFunction
 from worker.stages import stage_table
 
@@ -83,6 +84,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._heart = heart
         self._surroundings = surroundings
         self._stages, self._taken = stages, 0
+        self.makes_room = False
+        """Whether it ended so that its supervisor starts a fresh one."""
         self._context: TaskContext | None = None
         self._outcome: Event | None = None
         AllowedJob.function = self._run_task
@@ -110,6 +113,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._heart.hold(None, state="stopping" if self._stop_requested else "idle")
             self._context = None
         self._tell_outcome()
+        self._surroundings.tasks_done += 1
+        if why := self._surroundings.outgrown():
+            log.info("this worker ends for a fresh one to start: %s", why)
+            self._heart.stopping()
+            self.makes_room = True
+            self._stop_requested: bool = True
         self.set_state("idle")
 
     def _tell_outcome(self) -> None:
@@ -174,6 +183,17 @@ class Surroundings:
         self.settings = settings
         self.store = store
         self._device = device
+        self._memory_mb = limit_mb(settings.worker_max_memory_mb)
+        self.tasks_done = 0
+
+    def outgrown(self) -> str:
+        """Why this process should make room for a fresh one, "" if it need not."""
+        most = self.settings.worker_max_tasks
+        if most and self.tasks_done >= most:
+            return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
+        if (held := resident_mb()) > self._memory_mb:
+            return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
+        return ""
 
     def context(self, raw: Mapping[str, Any], queue: RqQueue, worker: str) -> TaskContext:
         """The context of a task, which tells its progress to the queue."""
@@ -237,7 +257,7 @@ def run_worker(
     finally:
         heart.stop()
         queue.close()
-    return burst or max_tasks is not None or worker.was_told_to_stop
+    return burst or max_tasks is not None or worker.was_told_to_stop or worker.makes_room
 
 
 def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerBeat:

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, delete, select, update
 
 from service.domain import Asset, State
 from service.index.database import Database, upsert
-from service.index.rows import asset_row, attempt_row, grasp_rows, job_row, shard_row, task_rows
+from service.index.rows import asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
 from service.index.states import settle
 from service.index.tables import assets, attempts, grasps, jobs, shards, tasks, workers
 from service.manifests import ShardManifest
@@ -78,7 +78,13 @@ class Changes(Database):
             job = connection.scalar(
                 update(tasks)
                 .where(tasks.c.id == task_id, tasks.c.state == State.QUEUED.value)
-                .values(state=State.RUNNING.value, queued=True, worker=worker, progress_done=0.0, progress_total=0.0)
+                .values(
+                    state=State.RUNNING.value,
+                    queued=True,
+                    worker=clean(worker, 128),
+                    progress_done=0.0,
+                    progress_total=0.0,
+                )
                 .returning(tasks.c.job_id)
             )
             if job is None:
@@ -98,7 +104,7 @@ class Changes(Database):
                 connection.execute(
                     update(tasks)
                     .where(tasks.c.id == task_id, tasks.c.state == State.RUNNING.value)
-                    .values(progress_done=done, progress_total=total, progress_message=message)
+                    .values(progress_done=done, progress_total=total, progress_message=clean(message))
                 )
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
@@ -116,7 +122,7 @@ class Changes(Database):
             the states of the jobs concerned.
         """
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
-        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message}
+        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message and clean(message)}
         touched: set[str] = set()
         with self.writing() as connection:
             for some in _chunks(task_ids):
@@ -131,19 +137,19 @@ class Changes(Database):
                 update(assets).where(assets.c.digest.in_(list(digests))).values(queued=queued, not_before=not_before)
             )
 
-    def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str) -> None:
-        """The living workers; others turn to lost, and are forgotten when last seen before that time."""
+    def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
+        """The living workers; others turn to lost when last seen before a time, and are forgotten before another."""
         rows = [
             {
-                "name": beat.name,
-                "host": beat.host,
+                "name": clean(beat.name, 128),
+                "host": clean(beat.host, 128),
                 "pid": beat.pid,
-                "device": beat.device,
-                "device_name": beat.device_name,
+                "device": clean(beat.device, 64),
+                "device_name": clean(beat.device_name, 128),
                 "stages": [stage.value for stage in beat.stages],
-                "version": beat.version,
-                "state": beat.state,
-                "task_id": beat.task_id or None,
+                "version": clean(beat.version, 32),
+                "state": clean(beat.state, 10),
+                "task_id": clean(beat.task_id, 32) or None,
                 "started": beat.started,
                 "seen": beat.seen,
             }
@@ -152,8 +158,14 @@ class Changes(Database):
         with self.writing() as connection:
             upsert(connection, workers, rows)
             gone = workers.c.name.not_in([beat.name for beat in beats])
-            connection.execute(update(workers).where(gone).values(state="lost", task_id=None))
+            lost = update(workers).where(gone, workers.c.seen < lost_before)
+            connection.execute(lost.values(state="lost", task_id=None))
             connection.execute(delete(workers).where(gone, workers.c.seen < forget_before))
+
+    def forget_worker(self, name: str) -> None:
+        """A worker that ended as it should."""
+        with self.writing() as connection:
+            connection.execute(delete(workers).where(workers.c.name == name))
 
     def _add_job(self, connection: Connection, record: JobRecord) -> State:
         rows = list(task_rows(record))
@@ -186,10 +198,14 @@ class Changes(Database):
 
     def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
         upsert(connection, attempts, [attempt_row(attempt)])
-        values: dict[str, Any] = {"last_attempt": attempt.number, "exhausted": attempt.last, "reason": attempt.reason}
+        values: dict[str, Any] = {
+            "last_attempt": attempt.number,
+            "exhausted": attempt.last,
+            "reason": clean(attempt.reason),
+        }
         values |= {
             "finished": attempt.ended if attempt.last else None,
-            "worker": attempt.worker if attempt.last else None,
+            "worker": clean(attempt.worker, 128) if attempt.last else None,
         }
         values |= {"queued": False, "not_before": not_before, "state": State.QUEUED.value}
         values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": None}

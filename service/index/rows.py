@@ -66,6 +66,11 @@ def task_rows(record: JobRecord) -> Iterator[Row]:
         }
 
 
+def clean(text: str, length: int | None = None) -> str:
+    """Text that every database takes: PostgreSQL knows no character of code zero, and keeps columns to their length."""
+    return text.replace("\0", "")[:length]
+
+
 def attempt_row(attempt: AttemptRecord) -> Row:
     """A failed attempt."""
     return {
@@ -73,10 +78,10 @@ def attempt_row(attempt: AttemptRecord) -> Row:
         "number": attempt.number,
         "job_id": attempt.job_id,
         "stage": attempt.stage.value,
-        "kind": attempt.kind,
-        "reason": attempt.reason,
-        "trace": attempt.trace,
-        "worker": attempt.worker,
+        "kind": clean(attempt.kind, 64),
+        "reason": clean(attempt.reason),
+        "trace": attempt.trace and clean(attempt.trace),
+        "worker": clean(attempt.worker, 128),
         "started": attempt.started,
         "ended": attempt.ended,
         "last": attempt.last,
@@ -136,7 +141,7 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
         "created": asset.created,
         "builtin": asset.builtin,
         "verdict": found.get("verdict"),
-        "message": found.get("message"),
+        "message": found.get("message") and clean(found["message"]),
         "repairs": list(found.get("repairs") or []),
         "facts": {**asset.facts, **(found.get("facts") or {})},
         "last_attempt": 0,

@@ -38,6 +38,8 @@ class EventKind(StrEnum):
     RETURNED = "returned"
     """The worker was told to stop and handed the task back; the attempt does not count."""
     CANCELLED = "cancelled"
+    LEFT = "left"
+    """A worker ended as it should; it is not lost."""
     JOB = "job"
     """The job's state changed; `message` is the new state."""
 

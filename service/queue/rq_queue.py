@@ -150,9 +150,7 @@ class RqQueue:
 
     def publish(self, event: Event) -> None:
         with _mapped():
-            self.connection.xadd(
-                EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True
-            )
+            self.connection.xadd(EVENTS, encoded(event), maxlen=EVENTS_KEPT, approximate=True)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
@@ -287,6 +285,11 @@ def cancel_key(task_id: str) -> str:
 def worker_key(name: str) -> str:
     """Key that a living worker keeps alive."""
     return f"graspd:worker:{name}"
+
+
+def encoded(event: Event) -> dict[str, str]:
+    """The fields of an event's entry in the stream."""
+    return {"e": event.model_dump_json(exclude_defaults=True)}
 
 
 def _queue_keys() -> list[str]:

@@ -470,3 +470,28 @@ def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts,
     assert parts.index.stats().tasks[State.SUCCEEDED] == 24
     assert parts.index.job(job.id).state is State.SUCCEEDED
     assert differences(parts.index, parts.store) == []
+
+
+def test_text_that_a_database_would_refuse_stops_nothing(parts: Parts) -> None:
+    job, _ = pipeline.submit(parts, request())
+    task = parts.index.tasks(job=job.id).items[0]
+    long = "w" * 200 + "\0"
+    parts.index.set_running(task.id, long)
+    parts.index.set_progress({task.id: (1.0, 2.0, "half\0way")})
+    assert parts.index.task(task.id).message == "halfway"
+    attempt = AttemptRecord(
+        task_id=task.id, job_id=job.id, stage=task.stage, number=1, kind="K" * 100, reason="a\0b", trace="\0",
+        worker=long, ended=timestamp(), last=True,
+    )  # fmt: skip
+    put_record(parts.store, names.attempt(task.id, 1), attempt)
+    parts.index.add_attempt(attempt)
+    assert parts.index.job(job.id).reason == "ab"
+    assert differences(parts.index, parts.store) == []
+
+
+@pytest.mark.postgres
+def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server: PostgresServer) -> None:
+    index = Index(postgres_server.database())
+    with pytest.raises(InputError, match="cannot hold"), index.writing() as connection:
+        connection.execute(tables.workers.insert().values(name="x" * 999))
+    index.close()

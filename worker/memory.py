@@ -1,0 +1,26 @@
+"""How much memory this process holds. Engines and drivers leak: a worker that grew too large makes room for a new one."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Final
+
+_STATUS: Final = Path("/proc/self/statm")
+
+
+def resident_mb() -> float:
+    """Resident memory of this process [MiB]; where the system does not tell, the most it ever was."""
+    try:
+        pages = int(_STATUS.read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def limit_mb(wanted: int) -> float:
+    """The limit of a worker [MiB]: as given, or half of the machine's memory for 0."""
+    return wanted or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20 / 2
