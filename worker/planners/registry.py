@@ -21,6 +21,7 @@ PLANNERS: Final[dict[str, tuple[str, str]]] = {
     "fast_graspd": ("worker.planners.fast_graspd.method", "METHOD"),
     "graspit": ("worker.planners.graspit.planner", "METHOD"),
     "graspd2022": ("worker.planners.graspd2022.planner", "METHOD"),
+    "dfc": ("worker.planners.dfc.planner", "METHOD"),
     "autograsp": ("worker.planners.autograsp.planner", "METHOD"),
 }
 

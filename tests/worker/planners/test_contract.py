@@ -12,43 +12,40 @@ from service.errors import TaskCancelled
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
+from worker.planners import PLANNERS, method, synthesize
 
-#: Peers with options that make them quick.
-PEERS: dict[str, dict[str, object]] = {
-    "autograsp": {},
-    "graspd2022": {"steps": 60, "grid": 24},
-    "graspit": {"steps": 30_400},
-}
-EACH = pytest.mark.parametrize("method", sorted(PEERS))
+#: All methods but fast_graspd, with the options that make them quick.
+PEERS: dict[str, dict[str, object]] = {name: dict(method(name).quick) for name in PLANNERS if name != "fast_graspd"}
+PEERS["graspd2022"]["grid"] = 24
+EACH = pytest.mark.parametrize("name", sorted(PEERS))
 
 
-def grasps(method: str, count: int, *, threads: int = 1, seed: int = 0, hand: str = "barrett") -> GraspSet:
+def grasps(name: str, count: int, *, threads: int = 1, seed: int = 0, hand: str = "barrett") -> GraspSet:
     return synthesize(
-        hand_from_path(hand), object_from_path("block"), count=count, method=method, fidelity=FIDELITIES["draft"],
-        options=PEERS[method], seed=seed, threads=threads,
+        hand_from_path(hand), object_from_path("block"), count=count, method=name, fidelity=FIDELITIES["draft"],
+        options=PEERS[name], seed=seed, threads=threads,
     )  # fmt: skip
 
 
 @EACH
-def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(method: str) -> None:
-    small, large, other = grasps(method, 2), grasps(method, 5, threads=2), grasps(method, 2, seed=1)
+def test_a_grasp_depends_on_seed_and_index_but_not_on_batch_or_threads(name: str) -> None:
+    small, large, other = grasps(name, 2), grasps(name, 5, threads=2), grasps(name, 2, seed=1)
     assert np.array_equal(small.grasp.hand_pose, large.grasp.hand_pose[:2])
     assert np.array_equal(small.grasp.joint_positions, large.grasp.joint_positions[:2])
     assert not np.allclose(small.grasp.hand_pose, other.grasp.hand_pose)
 
 
 @EACH
-def test_grasps_respect_joint_limits_and_unit_quaternions(method: str) -> None:
+def test_grasps_respect_joint_limits_and_unit_quaternions(name: str) -> None:
     model = hand_from_path("allegro")
-    found = grasps(method, 2, hand="allegro")
+    found = grasps(name, 2, hand="allegro")
     q = model.reduce(found.grasp.joint_positions)
     assert np.all(q >= model.lower - 1e-5) and np.all(q <= model.upper + 1e-5)
     np.testing.assert_allclose(np.linalg.norm(found.grasp.hand_pose[:, 3:], axis=1), 1, atol=1e-6)
 
 
 @EACH
-def test_cancelling_stops_at_the_first_look(method: str) -> None:
+def test_cancelling_stops_at_the_first_look(name: str) -> None:
     calls, stop = [], threading.Event()
 
     def progress(done: float, total: float, message: str) -> None:
@@ -57,7 +54,7 @@ def test_cancelling_stops_at_the_first_look(method: str) -> None:
 
     with pytest.raises(TaskCancelled):
         synthesize(
-            hand_from_path("barrett"), object_from_path("block"), count=2, method=method, fidelity=FIDELITIES["draft"],
-            options=PEERS[method], threads=1, progress=progress, cancelled=stop.is_set,
+            hand_from_path("barrett"), object_from_path("block"), count=2, method=name, fidelity=FIDELITIES["draft"],
+            options=PEERS[name], threads=1, progress=progress, cancelled=stop.is_set,
         )  # fmt: skip
     assert len(calls) == 1

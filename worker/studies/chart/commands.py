@@ -19,7 +19,7 @@ from worker.devices import Device
 app = typer.Typer()
 
 #: What is compared where nothing is named.
-PEERS = ("fast_graspd", "graspit", "graspd2022", "autograsp")
+PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 
 
 @app.command(epilog="graspd chart --methods fast_graspd,autograsp --hands allegro --objects mug,bottle --out chart")

@@ -1,0 +1,150 @@
+"""The Metropolis-adjusted descent of a batch of hands, as a fixed list of launches."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.planners.dfc import kernels
+from worker.planners.dfc.schedule import CONTACTS, SELF_GAP_M
+from worker.planners.fast_graspd.pairs import Pair
+from worker.planners.inside import inside_points
+from worker.planners.parts import Steps
+from worker.simulation.kernels import kinematics, optimizers
+from worker.simulation.simulation import HandState, Simulation, still_schedule
+from worker.transforms import IDENTITY_POSE, apply
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+#: Places that may become contacts, on each link and on the palm.
+EACH: Final = 12
+ON_PALM: Final = 24
+#: Object samples asked for penetration.
+SAMPLES: Final = 2000
+#: Energies: force closure, distance, penetration, self-penetration, joint limits.
+TERMS: Final = 5
+CHUNK: Final = 50
+INFINITE: Final = 1e30
+
+
+def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
+    """Bodies (K,) and places (K, 3) of the middle of each piece, and the pairs (first, second) to be kept apart.
+
+    Pieces that are near each other at rest by their shape are no pair.
+    """
+    body = np.array([piece.body for piece in hand.pieces], np.int32)
+    place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
+    rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
+    pairs = [
+        (i, j)
+        for i, j in combinations(range(len(body)), 2)
+        if body[i] != body[j]
+        and (min(body[i], body[j]), max(body[i], body[j])) not in hand.neighbours
+        and np.linalg.norm(rest[i] - rest[j]) > SELF_GAP_M
+    ]
+    first, second = (np.array([pair[k] for pair in pairs], np.int32) for k in (0, 1))
+    return body, place, first, second
+
+
+class Descent:
+    """A batch of hands on one object."""
+
+    def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
+        self.pair, self.n = pair, len(starts.pivot)
+        hand = pair.hand.model
+        self.obj = pair.fine.obj.thinned(SAMPLES)
+        self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
+        # Holds the proposals; only its kinematics is run.
+        self.proposal = Simulation(
+            pair.hand, self.obj, pair.coarse.points, pair.coarse.own, capacity=self.n, options=pair.options
+        )
+        self.device = self.proposal.device
+        generators = [np.random.default_rng([*seed, 1]) for seed in seeds]
+        random = np.array([g.integers(2**32, dtype=np.uint32) for g in generators], np.uint32)
+        contacts = np.array([g.integers(len(self.candidates), size=CONTACTS) for g in generators], np.int32)
+        with wp.ScopedDevice(self.device):
+            self.rng = wp.array(random, dtype=wp.uint32)
+            self._allocate(contacts)
+            self._upload(hand)
+        self.proposal.set_schedule(still_schedule())
+        self.proposal.set_state(starts)
+        for mine, other in zip(self.state, self._proposed(), strict=True):
+            wp.copy(mine, other)
+        self.launches = self._record()
+
+    def _allocate(self, contacts: Ints) -> None:
+        n, dofs = self.n, self.pair.hand.model.dofs
+        self.state = [wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat), wp.zeros((n, dofs), dtype=wp.float32)]
+        self.contact, self.new_contact = (wp.array(contacts, dtype=wp.int32) for _ in range(2))
+        self.terms = wp.full((n, TERMS), INFINITE, dtype=wp.float32)
+        self.new_terms = wp.zeros((n, TERMS), dtype=wp.float32)
+        self.gradient = wp.zeros((n, 6 + dofs), dtype=wp.float32)
+        self.moment = wp.zeros((n, 3), dtype=wp.float32)
+        self.taken = wp.zeros(n, dtype=wp.int32)
+
+    def _upload(self, hand: HandModel) -> None:
+        self.candidate_body = wp.array(self.candidates.body, dtype=wp.int32)
+        self.candidate_position = wp.array(self.candidates.position, dtype=wp.vec3)
+        body, place, first, second = key_points(hand)
+        self.pairs = len(first)
+        self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
+
+    def _proposed(self) -> list[Any]:
+        return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
+
+    def _record(self) -> list[Any]:
+        s, n = self.proposal, self.n
+        pose, wrench = [s.body_p, s.body_q], [s.force, s.torque]
+        own = [self.new_terms, *wrench]
+        steps: list[tuple[Any, Any, list[Any]]] = [
+            (kernels.propose, n,
+             [s.iteration, len(self.candidates), self.rng, self.gradient, self.moment, *self.state, self.contact,
+              *self._proposed(), self.new_contact, self.new_terms]),
+            (kinematics.forward, n,
+             [s.hand.tree, s.active, s.pivot, s.rotation, s.q, *pose, s.axis, *wrench, s.contacts, s.point_depth,
+              s.object_depth, s.self_depth]),
+            (kernels.force_closure, n,
+             [self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose, *own]),
+            (kernels.penetration, (n, len(s.hand.model.pieces)),
+             [s.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose, *own]),
+            (kernels.self_penetration, (n, self.pairs), [*self.keys, *pose, *own]),
+            (kinematics.backward, n, [s.hand.tree, s.active, s.pivot, s.body_p, s.axis, *wrench, s.gradient]),
+            (kernels.limits, n, [s.q, s.hand.lower, s.hand.upper, self.new_terms, s.gradient]),
+            (kernels.accept, n,
+             [s.iteration, self.rng, self.new_terms, s.gradient, *self._proposed(), self.new_contact, self.terms,
+              self.gradient, *self.state, self.contact, self.taken]),
+            (optimizers.advance, 1, [s.iteration]),
+        ]  # fmt: skip
+        return [
+            wp.launch(k, dim, inputs=inputs, device=self.device, record_cmd=True)
+            for k, dim, inputs in steps
+            if dim != (n, 0)
+        ]
+
+    def run(self, steps: int, tell: Steps) -> None:
+        """So many proposals; raises TaskCancelled through `tell`."""
+        for first in range(0, steps, CHUNK):
+            count = min(CHUNK, steps - first)
+            for _ in range(count):
+                for launch in self.launches:
+                    launch.launch()
+            tell(self.n * count, "annealing")
+
+    def hands(self) -> HandState:
+        """Where the hands are, joints inside their limits."""
+        for mine, other in zip(self._proposed(), self.state, strict=True):
+            wp.copy(mine, other)
+        found = self.proposal.state(self.n)
+        hand = self.pair.hand.model
+        return HandState(found.pivot, found.rotation, np.clip(found.q, hand.lower, hand.upper))
+
+    def energies(self) -> Floats:
+        """(n, 5) E_fc, E_dis, E_pen, E_spen, E_joints, unweighted."""
+        return self.terms.numpy().astype(float)
