@@ -12,6 +12,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
 from api.auth import caller
+from api.dataset_quota import unfinished
 from api.grasp_files import GraspFiles
 from api.health import Probes
 from api.idempotency import Idempotency
@@ -75,7 +76,7 @@ class Catalog:
         self._parts = parts
         redis = connect(redis_url(parts.settings), patience=1)
         self._idempotency = Idempotency(redis)
-        self._quotas = Quotas(parts.settings, redis, parts.index.unfinished_of)
+        self.quotas = Quotas(parts.settings, redis, lambda ids: unfinished(parts.index, ids))
         self._paces = Paces()
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
         self._losses: dict[str, tuple[int, list[float]] | None] = {}
@@ -102,7 +103,7 @@ class Catalog:
         if idempotency_key is not None:
             self._idempotency.claim(key.name if key else "", idempotency_key, request)
         record = pipeline.prepare(self._parts, request)
-        with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
+        with bind(job=record.id), self.quotas.claim(key, record.id, record.request.grasps) as claim:
             job, is_new = pipeline.enter(self._parts, record)
             claim.counts = is_new
             log.info("job submitted" if is_new else "job was there already")
@@ -122,7 +123,7 @@ class Catalog:
             QuotaError: the caller's key has all it may have.
         """
         grasps = self._parts.index.job(job_id).request.grasps
-        with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
+        with bind(job=job_id), self.quotas.claim(caller.get(), job_id, grasps, is_new=False):
             job = pipeline.retry(self._parts, job_id)
             log.info("job retried")
         return self._detail(job)

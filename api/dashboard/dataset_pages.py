@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
+from api import dataset_quota
 from api.catalog import Catalog
 from api.dashboard import matrix
 from api.dashboard.forms import asset_choices, first_message
@@ -100,7 +101,7 @@ def act(request: Request, name: str, action: str, catalog: CatalogOf) -> Redirec
     """Cancel or retry a whole dataset, or take a snapshot of it."""
     do: dict[str, Callable[..., Any]] = {
         "cancel": actions.cancel,
-        "retry": actions.retry,
+        "retry": lambda _, name: dataset_quota.retry(catalog, name),
         "snapshot": actions.snapshot,
     }
     if action not in do:
@@ -113,7 +114,7 @@ def _create(request: Request, catalog: Catalog, fields: FormData) -> HTMLRespons
     form = {key: str(fields[key]) for key in ("name", "grasps", "fidelity") if fields.get(key)}
     wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
     try:
-        dataset, _ = actions.create(catalog.parts, DatasetRequest.model_validate(wanted))
+        dataset, _ = dataset_quota.create(catalog, DatasetRequest.model_validate(wanted))
     except (ValidationError, InputError) as error:
         message = first_message(error) if isinstance(error, ValidationError) else str(error)
         return _overview(request, catalog, problem=message, form=wanted, status=422)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from api import dataset_quota
 from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
 from api.problems import responses
@@ -44,7 +45,7 @@ class ObjectSetRequest(BaseModel):
 )
 def create_dataset(body: DatasetRequest, response: Response, catalog: CatalogOf) -> DatasetView:
     """Create a dataset. The same name with the same content is the same dataset: what is made is not made again."""
-    dataset, _ = actions.create(catalog.parts, body)
+    dataset, _ = dataset_quota.create(catalog, body)
     if dataset.state.is_final:
         response.status_code = 200
     return _placed(dataset, response)
@@ -107,7 +108,7 @@ def cancel_dataset(name: DatasetName, response: Response, catalog: CatalogOf) ->
 )
 def retry_dataset(name: DatasetName, response: Response, catalog: CatalogOf) -> DatasetView:
     """Start the cells again that failed or were cancelled; what is written is not made twice."""
-    return _placed(actions.retry(catalog.parts, name), response)
+    return _placed(dataset_quota.retry(catalog, name), response)
 
 
 @router.post(

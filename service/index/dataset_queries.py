@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
@@ -46,6 +46,13 @@ class DatasetQueries(Database):
         """A dataset; NotFoundError if there is none."""
         with self.reading() as connection:
             return _dataset_view(connection, _dataset_row(connection, name))
+
+    def unfinished_datasets(self, names: Collection[str]) -> set[str]:
+        """Of these names, those of a dataset that has not ended."""
+        query = select(datasets).where(datasets.c.name.in_(sorted(names)))
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+            return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
     def dataset_cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
@@ -133,9 +140,7 @@ def _cell_state(cancelled: bool) -> ColumnElement[str]:
 def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     options = JobOptions.model_validate(row["options"])
     states = _states(connection, row)
-    state = job_state(state for state, count in states.items() if count)
-    if state.is_final and not row["cancelled"] and row["applied"] < row["events"]:
-        state = State.QUEUED  # a retry that is not yet passed on to the jobs
+    state = _state(row, states)
     work = _work(connection, dataset_cells.c.dataset == row["name"])
     made = _made(connection, dataset_cells.c.dataset == row["name"])
     tasks_asked = max(work["tasks"], row["cells"] * _tasks_of_cell(options))
@@ -157,6 +162,13 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
         finished=work["finished"] if state.is_final else None,
         **made,
     )
+
+
+def _state(row: Any, states: dict[State, int]) -> State:
+    state = job_state(state for state, count in states.items() if count)
+    if state.is_final and not row["cancelled"] and row["applied"] < row["events"]:
+        return State.QUEUED  # a retry that is not yet passed on to the jobs
+    return state
 
 
 def _states(connection: Connection, row: Any) -> dict[State, int]:

@@ -17,6 +17,7 @@ from api.keys import KeyFile, KeyLimits, Scope
 from api.limits import BodyLimit
 from api.rates import Allowance, Rates
 from service import names
+from service.datasets.planner import Planner
 from service.parts import Parts
 from service.queue.rq_queue import RqQueue
 from service.records import JobRecord, read_record
@@ -186,6 +187,24 @@ def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, par
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
     finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
+
+
+def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
+    twins: Twins, keys: KeyFile, parts: Parts
+) -> None:
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
+    client, _ = twins()
+    matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}
+    large = client.post("/v1/datasets", json=matrix | {"grasps": 33}, headers=headers)
+    assert large.status_code == 429 and client.get("/v1/datasets", headers=headers).json()["items"] == []
+    for _ in range(2):
+        assert client.post("/v1/datasets", json=matrix, headers=headers).status_code == 202
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 429
+    assert client.post("/v1/datasets/d/cancel", headers=headers).status_code == 202
+    while Planner(parts).advance(10):
+        pass
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
+    assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
 
 
 def test_the_quota_of_one_key_is_not_that_of_another(twins: Twins, keys: KeyFile) -> None:
