@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -65,19 +63,6 @@ def seconds(duration: str) -> float:
     """Seconds of a duration such as 1m30s."""
     units = {"h": 3600.0, "m": 60.0, "s": 1.0}
     return sum(float(number) * units[unit] for number, unit in re.findall(r"(\d+(?:\.\d+)?)([hms])", duration))
-
-
-def start(
-    service: Mapping[str, Any], data: Path, log: Path, moved: Mapping[str, str], *more: str
-) -> subprocess.Popen[bytes]:
-    """A service of graspd as a process: its command and environment, addresses of containers replaced by `moved`."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "graspd", *service["command"], *more],
-        env=environment(service, data, moved),
-        cwd=REPOSITORY,
-        stdout=log.open("ab"),
-        stderr=subprocess.STDOUT,
-    )
 
 
 def environment(service: Mapping[str, Any], data: Path, moved: Mapping[str, str]) -> dict[str, str]:

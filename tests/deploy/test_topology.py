@@ -1,0 +1,194 @@
+"""The compose file's services as processes of this machine: its Redis, its environments, real S3 and PostgreSQL."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.embedded import find_server
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.store import open_store
+from tests.conftest import REPOSITORY
+from tests.deploy import composition
+from tests.servers import PostgresServer, S3Server, free_ports
+
+_READY_S = 60.0
+
+
+@dataclass
+class Topology:
+    """Two front doors, a keeper and two workers without an engine."""
+
+    folder: Path
+    variables: dict[str, str]
+    redis_port: int
+    ports: list[int]
+    processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+
+    def environment(self, service: str) -> dict[str, str]:
+        found = composition.load(self.variables)["services"][service]
+        return composition.environment(found, self.folder / "data", {"redis:6379": f"127.0.0.1:{self.redis_port}"})
+
+    def start(self, name: str, service: str, *command: str, **more: str) -> None:
+        with (self.folder / f"{name}.log").open("ab") as log:
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, "-m", *command],
+                env=self.environment(service) | more,
+                cwd=REPOSITORY,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+
+    def graspd(self, service: str, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "graspd", *arguments],
+            env=self.environment(service) | more,
+            cwd=REPOSITORY,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    def until_ready(self) -> None:
+        deadline = time.monotonic() + _READY_S
+        for port in self.ports:
+            while True:
+                try:
+                    if httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=5, trust_env=False).status_code == 200:
+                        break
+                except httpx.HTTPError:
+                    pass
+                assert time.monotonic() < deadline, self.logs()
+                time.sleep(0.1)
+
+    def stop(self) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGTERM)
+        for process in self.processes.values():
+            try:
+                process.wait(timeout=30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def logs(self) -> str:
+        return "\n".join(f"--- {log.name}\n{log.read_text()[-1500:]}" for log in sorted(self.folder.glob("*.log")))
+
+
+@pytest.fixture
+def topology(tmp_path: Path, s3_server: S3Server, postgres_server: PostgresServer) -> Iterator[Topology]:
+    redis_port, *ports = free_ports(3)
+    variables = {
+        "REDIS_PASSWORD": "a-password",
+        "GRASPD_STORE_URL": f"s3://{s3_server.bucket}/{tmp_path.name}",
+        "GRASPD_INDEX_URL": postgres_server.database(),
+        **s3_server.environment,
+    }
+    made = Topology(tmp_path, variables, redis_port, ports)
+    (tmp_path / "redis").mkdir()
+    service = composition.load(variables)["services"]["redis"]
+    command = composition.redis_command(service, find_server()[0], redis_port, tmp_path / "redis")
+    made.processes["redis"] = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        yield made
+    finally:
+        redis = made.processes.pop("redis")
+        made.stop()
+        redis.terminate()
+        redis.wait(timeout=30)
+
+
+def key_of(topology: Topology) -> str:
+    made = topology.graspd("api", "keys", "add", "admin", "--scope", "admin")
+    assert made.returncode == 0, made.stderr
+    return made.stdout.split()[0]
+
+
+@pytest.mark.s3
+@pytest.mark.postgres
+def test_the_services_of_the_compose_file_do_a_job_together(
+    topology: Topology, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key = key_of(topology)
+    for number, port in enumerate(topology.ports):
+        topology.start(f"api-{number}", "api", "graspd", "api", GRASPD_PORT=str(port))
+    topology.start("keeper", "keeper", "graspd", "keeper")
+    for number in range(2):
+        topology.start(f"worker-{number}", "worker-cpu", "tests.fakes", GRASPD_DEVICE="cpu")
+    topology.until_ready()
+
+    first, second = (
+        httpx.Client(
+            base_url=f"http://127.0.0.1:{port}",
+            headers={"Authorization": f"Bearer {key}"},
+            trust_env=False,
+            timeout=30,
+        )
+        for port in topology.ports
+    )
+    with first, second:
+        assert httpx.get(f"{first.base_url}/v1/jobs", trust_env=False).status_code == 401
+        deadline = time.monotonic() + 60
+        while not first.get("/v1/objects").json()["items"]:  # the keeper publishes what comes with graspd
+            assert time.monotonic() < deadline, topology.logs()
+            time.sleep(0.2)
+        job = first.post("/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 128, "scenes": 1})
+        assert job.status_code == 202, job.text
+        while second.get(job.headers["location"]).json()["state"] != "succeeded":
+            assert time.monotonic() < deadline, topology.logs()
+            time.sleep(0.2)
+        assert second.get("/v1/stats").json()["grasps"] == 128
+
+    assert topology.graspd("keeper", "keeper", "--check").returncode == 0
+    assert topology.graspd("worker-cpu", "worker", "--check").returncode == 0
+    for name, value in topology.environment("api").items():
+        monkeypatch.setenv(name, value)
+    index = Index(topology.variables["GRASPD_INDEX_URL"])
+    try:
+        assert differences(index, open_store(topology.variables["GRASPD_STORE_URL"])) == []
+    finally:
+        index.close()
+
+
+@pytest.mark.s3
+def test_a_check_fails_where_nothing_lives(topology: Topology) -> None:
+    time.sleep(0.5)
+    for service, command in (("keeper", "keeper"), ("worker-cpu", "worker")):
+        done = topology.graspd(service, command, "--check")
+        assert done.returncode == 1
+        assert len(done.stderr.splitlines()) == 1
+
+
+def test_redis_refuses_those_without_the_password(tmp_path: Path) -> None:
+    import redis
+
+    (port,) = free_ports(1)
+    service = composition.SERVICES["redis"]
+    command = composition.redis_command(service, find_server()[0], port, tmp_path)
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        try:
+            with redis.Redis(port=port, password="secret") as client:
+                deadline = time.monotonic() + 10
+                while True:
+                    try:
+                        client.ping()
+                        break
+                    except redis.ConnectionError:
+                        assert time.monotonic() < deadline
+                        time.sleep(0.05)
+                assert client.config_get("appendonly") == {"appendonly": "yes"}
+                assert client.config_get("maxmemory-policy") == {"maxmemory-policy": "noeviction"}
+            with redis.Redis(port=port) as stranger, pytest.raises(redis.AuthenticationError):
+                stranger.ping()
+        finally:
+            process.terminate()
+    assert (tmp_path / "appendonlydir").is_dir()
