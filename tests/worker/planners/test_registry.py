@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
+import h5py
 import pytest
 
 from service.errors import InputError
@@ -61,3 +66,26 @@ def test_an_entry_point_that_is_no_method_is_named_in_the_error(monkeypatch: pyt
     offer(monkeypatch, "theirs", value)
     with pytest.raises(InputError, match="theirs"):
         method("theirs")
+
+
+def documented_example() -> str:
+    page = (Path(__file__).parents[3] / "docs" / "planners.md").read_text()
+    return page.split("```python\n", 1)[1].split("```", 1)[0]
+
+
+def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
+    """As installed: a module and its metadata beside each other on the path."""
+    (tmp_path / "mine.py").write_text(documented_example())
+    metadata = tmp_path / "mine-0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 0.1\n")
+    (metadata / "entry_points.txt").write_text("[graspd.planners]\nmine = mine:METHOD\n")
+    out = tmp_path / "grasps.h5"
+    command = [sys.executable, "-m", "graspd", "synth", "--hand", "barrett", "--object", "block", "-n", "2"]
+    command += ["--method", "mine", "--option", "tries=2", "--threads", "1", "-o", str(out)]
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    with h5py.File(out) as file:
+        assert file.attrs["method"] == "mine"
+        assert len(file["grasp/hand_pose"]) == 2
