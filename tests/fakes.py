@@ -116,7 +116,10 @@ def _pretend_to_work(context: TaskContext) -> None:
 
 
 def main() -> None:
-    """A worker process with these stages: `python -m tests.fakes`. FAKE_POISON names a batch that kills its worker."""
+    """A worker process with these stages: `python -m tests.fakes`.
+
+    FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps.
+    """
     from service.cli import log_to_stderr
     from service.settings import Settings
     from worker.main import run_worker
@@ -125,10 +128,12 @@ def main() -> None:
     log_to_stderr(settings, "worker")
     table = fake_stages()
     poison = os.environ.get("FAKE_POISON")
+    leaked: list[bytes] = []
 
     def synthesize(message: TaskMessage, context: TaskContext) -> Output:
         if str(message.batch) == poison:
             os.kill(os.getpid(), 9)
+        leaked.append(os.urandom(2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 
     sys.exit(0 if run_worker(settings, table=table | {Stage.SYNTHESIZE: synthesize}) else 1)

@@ -71,13 +71,18 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     running: list[System] = []
 
     def make(
-        *, workers: int = 1, fakes: bool = True, environment: dict[str, str] | None = None, **settings: Any
+        *,
+        workers: int = 1,
+        fakes: bool = True,
+        api: bool = False,
+        environment: dict[str, str] | None = None,
+        **settings: Any,
     ) -> System:
         for name, value in (environment or {}).items():
             monkeypatch.setenv(name, value)
         wanted = Settings(data_dir=tmp_path / "data", port=0, device="cpu", keeper_interval_s=0.5, **settings)
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
-        supervisor = Supervisor(wanted, workers=workers, api=False, worker_command=(sys.executable, *command))
+        supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))
         supervisor.start()
         try:
             supervisor.wait_ready(READY_S)

@@ -27,7 +27,8 @@ from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.shards import read_shard
 from service.supervisor import Supervisor
-from tests.fakes import fake_synthesize, message_for, request
+from tests.fakes import fake_synthesize, message_for
+from tests.fakes import request as wanted
 from tests.system.conftest import System, alive
 from worker.context import TaskContext
 
@@ -48,9 +49,9 @@ def running_on(system: System, job: str) -> str | None:
 
 def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "1.5"})
-    reference = system.submit(request(seed=1))
+    reference = system.submit(wanted(seed=1))
     (untouched,) = system.finish(reference, seconds=30)
-    job = system.submit(request(seed=2, scenes=1))
+    job = system.submit(wanted(seed=2, scenes=1))
     system.until(lambda: running_on(system, job), 10, "the task runs")
     killed = system.kill("worker-0")
     died = time.monotonic()
@@ -74,7 +75,7 @@ def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(st
 
 def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
-    jobs = [system.submit(request(grasps=96, scenes=1, seed=seed)) for seed in range(3)]
+    jobs = [system.submit(wanted(grasps=96, scenes=1, seed=seed)) for seed in range(3)]
     system.until(lambda: running_on(system, jobs[0]), 10, "the first task runs")
     system.kill("redis")
     done = system.finish(*jobs, seconds=60)
@@ -85,7 +86,7 @@ def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> N
 
 def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(start: Start) -> None:
     system = start(workers=2)
-    jobs = [system.submit(request(grasps=70, scenes=2, seed=seed)) for seed in range(5)]
+    jobs = [system.submit(wanted(grasps=70, scenes=2, seed=seed)) for seed in range(5)]
     done = system.finish(*jobs, seconds=60)
     assert {(job.state, job.grasps) for job in done} == {(State.SUCCEEDED, 70)}
     workers = {shard.worker for shard in system.parts.index.shards(limit=200).items}
@@ -98,8 +99,8 @@ def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(start: St
 
 def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) -> None:
     system = start(environment={"FAKE_POISON": "1"}, lease_s=2.0, task_attempts=2, retry_backoff_s=0.1)
-    poisoned = system.submit(request(grasps=64))
-    healthy = system.submit(request(seed=7))
+    poisoned = system.submit(wanted(grasps=64))
+    healthy = system.submit(wanted(seed=7))
     bad, good = system.finish(poisoned, healthy, seconds=60)
     assert good.state is State.SUCCEEDED
     assert (bad.state, bad.stages[0].succeeded, bad.stages[0].failed) == (State.FAILED, 1, 1)
@@ -110,18 +111,18 @@ def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) ->
 
 def test_a_running_job_is_cancelled_within_two_seconds(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "60"})
-    job = system.submit(request())
+    job = system.submit(wanted())
     system.until(lambda: running_on(system, job), 10, "the task runs")
     assert pipeline.cancel(system.parts, job).state is State.CANCELLED
     system.until(lambda: not system.parts.queue.leases(), CANCEL_S, "the worker let go")
     assert system.parts.index.attempts(job=job) == []
-    again = system.submit(request(grasps=1, seed=3))
+    again = system.submit(wanted(grasps=1, seed=3))
     system.until(lambda: running_on(system, again), 10, "the worker takes the next task")
 
 
 def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "4"})
-    job = system.submit(request())
+    job = system.submit(wanted())
     system.until(lambda: running_on(system, job), 10, "the task runs")
     first = running_on(system, job)
     os.kill(system.supervisor.pids["worker-0"], signal.SIGTERM)
@@ -134,7 +135,7 @@ def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None
 
 def test_a_task_that_takes_too_long_is_stopped_with_that_reason(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "60"}, task_timeout_s=0.5, task_attempts=1)
-    (job,) = system.finish(system.submit(request()), seconds=30)
+    (job,) = system.finish(system.submit(wanted()), seconds=30)
     assert job.state is State.FAILED
     assert job.reason is not None
     assert "GRASPD_TASK_TIMEOUT_S" in job.reason
@@ -152,7 +153,7 @@ def test_forged_entries_run_nothing_and_stop_nobody(start: Start, tmp_path: Path
     broken = plain.enqueue_call(TASK_FUNCTION, args=({},))
     system.parts.queue.connection.hset(f"rq:job:{broken.id}", "data", b"\xff\xfe rubbish")
     worker = system.supervisor.pids["worker-0"]
-    (done,) = system.finish(system.submit(request()), seconds=30)
+    (done,) = system.finish(system.submit(wanted()), seconds=30)
     assert done.state is State.SUCCEEDED
     assert not witness.exists()
     assert system.supervisor.pids["worker-0"] == worker, "the worker was not even restarted"
@@ -172,7 +173,7 @@ def test_any_child_that_is_killed_is_started_again(start: Start) -> None:
         pid = system.kill(name)
         system.until(lambda n=name, p=pid: system.supervisor.pids.get(n, p) != p, 5, f"{name} is back")
     system.supervisor.wait_ready(30)
-    (done,) = system.finish(system.submit(request()), seconds=30)
+    (done,) = system.finish(system.submit(wanted()), seconds=30)
     assert done.state is State.SUCCEEDED
 
 
@@ -207,20 +208,36 @@ def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_pat
         again.wait_ready(30)
 
 
+@pytest.mark.parametrize("remote", [False, pytest.param(True, marks=[pytest.mark.s3, pytest.mark.postgres])])
 @pytest.mark.parametrize(
     ("batches", "kills"), [(200, 8), pytest.param(2000, 60, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])]
 )
-def test_random_kills_lose_nothing_and_repeat_nothing(start: Start, batches: int, kills: int) -> None:
-    system = start(workers=2, environment={"FAKE_SECONDS": "0.02"}, lease_s=2.0, task_attempts=20, retry_backoff_s=0.1)
+def test_random_kills_lose_nothing_and_repeat_nothing(
+    start: Start, request: pytest.FixtureRequest, batches: int, kills: int, remote: bool
+) -> None:
+    """Redis, API, keeper and workers are killed; with the store on S3 and the index in PostgreSQL too."""
+    places: dict[str, str] = {}
+    if remote:
+        url = request.getfixturevalue("postgres_server").database()
+        places = {"store_url": request.getfixturevalue("s3_url"), "index_url": url}
+    system = start(
+        workers=2, api=True, environment={"FAKE_SECONDS": "0.02"}, lease_s=2.0, task_attempts=20, retry_backoff_s=0.1,
+        **places,
+    )  # fmt: skip
     rng = random.Random(0)
-    jobs = [system.submit(request(grasps=32 * batches // 10, seed=seed)) for seed in range(10)]
+    jobs = [system.submit(wanted(grasps=32 * batches // 10, seed=seed)) for seed in range(10)]
     everyone: set[int] = set()
+    killed: set[str] = set()
     for _ in range(kills):
         time.sleep(rng.uniform(0.2, 0.8))
         everyone |= set(system.supervisor.pids.values())
-        name = rng.choice(sorted(system.supervisor.pids) or ["keeper"])
+        # Those not killed yet come first, so that every part is killed at least once.
+        names_now = sorted(system.supervisor.pids)
+        name = rng.choice(sorted(set(names_now) - killed) or names_now or ["keeper"])
         if name in system.supervisor.pids:
             system.kill(name)
+            killed.add(name)
+    assert killed >= {"redis", "api", "keeper", "worker-0"}
     done = system.finish(*jobs, seconds=60 + batches / 2)
     assert {job.state for job in done} == {State.SUCCEEDED}
     manifests = [e.key for e in system.parts.store.list(names.SHARDS) if e.key.endswith(".json")]
