@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+import time
 from collections.abc import AsyncIterator
 from typing import Final
+from weakref import WeakKeyDictionary
 
 from anyio.to_thread import run_sync
 from fastapi import Request
@@ -45,13 +48,33 @@ async def service_events(catalog: Catalog, request: Request) -> AsyncIterator[Se
     last = ""
     while not await request.is_disconnected():
         try:
-            digest = await run_sync(_fingerprint, catalog)
+            digest = await run_sync(_seen.of, catalog)
         except UnavailableError as error:
             digest = str(error)
         if digest != last:
             last = digest
             yield ServerSentEvent(event="progress", data={}, retry=RETRY_MS)
         await asyncio.sleep(2 * POLL_S)
+
+
+class _Fingerprints:
+    """What the service looks like, asked anew at most once a pause however many pages are open."""
+
+    def __init__(self) -> None:
+        self._known: WeakKeyDictionary[Catalog, tuple[float, str]] = WeakKeyDictionary()
+        self._lock = threading.Lock()
+
+    def of(self, catalog: Catalog) -> str:
+        with self._lock:
+            at, digest = self._known.get(catalog, (0.0, ""))
+            now = time.monotonic()
+            if not digest or now - at >= 2 * POLL_S:
+                digest = _fingerprint(catalog)
+                self._known[catalog] = (now, digest)
+            return digest
+
+
+_seen: Final = _Fingerprints()
 
 
 def _fingerprint(catalog: Catalog) -> str:

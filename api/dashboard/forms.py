@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
 from typing import Any, Final
 
 from fastapi import APIRouter, Depends, Request
@@ -17,9 +16,7 @@ from api.catalog import Catalog
 from api.dashboard.rendering import render
 from api.dependencies import CatalogOf, may_read, may_submit
 from api.routes.assets import store_upload
-from service.datasets.cost import estimate
-from service.datasets.spec import Matrix
-from service.domain import OFFERED, AssetKind, JobRequest
+from service.domain import AssetKind, JobRequest
 from service.errors import GraspdError, InputError
 from service.index.views import AssetView
 
@@ -32,23 +29,6 @@ DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
     "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240, "want": "valid", "referee": "certificate",
 }  # fmt: skip
-FIDELITY_WORDS: Final = {
-    "draft": "Fewest points and starts. For a first look.",
-    "standard": "The balance that the docs measure.",
-    "fine": "More starts, more points. Contacts that hold up.",
-}
-
-
-@dataclass(frozen=True)
-class Expected:
-    """What a fidelity is expected to cost and give."""
-
-    name: str
-    words: str
-    seconds: float | None
-    """One worker's time for the whole job [s]; None: not known."""
-    valid_yield: float | None
-    origin: str
 
 
 @router.get("/submit", dependencies=[Depends(may_read)])
@@ -151,24 +131,6 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     return errors
 
 
-def _expected(catalog: Catalog, form: dict[str, Any]) -> list[Expected]:
-    """Time and yield of each fidelity for what the form says, from what was measured here or stored."""
-    found = []
-    for name in OFFERED:
-        wanted = {key: value for key, value in form.items() if key not in ("hand", "object", "fidelity")}
-        try:
-            matrix = Matrix.model_validate(
-                wanted | {"hands": (form["hand"],), "objects": (form["object"],), "fidelity": name}
-            )
-            cost = estimate(catalog.parts.index, matrix)
-            rate = cost.rates[0] if cost.rates else None
-            share, origin = (rate.valid_yield, rate.origin) if rate else (None, "")
-            found.append(Expected(name, FIDELITY_WORDS[name], cost.seconds, share, origin))
-        except (ValidationError, GraspdError):
-            found.append(Expected(name, FIDELITY_WORDS[name], None, None, ""))
-    return found
-
-
 def _form(
     request: Request,
     catalog: Catalog,
@@ -188,7 +150,7 @@ def _form(
         problem=problem,
         hands=asset_choices(catalog, AssetKind.HAND),
         objects=asset_choices(catalog, AssetKind.OBJECT),
-        expected=_expected(catalog, form),
+        expected=request.app.state.expectations.of(form),
         units=UNITS,
         max_upload=request.app.state.settings.max_upload_bytes,
     )

@@ -11,6 +11,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from api import events
 from api.dashboard import dataset_pages, forms, grasp_pages, job_pages, service_pages, session
+from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
 from api.dependencies import CatalogOf, may_read
@@ -23,6 +24,7 @@ def install(app: FastAPI) -> None:
     """Add the pages to the application."""
     app.state.templates = environment()
     app.state.pictures = Pictures(app.state.catalog.store)
+    app.state.expectations = Expectations(app.state.catalog.parts.index)
     for part in (service_pages, job_pages, grasp_pages, dataset_pages, forms, session):
         app.include_router(part.router)
     app.include_router(router)

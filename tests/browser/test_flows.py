@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
+from PIL import Image
 
 from service.assets import builtin_files
 from service.domain import AssetKind
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
 #: Eight draft grasps take about ten seconds on two cores; the rest is a busy machine.
-WORK_MS = 150_000
-CHECK_MS = 60_000
+WORK_MS = 500_000
+CHECK_MS = 120_000
 SHOWN_MS = 60_000
 
 
@@ -27,10 +30,9 @@ def test_a_user_submits_watches_filters_inspects_downloads_cancels_and_retries(r
 
     page.goto("/submit")
     page.set_input_files("#file", mesh)
-    page.wait_for_selector("[data-thing=object] [data-found][data-state=bad]", timeout=CHECK_MS)
-    assert "already known as 'block'" in page.inner_text("[data-thing=object] [data-found]")
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=good]", timeout=CHECK_MS)
+    assert page.input_value("#object") == "my-block"
     page.select_option("#hand", "barrett")
-    page.select_option("#object", "block")
     page.wait_for_selector("[data-thing=object] figure[data-state=ready]", timeout=SHOWN_MS)
     page.fill("#grasps", "8")
     page.check("input[value=draft]")
@@ -89,11 +91,8 @@ def inspect(page: Any) -> None:
 
 def colours(canvas: Any) -> int:
     """Number of different colours on a canvas: one or two mean that nothing was drawn."""
-    import io
-
-    from PIL import Image
-
-    return len(set(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB").resize((200, 150)).getdata()))
+    pixels = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB").resize((200, 150)))
+    return len(np.unique(pixels.reshape(-1, 3), axis=0))
 
 
 def test_an_upload_is_checked_at_once_shown_and_a_bad_one_says_why(real_page: Any, tmp_path: Path) -> None:

@@ -53,7 +53,9 @@
   function watch() {
     const source = new EventSource(document.body.dataset.events);
     const lamp = document.getElementById("lamp");
-    const onEvent = () => { pending ??= setTimeout(() => refresh().catch(() => {}), document.hidden ? 10000 : 300); };
+    const onEvent = () => { pending ??= setTimeout(() => refresh().catch(() => {}), document.hidden ? 10000 : pause); };
+    // A whole service changes all the time; one job's page is watched closely.
+    const pause = document.body.dataset.events === "/events" ? 1000 : 300;
     source.addEventListener("progress", onEvent);
     source.addEventListener("end", () => { onEvent(); source.close(); });
     source.addEventListener("open", () => lamp && lamp.removeAttribute("data-lost"));

@@ -1,0 +1,77 @@
+"""What each fidelity is expected to cost and give for a job, from what was measured here or is stored."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from service.datasets.cost import estimate
+from service.datasets.spec import Matrix
+from service.domain import OFFERED, Stage
+from service.errors import GraspdError
+from service.index.cost_queries import BatchCost
+from service.index.index import Index
+
+#: Costs of batches change slowly, and reading two thousand of them takes as long as a page may.
+KEPT_S: Final = 60.0
+WORDS: Final = {
+    "draft": "Fewest points and starts. For a first look.",
+    "standard": "The balance that the docs measure.",
+    "fine": "More starts, more points. Contacts that hold up.",
+}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A fidelity and its price."""
+
+    name: str
+    words: str
+    seconds: float | None
+    """One worker's time for the whole job [s]; None: not known."""
+    valid_yield: float | None
+    origin: str
+
+
+class Expectations:
+    """Estimates for the form of a job; what it remembers between two requests may be lost."""
+
+    def __init__(self, index: Index) -> None:
+        self._index = _Remembering(index)
+
+    def of(self, form: Mapping[str, Any]) -> list[Expected]:
+        """Every offered fidelity for what a form says; without numbers where it cannot be estimated."""
+        wanted = {key: value for key, value in form.items() if key not in ("hand", "object", "fidelity")}
+        return [self._one(name, wanted, str(form["hand"]), str(form["object"])) for name in OFFERED]
+
+    def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> Expected:
+        try:
+            matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
+            cost = estimate(self._index, matrix)
+        except (ValidationError, GraspdError):
+            return Expected(name, WORDS[name], None, None, "")
+        rate = cost.rates[0] if cost.rates else None
+        share, origin = (rate.valid_yield, rate.origin) if rate else (None, "")
+        return Expected(name, WORDS[name], cost.seconds, share, origin)
+
+
+class _Remembering(Index):
+    """An index whose costs of batches are read at most once in a while."""
+
+    def __init__(self, index: Index) -> None:
+        # It shares the connections of the index that it stands for.
+        self.__dict__ = dict(index.__dict__)
+        self._costs: dict[Stage, tuple[float, list[BatchCost]]] = {}
+        self._costs_lock = threading.Lock()
+
+    def batch_costs(self, stage: Stage) -> list[BatchCost]:
+        with self._costs_lock:
+            now = time.monotonic()
+            if stage not in self._costs or now - self._costs[stage][0] > KEPT_S:
+                self._costs[stage] = (now, super().batch_costs(stage))
+            return self._costs[stage][1]

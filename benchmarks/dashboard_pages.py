@@ -1,0 +1,131 @@
+"""How long the server takes for each page of the dashboard, and the browser until its first paint.
+
+usage: python -m benchmarks.large_index --data-dir DIR
+       python -m benchmarks.dashboard_pages --data-dir DIR [--repeats 20] [--paint]
+
+Milliseconds of the server, warm, one request at a time, over whatever index stands in DIR; `cpu` is what a request
+takes of the processor, client included, which a busy machine does not change. With --paint also the time from opening
+a page in headless Chromium until its first contentful paint, over loopback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import socket
+import statistics
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import uvicorn
+
+from api.app import create_app
+from service.index.index import Index
+from service.parts import Parts
+from service.queue.memory import MemoryQueue
+from service.settings import Settings
+from service.store import open_store
+
+_CHROMIUM = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data-dir", type=Path, required=True)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--paint", action="store_true")
+    given = parser.parse_args(arguments)
+    settings = Settings(data_dir=given.data_dir)
+    index = Index(settings.resolved_index_url)
+    parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    stats = index.stats()
+    say(f"{stats.grasps:,} grasps, {sum(stats.jobs.values()):,} jobs, {stats.shards:,} shards")
+    paths = pages(parts)
+    with serving(settings, parts) as address:
+        rows = server_times(address, paths, given.repeats)
+        paints = first_paints(address, paths) if given.paint else {}
+    say(f"{'page':<34} {'median':>8} {'slowest':>8} {'cpu':>8}" + (f" {'paint':>8}" if paints else "") + "  [ms]")
+    for path, (median, slowest, cpu) in rows.items():
+        say(f"{path[:34]:<34} {median:8.1f} {slowest:8.1f} {cpu:8.1f}" + (f" {paints[path]:8.0f}" if paints else ""))
+    parts.close()
+    return 0
+
+
+def say(line: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def pages(parts: Parts) -> list[str]:
+    """One address of each kind of page that the index can show."""
+    jobs = [job.id for job in parts.index.jobs(limit=3).items]
+    pairs = parts.index.matrix()[:1]
+    found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
+    found += [f"/grasps?hand={pair.hand}&object={pair.object}&sort=penetration_depth_mm&order=asc" for pair in pairs]
+    found += ["/grasps?valid=true&min_epsilon=0.3&max_penetration_depth_mm=0.5", "/workers", "/chart", "/submit"]
+    return found
+
+
+def server_times(address: str, paths: Sequence[str], repeats: int) -> dict[str, tuple[float, float, float]]:
+    """Median and slowest answer of each page, and the processor's time for one [ms], after one that is not counted."""
+    rows = {}
+    with httpx.Client(base_url=address, trust_env=False, timeout=60) as client:
+        for path in paths:
+            client.get(path).raise_for_status()
+            times, busy = [], time.process_time()
+            for _ in range(repeats):
+                start = time.perf_counter()
+                client.get(path).raise_for_status()
+                times.append(1000 * (time.perf_counter() - start))
+            rows[path] = (statistics.median(times), max(times), 1000 * (time.process_time() - busy) / repeats)
+    return rows
+
+
+def first_paints(address: str, paths: Sequence[str]) -> dict[str, float]:
+    """Time until the first contentful paint of each page [ms], the fonts and styles already known to the browser."""
+    from playwright.sync_api import sync_playwright
+
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    paint = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? NaN"
+    found = {}
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=list(_CHROMIUM))
+        page: Any = browser.new_page(base_url=address)
+        for path in paths:
+            page.goto(path)
+            values = []
+            for _ in range(3):
+                page.goto(path)
+                page.wait_for_function("performance.getEntriesByName('first-contentful-paint').length > 0")
+                values.append(page.evaluate(paint))
+            found[path] = statistics.median(values)
+        browser.close()
+    return found
+
+
+@contextmanager
+def serving(settings: Settings, parts: Parts) -> Iterator[str]:
+    """The application on a free port of this machine."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    app = create_app(settings, parts)
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    server.should_exit = True
+    thread.join()
+    listener.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
