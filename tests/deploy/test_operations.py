@@ -13,7 +13,7 @@ import graspd
 from service import pipeline
 from service.domain import State
 from service.index.index import Index
-from service.index.rebuild import differences
+from service.index.rebuild import differences, rebuild
 from service.library import publish_builtins
 from service.parts import Parts
 from service.queue.memory import MemoryQueue
@@ -81,12 +81,22 @@ def test_a_damaged_copy_is_noticed(kept: Parts, tmp_path: Path) -> None:
         restored.close()
 
 
-def test_an_older_version_can_start_from_an_empty_index(kept: Parts) -> None:
+def test_an_index_goes_back_for_an_older_version_and_forward_again(kept: Parts, tmp_path: Path) -> None:
+    before = {job.id: job.state for job in kept.index.jobs(limit=10).items}
+    kept.index.close()
+    done = page.run("downgrade", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
+    assert done.returncode == 0, done.stderr
+    again = Index(kept.settings.resolved_index_url)
+    try:
+        assert {job.id: job.state for job in again.jobs(limit=10).items} == before
+    finally:
+        again.close()
+
+
+def test_an_empty_index_is_filled_from_the_store(kept: Parts) -> None:
     before = {job.id: job.state for job in kept.index.jobs(limit=10).items}
     empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
     try:
-        from service.index.rebuild import rebuild
-
         rebuild(empty, kept.store)
         assert {job.id: job.state for job in empty.jobs(limit=10).items} == before
     finally:
