@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: help install demo test test-slow check format browser docs pins clean
+.PHONY: help install demo test test-slow check format browser docs pins audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
@@ -46,6 +46,10 @@ docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 pins: $(STAMP) ## versions that the images install: those of .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres]'
 	$(BIN)/python docker/pin.py > docker/constraints.txt.new && mv docker/constraints.txt.new docker/constraints.txt
+
+audit: $(STAMP) ## known vulnerabilities of what .venv and the images install (asks PyPI)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,audit]'
+	$(BIN)/python docker/audit.py
 
 clean: ## what the verbs above made
 	rm -rf $(VENV) build dist demo-out *.egg-info

@@ -106,10 +106,22 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         problem = problems.Problem.model_json_schema(ref_template="#/components/schemas/{model}")
         schemas |= problem.pop("$defs")
         schemas["Problem"] = problem
-        for path in document["paths"].values():
-            for operation in path.values():
-                answers = operation.get("responses", {})
+        for path, operations in document["paths"].items():
+            for method, operation in operations.items():
+                answers = operation.setdefault("responses", {})
                 if "application/json" in answers.get("422", {}).get("content", {}):
                     answers["422"] = problems.responses(422)[422]
+                for status, answer in problems.responses(*_of_everybody(path, method)).items():
+                    answers.setdefault(str(status), answer)
         app.openapi_schema = document
     return app.openapi_schema
+
+
+def _of_everybody(path: str, method: str) -> list[int]:
+    """Statuses with which the middleware answers before a route is asked."""
+    statuses = [421]
+    if path.startswith(("/v1/", "/metrics")):
+        statuses += [401, 403, 429, 503]
+    if method not in ("get", "head"):
+        statuses += [403, 408, 413]
+    return statuses

@@ -1,0 +1,118 @@
+"""Hypothesis walks the OpenAPI document: no request, however odd, ends in a 500 or an answer that is not declared."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import hypothesis
+import pytest
+import schemathesis
+from pydantic import SecretStr
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+    unsupported_method,
+)
+
+from api.app import create_app
+from service.index.index import Index
+from service.parts import Parts
+from service.queue.rq_queue import RqQueue, connect
+from service.settings import Settings
+from service.store import open_store
+from tests.api.factories import add_builtins, add_job, add_worker, fail, finish_all
+
+_EXAMPLES = int(os.environ.get("CONTRACT_EXAMPLES", "15"))
+_CHECKS = [
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    unsupported_method,
+]
+#: Requests that follow the document, and requests that break it.
+_MODES = (GenerationMode.POSITIVE, GenerationMode.NEGATIVE)
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Iterator[Any]:
+    """The document of an application with jobs in every state, on a real Redis."""
+    settings = Settings(
+        data_dir=tmp_path_factory.mktemp("contract"), redis_url=SecretStr(redis_server), max_upload_bytes=1 << 20
+    )
+    queue = RqQueue(connect(redis_server))
+    queue.connection.flushdb()
+    parts = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), queue)
+    add_builtins(parts)
+    done = add_job(parts, scenes=1, views=1)
+    finish_all(parts, done)
+    fail(parts, add_job(parts, seed=1), "it broke")
+    waiting = add_job(parts, seed=2)
+    add_worker(parts)
+    shard = parts.index.shards(job=done.id).items[0].id
+    known = {"job_id": [done.id, waiting.id], "shard_id": [shard], "name": ["allegro", "mug"]}
+    schema = schemathesis.openapi.from_asgi("/openapi.json", _addressed(create_app(settings, parts)))
+
+    @schema.hook
+    def map_path_parameters(context: Any, path_parameters: dict[str, Any]) -> dict[str, Any]:
+        """Every second name is one that exists: else all answers were 404."""
+        for name, values in known.items():
+            given = (path_parameters or {}).get(name)
+            if isinstance(given, str) and len(given) % 2:
+                path_parameters[name] = values[len(given) % len(values)]
+        return path_parameters
+
+    yield schema
+    parts.close()
+
+
+def _addressed(app: Any) -> Any:
+    """The application, called by a name of this machine: an open service answers to no other."""
+
+    async def call(scope: Any, receive: Any, send: Any) -> None:
+        headers = [(name, value) for name, value in scope.get("headers", []) if name != b"host"]
+        await app(scope | {"headers": [*headers, (b"host", b"127.0.0.1")]}, receive, send)
+
+    return call
+
+
+def test_every_answer_is_declared_and_none_is_a_500(document: Any) -> None:
+    mistakes = []
+    # A stream of events ends with its job: other tests read it.
+    for operation in (result.ok() for result in document.exclude(path_regex="/events$").get_all_operations()):
+        try:
+            _probe(operation)
+        except (Exception, BaseExceptionGroup) as error:
+            mistakes.append(f"{operation.label}\n{_shown(error)}")
+    assert not mistakes, "\n\n".join(mistakes)
+
+
+def _probe(operation: Any) -> None:
+    """Send what Hypothesis makes of one operation's parameters and body, and check what comes back."""
+
+    @hypothesis.settings(
+        max_examples=_EXAMPLES,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
+    @hypothesis.given(case=hypothesis.strategies.one_of(*(operation.as_strategy(mode) for mode in _MODES)))
+    def run(case: Any) -> None:
+        case.call_and_validate(checks=_CHECKS)
+
+    run()
+
+
+def _shown(error: BaseException) -> str:
+    """The failures in an exception, or in a group of them."""
+    inner = getattr(error, "exceptions", None)
+    return "\n".join(map(_shown, inner)) if inner else f"{type(error).__name__}: {error}"
