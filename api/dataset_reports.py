@@ -33,6 +33,7 @@ def print_estimate(found: Estimate, console: Console) -> None:
         f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.tried)} tries, "
         f"{count(found.valid)} valid, {count(found.tasks)} tasks",
         markup=False,
+        soft_wrap=True,
     )
     table = Table("workers", "time", "network", "on average", box=None, header_style="bold")
     for plan in found.plans:
@@ -41,11 +42,12 @@ def print_estimate(found: Estimate, console: Console) -> None:
     console.print(table)
     kinds = ", ".join(f"{kind} {size(stored)}" for kind, stored in found.storage_by_kind.items())
     console.print(f"storage {size(found.storage_bytes)} ({kinds})", markup=False)
+    width = max(len(used.hand) for used in found.rates[:_SHOWN_RATES])
     for used in found.rates[:_SHOWN_RATES]:
         each = "no valid grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
         batches = f", {count(used.batches)} batches" if used.batches else ""
         console.print(
-            f"  {used.hand:<12} {each} per valid grasp, yield {percent(used.valid_yield)} "
+            f"  {used.hand:<{width}} {each} per valid grasp, yield {percent(used.valid_yield)} "
             f"({used.origin}{batches}) for {count(used.cells)} cells",
             markup=False,
             highlight=False,
@@ -69,6 +71,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         markup=False,
         highlight=False,
+        soft_wrap=True,
     )
 
 

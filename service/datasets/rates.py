@@ -11,7 +11,7 @@ from collections.abc import Collection, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from service.domain import JobOptions
+from service.domain import BATCH_SIZE, JobOptions
 from service.index.cost_queries import BatchCost
 
 
@@ -83,7 +83,7 @@ class Rates:
 
     def _measured(self, key: Hashable, words: str) -> Rate:
         if key not in self._known:
-            batches = self._groups[key]
+            batches = _whole(self._groups[key])
             tried = sum(batch.tried for batch in batches)
             devices = ", ".join(sorted({batch.device for batch in batches}))
             self._known[key] = Rate(
@@ -100,6 +100,11 @@ class Rates:
         seconds, share = STORED.get(name, STORED["standard"])
         origin = ORIGIN if name in STORED else f"{ORIGIN}, of standard for want of {name}"
         return Rate(seconds, share, _BYTES_PER_GRASP, origin, 0)
+
+
+def _whole(batches: list[BatchCost]) -> list[BatchCost]:
+    """Those of at least half a full batch, if there are any: a small one spends its time on loading."""
+    return [batch for batch in batches if 2 * batch.tried >= BATCH_SIZE] or batches
 
 
 def recipe_of(options: JobOptions) -> Hashable:

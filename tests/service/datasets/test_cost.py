@@ -65,6 +65,17 @@ def test_another_object_takes_the_hand_and_another_hand_takes_all(parts: Parts) 
         assert [rate.origin for rate in found.rates] == [words]
 
 
+def test_a_small_batch_says_less_than_a_whole_one(parts: Parts) -> None:
+    few = {"hands": ("claw",), "objects": ("cube",), "want": "raw"}
+    actions.create(parts, wanted("few", grasps=2, **few))
+    plan_all(parts)
+    finish(parts, jobs_of(parts, "few")[0])
+    (small,) = estimate(parts.index, wanted(**few)).rates
+    assert small.seconds_per_try == pytest.approx(FAKE_SECONDS / 2)
+    (whole,) = run(parts, **few).rates
+    assert whole.seconds_per_try == pytest.approx(FAKE_SECONDS / 32)
+
+
 def test_another_recipe_is_not_measured_by_this_one(parts: Parts) -> None:
     run(parts)
     for changes in ({"fidelity": "draft"}, {"referee": "screen"}, {"want": "raw"}):
