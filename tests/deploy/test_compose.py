@@ -19,7 +19,7 @@ SERVICES = composition.SERVICES
 OURS = sorted(name for name, service in SERVICES.items() if "build" in service)
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
 
-PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_")
+PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_")
 
 
 def test_it_is_what_the_compose_specification_says() -> None:
@@ -141,3 +141,9 @@ def test_secrets_stay_out_of_the_repository() -> None:
             assert value == "", f"{name} has a value that everybody would keep"
     ignored = subprocess.run(["git", "check-ignore", "-q", ".env"], cwd=REPOSITORY, check=False)
     assert ignored.returncode == 0, ".env may be committed by mistake"
+
+
+@pytest.mark.parametrize("name", [name for name in OURS if name.startswith("worker")])
+def test_a_worker_makes_room_before_its_container_is_killed_for_memory(name: str) -> None:
+    limit_gb = int(SERVICES[name]["deploy"]["resources"]["limits"]["memory"].removesuffix("G"))
+    assert int(SERVICES[name]["environment"]["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb

@@ -247,3 +247,12 @@ def test_compose_and_kubernetes_run_the_same_redis() -> None:
     assert seconds(SERVICES["redis"]["stop_grace_period"]) == 30
     options = {"--appendonly", "--appendfsync", "--maxmemory", "--maxmemory-policy", "--requirepass"}
     assert options <= set(redis["args"]) & set(SERVICES["redis"]["command"])
+
+
+def test_a_worker_makes_room_before_its_pod_is_killed_for_memory() -> None:
+    workers = [container for _, container in containers() if container["args"][0] == "worker"]
+    assert workers
+    for container in workers:
+        limit_gb = int(container["resources"]["limits"]["memory"].removesuffix("Gi"))
+        values = {entry["name"]: entry.get("value") for entry in container["env"]}
+        assert int(values["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb
