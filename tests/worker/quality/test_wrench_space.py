@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
 
 from service.errors import InputError
 from worker.quality.wrench_space import cone_edges, measure_space, tangents, wrenches
@@ -87,6 +88,28 @@ TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arang
 
 
 @pytest.mark.parametrize(
+    ("points", "friction", "epsilon", "volume"),
+    [(TETRAHEDRON, 0.2, 0.137258, 0.009218), (TETRAHEDRON, 0.5, 0.343027, 0.269793),
+     (TETRAHEDRON, 1.0, 0.689186, 5.588981), (TRIPOD, 0.2, 0.103717, 0.001378), (TRIPOD, 0.5, 0.275925, 0.078880),
+     (TRIPOD, 1.0, 0.554694, 2.211303)],
+)  # fmt: skip
+def test_four_and_three_contacts_on_the_unit_sphere(
+    points: np.ndarray, friction: float, epsilon: float, volume: float
+) -> None:
+    assert sphere_space(points, friction) == pytest.approx((epsilon, volume), abs=PRINTED)
+
+
+@pytest.mark.parametrize(("friction", "epsilon", "volume"), [(0.5, 0.469, 1.485), (1.0, 0.939, 23.9)])
+def test_many_contacts_saturate(friction: float, epsilon: float, volume: float) -> None:
+    turn = np.arange(30) + 0.5
+    polar, around = np.arccos(1 - turn / 15), np.pi * (1 + math.sqrt(5)) * turn
+    ring = np.sin(polar)
+    points = np.stack([np.cos(around) * ring, np.sin(around) * ring, np.cos(polar)], axis=1)
+    # The published spiral may begin elsewhere on the sphere.
+    assert sphere_space(points, friction) == pytest.approx((epsilon, volume), rel=0.01)
+
+
+@pytest.mark.parametrize(
     ("points", "friction", "bound"),
     [(TETRAHEDRON, 0.2, 0.142), (TETRAHEDRON, 0.5, 0.370), (TETRAHEDRON, 1.0, 0.747),
      (TRIPOD, 0.2, 0.1055), (TRIPOD, 0.5, 0.2887), (TRIPOD, 1.0, 0.5787)],
@@ -159,6 +182,24 @@ def test_published_frogger_grasps_have_their_ferrari_canny_recomputed(shared_dat
     assert count == 378
     # Stored points and normals are rounded to 1e-7 m and 1e-6, the stored metric to 1e-8.
     assert worst < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "pearson", "spearman"),
+    [("003_cracker_box", 0.92, 0.94), ("005_tomato_soup_can", 0.87, 0.88), ("006_mustard_bottle", 0.97, 0.97),
+     ("011_banana", 0.97, 0.98), ("048_hammer", 0.90, 0.92), ("056_tennis_ball", 0.96, 0.91),
+     ("061_foam_brick", 0.94, 0.81), ("077_rubiks_cube", 0.81, 0.67)],
+)  # fmt: skip
+def test_recomputed_values_follow_the_published_ones(
+    shared_data: Path, name: str, pearson: float, spearman: float
+) -> None:
+    """The published ones were computed on other meshes of the same objects, so they agree in order, not in digits."""
+    file = shared_data / "reference_grasps" / "frogger_allegro" / f"{name}.json"
+    grasps = json.loads(file.read_text())["grasps"]
+    ours = [measure_space(frogger_edges(grasp))[0] for grasp in grasps]
+    theirs = [grasp["ferrari_canny_L1_published"] for grasp in grasps]
+    assert np.corrcoef(ours, theirs)[0, 1] == pytest.approx(pearson, abs=0.006)
+    assert spearmanr(ours, theirs).statistic == pytest.approx(spearman, abs=0.006)
 
 
 def test_hull_of_a_published_grasp_agrees_with_exact_merging(shared_data: Path) -> None:
