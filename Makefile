@@ -44,7 +44,7 @@ docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
 
 pins: $(STAMP) ## versions that the images install: those of .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel]'
 	$(BIN)/python docker/pin.py > docker/constraints.txt.new && mv docker/constraints.txt.new docker/constraints.txt
 
 audit: $(STAMP) ## known vulnerabilities of what .venv and the images install (asks PyPI)

@@ -16,7 +16,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What the images are made of; `graspd up` and its embedded Redis do not run there.
-EXTRAS = ("api", "worker", "postgres")
+EXTRAS = ("api", "worker", "postgres", "otel")
 
 
 def requirements(*extras: str) -> list[Requirement]:
@@ -42,9 +42,7 @@ def closure(wanted: Iterable[Requirement]) -> dict[str, str]:
         try:
             found[name] = distribution(name).version
         except PackageNotFoundError:
-            raise SystemExit(
-                f"{name} is not installed here; run `make install` and `pip install -e .[postgres]`"
-            ) from None
+            raise SystemExit(f"{name} is not installed here; run `make pins`") from None
         waiting += _needs(name, extras)
     return found
 
