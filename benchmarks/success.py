@@ -1,21 +1,26 @@
-"""Success of the planner's grasps in the independent engine, per hand and object, as Markdown.
+"""Success of the planner's grasps in the independent engine and their quality, per hand and object, as Markdown.
 
-usage: python benchmarks/success.py DATA_DIR [GRASPS]     DATA_DIR holds hands/ and objects/
+usage: python benchmarks/success.py DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
 The referee is MuJoCo with the DexGraspBench protocol, level `certificate` (see worker/quality/referee).
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.domain import FIDELITIES
 from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.quality.referee.judge import judge
+from worker.quality.table import measure
 
 HANDS = {
     "Allegro": "allegro/allegro_hand_right.urdf",
@@ -24,26 +29,62 @@ HANDS = {
 }
 #: Not a seed that any setting was chosen with.
 SEED = 101
+#: As in the paper's table 2: friction and threshold of ε, and the grasps of each object that count, the best by ε.
+FRICTION, THRESHOLD_M, BEST = 1.0, 0.005, 10
+COLUMNS = ("contact_area_cm2", "epsilon", "wrench_volume", "intersection_volume_cm3")
 
 
-def main(data: Path, count: int) -> None:
-    fidelity = FIDELITIES["standard"]
-    hands = {name: hand_from_path(data / "hands" / path) for name, path in HANDS.items()}
-    sys.stdout.write(f"| object | {' | '.join(f'{n} | {n} hard' for n in hands)} |\n")
-    sys.stdout.write("| --- |" + " --: | --: |" * len(hands) + "\n")
-    rates: list[list[float]] = []
+@dataclass
+class Results:
+    """What became of one hand's grasps."""
+
+    success: list[NDArray[np.int8]] = field(default_factory=list)
+    hard: list[NDArray[np.int8]] = field(default_factory=list)
+    depth: list[NDArray[np.generic]] = field(default_factory=list)
+    best: list[list[float]] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def add(self, hand: HandModel, obj: ObjectModel, count: int) -> str:
+        """Grasps of one more object; the cells of its row."""
+        found = synthesize(hand, obj, count=count, fidelity=FIDELITIES["standard"], seed=SEED, device="cpu")
+        self.seconds += found.seconds
+        self.success.append(judge(hand, obj, found).success)
+        self.hard.append(judge(hand, obj, found, hard=True).success)
+        table = measure(hand, obj, found, friction=FRICTION, thresholds_m=[THRESHOLD_M])
+        self.depth.append(table["quality/penetration_depth_mm"])
+        order = np.argsort(table["quality/epsilon"][:, 0])[::-1][:BEST]
+        self.best.append([float(table[f"quality/{name}"][order].mean()) for name in COLUMNS])
+        return f"{self.success[-1].mean():.2f} | {self.hard[-1].mean():.2f}"
+
+    def summary(self) -> str:
+        held = np.array(self.success)
+        cells = [f"{held.mean():.3f}", f"{np.array(self.hard).mean():.3f}", f"{held.any(axis=1).mean():.2f}"]
+        cells += [f"{np.median(np.concatenate(self.depth)):.2f}"]
+        cells += [f"{value:.2f}" for value in np.mean(self.best, axis=0)]
+        cells += [f"{held.size / self.seconds:.1f}", f"{held.sum() / self.seconds:.1f}"]
+        return " | ".join(cells)
+
+
+def main(data: Path, count: int, names: list[str]) -> None:
+    hands = {name: hand_from_path(data / "hands" / HANDS[name]) for name in names}
+    results = {name: Results() for name in names}
+    _row("object", *(f"{n} | {n} hard" for n in hands))
+    _row("---", *["--: | --:"] * len(hands))
     for path in sorted((data / "objects").glob("*/clean.stl")):
-        obj = object_from_path(path, face_error_m=fidelity.face_error_m)
-        rates.append([])
-        for hand in hands.values():
-            found = synthesize(hand, obj, count=count, fidelity=fidelity, seed=SEED, device="cpu")
-            for hard in (False, True):
-                rates[-1].append(float(judge(hand, obj, found, hard=hard).success.mean()))
-        sys.stdout.write(f"| {path.parent.name} | " + " | ".join(f"{r:.2f}" for r in rates[-1]) + " |\n")
-        sys.stdout.flush()
-    means = np.array(rates).mean(axis=0)
-    sys.stdout.write("| **mean** | " + " | ".join(f"**{r:.3f}**" for r in means) + " |\n")
+        obj = object_from_path(path, face_error_m=FIDELITIES["standard"].face_error_m)
+        _row(path.parent.name, *(results[name].add(hand, obj, count) for name, hand in hands.items()))
+    titles = ("success", "hard", "OSR", "median depth mm", "CA cm2", "ε", "Vol", "IV cm3", "raw/s", "valid/s")
+    sys.stdout.write("\n")
+    _row("hand", *titles)
+    _row("---", *["--:"] * len(titles))
+    for name, result in results.items():
+        _row(name, result.summary())
+
+
+def _row(*cells: str) -> None:
+    sys.stdout.write(f"| {' | '.join(cells)} |\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 32)
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 32, sys.argv[3:] or list(HANDS))
