@@ -38,7 +38,10 @@ def submit(
     audits: Annotated[int, typer.Option(help="Valid grasps judged again by the letter.")] = 8,
     robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
     method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
-    fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
+    fidelity: Annotated[str, typer.Option(help="draft, standard, fine, or auto with --target.")] = "standard",
+    target: Annotated[
+        str, typer.Option(help="With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest that meets it is taken.")
+    ] = "",
     seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
     scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 0,
     views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
@@ -65,6 +68,7 @@ def submit(
                 "robustness": robustness,
                 "method": method,
                 "fidelity": fidelity,
+                "target": target,
                 "seed": seed,
                 "scenes": scenes,
                 "views": views,

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from service.domain import OFFERED
+from service.domain import AUTO, OFFERED, JobRequest
 from service.errors import InputError
 from service.store import Store
 
@@ -32,6 +32,21 @@ def latest(store: Store) -> dict[str, Any] | None:
     """The chart that was published last; None where there is none."""
     keys = [entry.key for entry in store.list(PREFIX) if entry.key.endswith(".json")]
     return dict(json.loads(store.get(max(keys)))) if keys else None
+
+
+def explicit(store: Store, request: JobRequest) -> JobRequest:
+    """The request with a fidelity in the place of `auto`.
+
+    Raises:
+        InputError: no chart was published, or nothing in it meets the target.
+    """
+    if request.fidelity != AUTO:
+        return request
+    chart = latest(store)
+    if chart is None:
+        raise InputError("fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity")
+    name = cheapest(chart, request.target, method=request.method, hand=request.hand, object_=request.object)
+    return request.model_copy(update={"fidelity": name, "target": ""})
 
 
 def parse_target(text: str) -> tuple[str, float]:

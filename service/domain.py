@@ -101,6 +101,9 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
     "control": Fidelity(name="control", simulate=False),
 }  # fmt: skip
 
+#: Stands in a request for the cheapest fidelity that meets its target; a stored job has that fidelity instead.
+AUTO: Final = "auto"
+
 #: Fidelities offered to users; the others are for comparison.
 OFFERED: Final = ("draft", "standard", "fine")
 
@@ -185,6 +188,25 @@ class JobRequest(JobOptions):
 
     hand: Name = Field(description="name of a hand known to the service")
     object: Name = Field(description="name of an object known to the service")
+    target: str = Field(
+        "",
+        max_length=40,
+        description="with fidelity `auto`: the accuracy wanted, gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest "
+        "fidelity that meets it in the stored chart is taken when the job is submitted",
+    )
+
+    @field_validator("fidelity")
+    @classmethod
+    def _known(cls, value: str | Fidelity) -> str | Fidelity:
+        return value if value == AUTO else super()._known(value)
+
+    @model_validator(mode="after")
+    def _auto_needs_a_target(self) -> Self:
+        if self.fidelity == AUTO and not self.target:
+            raise ValueError("fidelity auto needs a target, such as gsr>=0.6")
+        if self.target and self.fidelity != AUTO:
+            raise ValueError("a target goes with fidelity auto")
+        return self
 
 
 class Asset(Model):

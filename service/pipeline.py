@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from service import names
+from service import charts, names
 from service.clock import timestamp
 from service.digests import job_id
 from service.domain import AssetKind, JobRequest, Lane, Origin, State
@@ -41,14 +41,14 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> J
 
     Raises:
         NotFoundError: unknown hand or object.
-        InputError: the hand or object was refused when it was checked.
+        InputError: the hand or object was refused when it was checked; no chart tells which fidelity meets the target.
         ConflictError: the check of the hand or object is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
     hand = usable(parts, AssetKind.HAND, request.hand)
     obj = usable(parts, AssetKind.OBJECT, request.object)
     parts.queue.ping()
-    request = request.model_copy(update={"hand": hand.name, "object": obj.name})
+    request = charts.explicit(parts.store, request.model_copy(update={"hand": hand.name, "object": obj.name}))
     return JobRecord(
         id=job_id(request, hand.digest, obj.digest),
         request=request,

@@ -7,9 +7,12 @@ from typing import Any
 
 import pytest
 
+from service import pipeline
 from service.charts import cheapest, latest, parse_target, publish
 from service.errors import InputError
+from service.parts import Parts
 from service.store import open_store
+from tests.fakes import request
 
 
 def run(fidelity: str, speed: float, gsr: float, *, hand: str = "allegro", object_: str = "mug") -> dict[str, Any]:
@@ -71,3 +74,22 @@ def test_the_chart_published_last_is_the_latest(tmp_path: Path) -> None:
     publish(store, CHART)
     found = latest(store)
     assert found is not None and found["created"] == "2026-11-21T11:00:00.000Z"
+
+
+def test_a_job_with_fidelity_auto_is_stored_with_the_one_the_chart_promises(parts: Parts) -> None:
+    publish(parts.store, CHART)
+    job, _ = pipeline.submit(parts, request(fidelity="auto", target="gsr>=0.75"))
+    assert (job.request.fidelity, job.request.target) == ("standard", "")
+    # It is the job that names the fidelity itself: a later chart does not change it.
+    assert pipeline.submit(parts, request(fidelity="standard"))[0].id == job.id
+
+
+def test_fidelity_auto_without_a_chart_says_how_to_get_one(parts: Parts) -> None:
+    with pytest.raises(InputError, match="graspd chart --publish"):
+        pipeline.submit(parts, request(fidelity="auto", target="gsr>=0.6"))
+
+
+@pytest.mark.parametrize("changes", [{"fidelity": "auto"}, {"target": "gsr>=0.6"}, {"fidelity": "superb"}])
+def test_auto_and_target_go_together(changes: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=r"target|unknown fidelity"):
+        request(**changes)

@@ -95,8 +95,8 @@ def test_the_first_valid_grasp_takes_as_many_calls_as_a_coin_of_that_bias() -> N
     share, grasps = 0.3, 2
     rng = np.random.default_rng(1)
     waits = rng.geometric(1 - (1 - share) ** grasps, size=20_000)
-    assert first_valid(share, 1.5, grasps) == pytest.approx(1.5 * waits.mean(), rel=0.02)
-    assert first_valid(0.0, 1.5, grasps) is None
+    assert first_valid(share, [1.5, 9.0, 1.4], grasps) == pytest.approx(1.5 * waits.mean(), rel=0.02)
+    assert first_valid(0.0, [1.5], grasps) is None
 
 
 def run_of(method: str, valid: int, seconds: float, pd: float) -> dict[str, Any]:

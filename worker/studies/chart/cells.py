@@ -85,8 +85,9 @@ class Cell:
     success: list[NDArray[np.int8]] = field(default_factory=list)
     columns: list[dict[str, Floats]] = field(default_factory=list)
     postures: list[Posture] = field(default_factory=list)
-    first_call_s: float = float("nan")
-    first_call_grasps: int = 1
+    first_calls: list[float] = field(default_factory=list)
+    """Seconds of calls of `first_grasps` grasps."""
+    first_grasps: int = 1
 
     def warm_up(self) -> None:
         """One call that is not counted: kernels, grids and samples are there afterwards."""
@@ -111,14 +112,14 @@ class Cell:
 
         Where a grasp takes longer than a second the time follows from the batch: threads work on one grasp each.
         """
-        self.first_call_grasps = grasps
-        each = float(np.mean(self.seconds)) / self.setting.batch
+        self.first_grasps = grasps
+        each = self.seconds[-1] / self.setting.batch
         if each > 1.0:
-            self.first_call_s = each * grasps
+            self.first_calls.append(each * grasps)
             return
         began = time.perf_counter()
-        self.setting.grasps(self.hand, self.obj, grasps, SEED - 1)
-        self.first_call_s = time.perf_counter() - began
+        self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds))
+        self.first_calls.append(time.perf_counter() - began)
 
     def values(self, key: str) -> Floats:
         """A column of all repeats."""

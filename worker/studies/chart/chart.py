@@ -31,7 +31,7 @@ class Thing:
 
 def chart(
     hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], *, repeats: int,
-    say: Say = lambda line: None,
+    say: Say = lambda line: None, keep: Callable[[dict[str, Any]], None] = lambda result: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run everything.
 
@@ -41,6 +41,7 @@ def chart(
         settings: what to compare.
         repeats: timed calls of each setting on each pair.
         say: told of each cell as it ends.
+        keep: given the result so far after each pair.
 
     Returns:
         `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `device`, `created`.
@@ -54,10 +55,15 @@ def chart(
             for _ in range(repeats):
                 for cell in cells:
                     cell.repeat()
+                    cell.time_first(cell.setting.threads or os.cpu_count() or 1)
             for cell in cells:
-                cell.time_first(cell.setting.threads or os.cpu_count() or 1)
                 runs.append(_row(cell, hand, thing))
                 say(_line(runs[-1]))
+            keep(_result(runs, settings))
+    return _result(runs, settings)
+
+
+def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> dict[str, Any]:
     return {
         "created": timestamp(),
         "device": device_name(settings[0].device),
@@ -66,7 +72,7 @@ def chart(
         "referee": {"protocol": "dexgraspbench", "level": "certificate"},
         "friction": FRICTION,
         "threshold_m": THRESHOLD_M,
-        "runs": runs,
+        "runs": list(runs),
         "summary": summed(runs),
     }
 

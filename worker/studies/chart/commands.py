@@ -32,7 +32,7 @@ def chart(
         OFFERED
     ),
     batch: Annotated[str, typer.Option(help="Grasps per call, with commas between; each is run.")] = "32",
-    peer_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods without fidelities.")] = 8,
+    peer_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls of each setting on each hand and object.")] = 2,
     option: Annotated[
         list[str] | None, typer.Option(help="METHOD:NAME=VALUE, such as graspit:steps=40000; several times.")
@@ -65,8 +65,13 @@ def chart(
         options=option or [], quick=quick, threads=threads, device=resolved,
     )  # fmt: skip
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
-    result = run(models, things, chosen, repeats=repeats, say=_say)
-    result["command"] = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
+    command = shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])])
+
+    def keep(so_far: dict[str, Any]) -> None:
+        if out is not None:
+            write(so_far | {"command": command}, out)
+
+    result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | {"command": command}
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=4 if quick else 32, repeats=repeats, quick=quick, threads=threads,
@@ -80,6 +85,11 @@ def chart(
         emit(result)
     else:
         typer.echo(markdown(result))
+
+
+def _short(word: str) -> str:
+    """A word of the command line without the folders of this machine that everybody else calls otherwise."""
+    return ",".join("DATA/" + part.split("/data/", 1)[1] if "/data/" in part else part for part in word.split(","))
 
 
 def _say(line: str) -> None:

@@ -36,7 +36,7 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
     last.set_xlabel("seconds to the first valid grasp (less is better)")
     last.set_title("Success in MuJoCo", loc="left", fontsize=11)
     for axes in (panels.flat[0], last):
-        axes.set_ylim(0, 1.02)
+        axes.set_ylim(-0.02, 1.04)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     for file in files:
         figure.savefig(file, dpi=150)
@@ -63,11 +63,18 @@ def _panel(axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]]
         shown.add(row["method"])
         labels.append((row[x], row[y], _label(row, rows), colour))
     _logarithmic(axes, [row[x] for row in rows if row[x]])
-    axes.set_ylim(bottom=0)
+    top = max([row[f"{y}_high"] for row in rows] or [1.0])
+    axes.set_ylim(-0.03 * top, 1.08 * top)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    for at_x, at_y, text, colour in labels:
-        axes.annotate(text, (at_x, at_y), xytext=(7, 6), textcoords="offset points", fontsize=8, color=colour)
+    placed: list[tuple[float, float]] = []
+    for at_x, at_y, text, colour in sorted(labels):
+        # Above its point, or below it where a label stands already.
+        near = any(at_x / left < 2.5 and abs(at_y - up) < 0.07 * top for left, up in placed)
+        placed += [] if near else [(at_x, at_y)]
+        axes.annotate(
+            text, (at_x, at_y), xytext=(7, -13 if near else 6), textcoords="offset points", fontsize=8, color=colour
+        )
 
 
 def _logarithmic(axes: Any, values: Sequence[float]) -> None:

@@ -20,6 +20,8 @@ def settings_of(
 ) -> list[Setting]:  # fmt: skip
     """A setting for every method, fidelity and batch; methods without fidelities have one each.
 
+    Those with a budget of steps take seconds a grasp and get `peer_batch` grasps per call, the others the first batch.
+
     Raises:
         InputError: unknown method, or an option that is not of one of them.
     """
@@ -33,7 +35,8 @@ def settings_of(
         if known.has_fidelities:
             found += [Setting(name, f, FIDELITIES[f], batch=b, **common) for f in fidelities for b in batches]
         else:
-            found.append(Setting(name, LABEL, FIDELITIES["standard"], batch=peer_batch, **common))
+            size = peer_batch if "steps" in known.options.model_fields else batches[0]
+            found.append(Setting(name, LABEL, FIDELITIES["standard"], batch=size, **common))
     return found
 
 

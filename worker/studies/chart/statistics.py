@@ -31,7 +31,7 @@ def figures(cell: Cell) -> dict[str, Any]:
         "grasps": len(held),
         "valid": int(held.sum()),
         "grasps_per_second": len(held) / seconds.sum(),
-        "seconds_to_first_valid": first_valid(float(held.mean()), cell.first_call_s, cell.first_call_grasps),
+        "seconds_to_first_valid": first_valid(float(held.mean()), cell.first_calls, cell.first_grasps),
         "valid_per_second": held.sum() / seconds.sum(),
         "gsr": held.mean(),
         "batch": batch,
@@ -43,11 +43,14 @@ def figures(cell: Cell) -> dict[str, Any]:
     return {key: plain(value) for key, value in row.items()}
 
 
-def first_valid(share: float, seconds: float, grasps: int) -> float | None:
-    """Expected seconds until a call of so many grasps, made again and again, has a valid one; None: never seen one."""
-    if share <= 0 or not np.isfinite(seconds):
+def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
+    """Expected seconds until a call of so many grasps, made again and again, has a valid one; None: never seen one.
+
+    Of the calls' `seconds` the median counts.
+    """
+    if share <= 0 or not seconds:
         return None
-    return seconds / (1.0 - (1.0 - share) ** grasps)
+    return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
 
 
 def _draws(cell: Cell) -> dict[str, Floats]:
