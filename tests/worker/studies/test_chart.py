@@ -17,6 +17,7 @@ from service.store import open_store
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.studies.chart.commands import app
+from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
 from worker.studies.chart.sweeps import Turn, _asking, _run, turns
 
@@ -78,6 +79,15 @@ def test_a_published_chart_is_the_latest_in_the_store(made: tuple[dict[str, Any]
 def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
     done = CliRunner().invoke(app, ["--quick", *arguments])
     assert done.exit_code == 2
+
+
+def test_a_method_can_be_charted_with_options_and_a_batch_of_its_own() -> None:
+    plain, kept = settings_of(
+        ["graspit", "graspit:keep=5@10"], ["draft"], batches=[32], peer_batch=4, options=["graspit:steps=40000"],
+        quick=False, threads=1, device="cpu",
+    )  # fmt: skip
+    assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
+    assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
 
 
 def test_the_front_has_no_point_that_another_beats() -> None:

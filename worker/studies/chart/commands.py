@@ -25,7 +25,9 @@ PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 @app.command(epilog="graspd chart --methods fast_graspd,autograsp --hands allegro --objects mug,bottle --out chart")
 @reporting_errors
 def chart(
-    methods: Annotated[str, typer.Option(help="Planners, with commas between.")] = ",".join(PEERS),
+    methods: Annotated[
+        str, typer.Option(help="Planners, with commas between; also as NAME:OPTION=VALUE@GRASPS_PER_CALL.")
+    ] = ",".join(PEERS),
     hands: Annotated[str, typer.Option(help="URDFs or built-in hands, with commas between.")] = "allegro,barrett",
     objects: Annotated[str, typer.Option(help="Meshes or built-in objects, with commas between.")] = "mug,bottle",
     fidelities: Annotated[str, typer.Option(help="Of methods that have them, with commas between.")] = ",".join(
