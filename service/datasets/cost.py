@@ -27,8 +27,8 @@ from service.index.views import View
 from service.planning import stages_of
 
 WORKERS: Final = (1, 8, 64)
-#: A task in the queue and the events it sends back, as measured on a task of 20 s [bytes].
-_MESSAGE_BYTES: Final = 8_000
+#: A task in the queue and the events it sends back, both ways (docs/scaling.md) [bytes].
+_MESSAGE_BYTES: Final = 19_500
 #: An object of unknown size: a scan of 5000 faces as STL [bytes].
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20

@@ -38,17 +38,18 @@ class StageRate:
     batches: int
 
 
-#: On which machine the stored numbers were measured.
-ORIGIN: Final = "stored default (2 CPU cores of a server, 2026-11-21, docs/results/matrix.md)"
-#: Seconds per grasp tried with everything the task does; valid yield. Of hands and objects of all kinds.
+#: Where the stored numbers come from: the CPU times and sizes of docs/scaling.md, for a worker with two cores that is
+#: busy nine tenths of its time.
+ORIGIN: Final = "stored default: 2 CPU cores, docs/scaling.md"
+#: Seconds per grasp tried, with postures, quality and verdict; valid yield, as in docs/results/matrix.md.
 STORED: Final[dict[str, tuple[float, float]]] = {
-    "draft": (0.12, 0.55),
-    "standard": (0.25, 0.65),
-    "fine": (0.55, 0.65),
+    "draft": (0.13, 0.7),
+    "standard": (0.16, 0.75),
+    "fine": (0.24, 0.75),
 }
-_BYTES_PER_GRASP: Final = 1500.0
-STORED_SCENE: Final = StageRate(0.5, 3000.0, ORIGIN, 0)
-STORED_PICTURE: Final = StageRate(4.0, 1.5e6, ORIGIN, 0)
+_BYTES_PER_GRASP: Final = 1338.0
+STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
+STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 
 class Rates:
