@@ -83,7 +83,8 @@ class RequestContext:
                 log_unforeseen(scope["path"], request_id, error)
             if status:
                 raise
-            await answer(Request(scope), error)(scope, receive, with_headers)
+            answered = getattr(scope["app"].state, "answer_error", answer) if "app" in scope else answer
+            await answered(Request(scope), error)(scope, receive, with_headers)
         finally:
             self._note(scope, status, time.perf_counter() - started)
 

@@ -207,17 +207,22 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response] | 
         page: makes a page of the problem, for addresses of the dashboard opened in a browser.
     """
 
-    async def any_error(request: Request, error: Exception) -> Response:
+    def answer_any(request: Request, error: Exception) -> Response:
         if page is not None and _is_page(request):
             slug, title, status, detail = describe(error)
             facts = {"type": slug, "title": title, "status": status, "detail": detail}
             return page(request, facts | {"request_id": request_id_of(request)})
         return answer(request, error)
 
+    async def any_error(request: Request, error: Exception) -> Response:
+        return answer_any(request, error)
+
     async def bad_request(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, RequestValidationError)
         return validation_answer(request, error)
 
+    #: What the outermost middleware gives where no handler was reached.
+    app.state.answer_error = answer_any
     app.add_exception_handler(GraspdError, any_error)
     app.add_exception_handler(ApiError, any_error)
     app.add_exception_handler(HTTPException, any_error)

@@ -185,3 +185,16 @@ def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatc
     answer = http.get("/", headers={"Accept": "text/html"})
     assert (answer.status_code, answer.headers["content-type"]) == (503, "text/html; charset=utf-8")
     assert "the index does not answer" in answer.text
+
+
+def test_an_unforeseen_error_is_a_page_that_gives_nothing_away(
+    http: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("a secret")
+
+    monkeypatch.setattr(Index, "stats", broken)
+    answer = http.get("/", headers={"Accept": "text/html"})
+    assert (answer.status_code, answer.headers["content-type"]) == (500, "text/html; charset=utf-8")
+    assert "a secret" not in answer.text
+    assert answer.headers["x-request-id"] in answer.text
