@@ -11,7 +11,7 @@ from typing import Final
 
 from service.clock import timestamp
 from service.domain import AssetKind, Stage, State
-from service.errors import InputError, UnavailableError
+from service.errors import InputError, StoreUnavailable, UnavailableError
 from service.library import load_asset, load_check
 from service.manifests import ShardManifest, load_manifest
 from service.metrics.tally import Tally
@@ -25,6 +25,9 @@ log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
 
 
+_NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
+
+
 class Indexer:
     """Applies events; tells listeners when a job's state changes."""
 
@@ -34,29 +37,45 @@ class Indexer:
         self._deferrals: dict[str, int] = {}
         self._tally = Tally(parts.queue)
 
-    def apply(self, events: Sequence[Event]) -> None:
+    def apply(self, events: Sequence[Event]) -> list[int]:
         """Bring the index up to date. Applying an event twice changes nothing.
 
+        Returns:
+            places of the events for which the store is needed and away; apply these again later.
+
         Raises:
-            UnavailableError: a part is away; apply the same events again later.
+            UnavailableError: another part is away; apply the same events again later.
         """
         progress: dict[str, tuple[float, float, str]] = {}
         made: list[ShardManifest] = []
-        for event in events:
+        waiting: list[int] = []
+        for place, event in enumerate(events):
             if event.kind is EventKind.PROGRESS:
                 progress[event.task_id] = (event.done, event.total, event.message)
                 continue
             progress.pop(event.task_id, None)
-            with _left_out(f"event {event.kind} of task {event.task_id}"):
-                if event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
-                    made.append(load_manifest(self._parts.store, event.stage, event.output))
-                    self._deferrals.pop(event.task_id, None)
-                else:
-                    self._apply(event)
+            # What a store that is away keeps from being known must not hide what does not need it.
+            if waiting and event.kind in _NEEDS_STORE:
+                waiting.append(place)
+                continue
+            try:
+                with _left_out(f"event {event.kind} of task {event.task_id}"):
+                    self._take_up(event, made)
+            except StoreUnavailable as error:
+                log.warning("%s; %d or more events wait for it", error, 1 + len(waiting))
+                waiting.append(place)
         self._index(made)
         if progress:
             with _left_out(f"progress of {len(progress)} tasks"):
                 self._parts.index.set_progress(progress)
+        return waiting
+
+    def _take_up(self, event: Event, made: list[ShardManifest]) -> None:
+        if event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
+            made.append(load_manifest(self._parts.store, event.stage, event.output))
+            self._deferrals.pop(event.task_id, None)
+        else:
+            self._apply(event)
 
     def _index(self, made: list[ShardManifest]) -> None:
         """Shards in one transaction; where the index cannot hold one of them, each by itself."""
@@ -130,6 +149,8 @@ class Indexer:
             self.finished(Stage.INGEST, event.output)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
+        elif event.kind is EventKind.LEFT:
+            self._parts.index.forget_worker(event.worker)
         elif event.kind is EventKind.DEFERRED:
             self._tally.handed_back(event.stage or "", event.kind.value)
             self._defer(event)

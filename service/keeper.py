@@ -6,15 +6,15 @@ import logging
 import math
 import threading
 import time
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
 from service import names
 from service.clock import timestamp
 from service.datasets.planner import Planner
 from service.domain import Lane
-from service.errors import UnavailableError
+from service.errors import StoreUnavailable, UnavailableError
 from service.index.rebuild import rebuild
 from service.indexer import Indexer
 from service.library import load_check, publish_builtins, stored_assets
@@ -28,9 +28,11 @@ from service.turns import Turns
 log = logging.getLogger(__name__)
 PART: Final = "keeper"
 _EVENTS_A_ROUND: Final = 1000
+#: Events that wait for the store; while there are more, no further ones are taken from the stream.
+_LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
-_LONGEST_PAUSE_S: Final = 15.0
+_LONGEST_PAUSE_S: Final = 5.0
 
 
 class Keeper:
@@ -43,7 +45,9 @@ class Keeper:
         self._planner = Planner(parts, clock=clock)
         self._has_plans = False
         self._turns = Turns()
-        self._backlog: deque[tuple[str, Event]] = deque()
+        self._backlog: list[tuple[str, Event]] = []
+        self._news = False
+        """Whether anything but progress came in since the queue was looked after."""
         self._started = False
         self._clock = clock
         self._look_again = self._plan_again = self._tell_again = -math.inf
@@ -72,18 +76,26 @@ class Keeper:
         """
         if not self._started:
             self._start()
-        news = self._index_events(0.0 if self._has_plans else wait_s)
+        away: list[UnavailableError] = []
+        with _noted(away):
+            self._index_events(0.0 if self._has_plans else wait_s)
         now = self._clock()
-        if news or now >= self._look_again:
-            self._look_after_queue()
-            self._look_again = now + self._parts.settings.keeper_interval_s
+        if self._news or now >= self._look_again:
+            with _noted(away):
+                self._look_after_queue()
+                self._news = False
+                self._look_again = now + self._parts.settings.keeper_interval_s
         if self._has_plans or now >= self._plan_again:
-            self._has_plans = self._planner.advance()
-            self._plan_again = now + self._parts.settings.keeper_interval_s
+            with _noted(away):
+                self._has_plans = self._planner.advance()
+                self._plan_again = now + self._parts.settings.keeper_interval_s
         if now >= self._tell_again:
-            self._indexer.flush()
-            self._look_after_workers()
-            self._tell_again = now + _WORKERS_EVERY_S
+            with _noted(away):
+                self._indexer.flush()
+                self._look_after_workers()
+                self._tell_again = now + _WORKERS_EVERY_S
+        if away:
+            raise away[0]
 
     def _look_after_workers(self) -> None:
         self._parts.queue.tidy()
@@ -107,17 +119,20 @@ class Keeper:
         for kind, digest in stored_assets(self._parts.store):
             self._indexer.checked(kind, digest)
 
-    def _index_events(self, wait_s: float) -> bool:
-        """Whether anything but progress came in."""
+    def _index_events(self, wait_s: float) -> None:
+        """Take up what came in; what the store is needed for waits while that is away."""
+        if len(self._backlog) < _LONGEST_BACKLOG:
+            wait_s = wait_s if not self._backlog else 0.0
+            self._backlog += self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
         if not self._backlog:
-            self._backlog.extend(self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s))
-        if self._backlog:
-            self._indexer.apply([event for _, event in self._backlog])
-            self._parts.queue.acknowledge([event_id for event_id, _ in self._backlog])
-            news = any(event.kind is not EventKind.PROGRESS for _, event in self._backlog)
-            self._backlog.clear()
-            return news
-        return False
+            return
+        waiting = set(self._indexer.apply([event for _, event in self._backlog]))
+        done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
+        self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
+        self._parts.queue.acknowledge([event_id for event_id, _ in done])
+        self._news |= any(event.kind is not EventKind.PROGRESS for _, event in done)
+        if waiting:
+            raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
     def _look_after_queue(self) -> None:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
@@ -155,3 +170,12 @@ class Keeper:
                     max_attempt=self._parts.settings.task_attempts,
                 )
                 self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=True)
+
+
+@contextmanager
+def _noted(away: list[UnavailableError]) -> Iterator[None]:
+    """A part that is away must not keep the keeper from what does not need it."""
+    try:
+        yield
+    except UnavailableError as error:
+        away.append(error)

@@ -218,6 +218,25 @@ def test_a_store_that_is_away_costs_no_attempt_and_says_so(bench: Bench) -> None
     assert bench.parts.index.attempts(job=job.id) == []
 
 
+def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise StoreUnavailable("the store does not answer")
+
+    job, _ = pipeline.submit(bench.parts, request(grasps=64))
+    bench.do(bench.take())
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.parts.store, "get", away)
+        bench.do(bench.take(), synthesize=away)
+        for _ in range(3):
+            with pytest.raises(StoreUnavailable, match="1 events wait for it"):
+                bench.pass_time(1)
+        states = [(task.state, task.message) for task in bench.parts.index.tasks(job=job.id).items]
+        assert states == [(State.RUNNING, None), (State.QUEUED, "waits: the store does not answer")]
+    bench.work_off()
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.attempts(job=job.id) == []
+
+
 def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
     def told_to_stop(message: TaskMessage, context: TaskContext) -> None:
         context.stop(StopReason.SHUTDOWN)

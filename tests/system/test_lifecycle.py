@@ -1,0 +1,98 @@
+"""Workers that come and go as they should, and whose turn it is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from service import pipeline
+from service.domain import Lane, State
+from tests.fakes import request
+from tests.system.conftest import System
+
+pytestmark = pytest.mark.chaos
+Start = Callable[..., System]
+
+
+def makers(system: System) -> set[str]:
+    """Names of the workers that made a shard."""
+    return {shard.worker for shard in system.parts.index.shards(limit=200).items}
+
+
+def test_a_worker_makes_room_after_so_many_tasks_and_no_task_is_disturbed(start: Start) -> None:
+    system = start(worker_max_tasks=2)
+    (done,) = system.finish(system.submit(request(grasps=32 * 6)), seconds=60)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 6)
+    assert len(makers(system)) == 3
+    assert system.parts.index.attempts() == []
+    assert "lost" not in {worker.state for worker in system.parts.index.workers()}
+
+
+def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -> None:
+    system = start(environment={"FAKE_LEAK_MB": "300"}, worker_max_memory_mb=500)
+    (done,) = system.finish(system.submit(request(grasps=32 * 6)), seconds=60)
+    assert done.state is State.SUCCEEDED
+    assert len(makers(system)) >= 3, "the second task is one too many for each"
+    assert system.parts.index.attempts() == []
+
+
+def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
+    system = start()
+    system.until(system.parts.index.workers, 10, "the worker is listed")
+    (first,) = system.parts.index.workers()
+    seen: set[str] = set()
+
+    def is_gone() -> bool:
+        now = system.parts.index.workers()
+        seen.update(worker.state for worker in now)
+        return first.name not in {worker.name for worker in now}
+
+    os.kill(system.supervisor.pids["worker-0"], signal.SIGTERM)
+    system.until(is_gone, 10, "it is no longer listed")
+    assert "lost" not in seen
+
+
+def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
+    system = start(lease_s=2.0)
+    system.until(system.parts.index.workers, 10, "the worker is listed")
+    system.kill("worker-0")
+    states = lambda: {worker.state for worker in system.parts.index.workers()}  # noqa: E731
+    system.until(lambda: "lost" in states(), 15, "it is lost")
+
+
+def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
+    system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
+    bulk = pipeline.submit(system.parts, request(grasps=100_000), lane=Lane.BULK)[0].id
+    system.until(lambda: system.parts.index.job(bulk).grasps, 15, "the dataset runs")
+    job = system.submit(request(grasps=32, seed=1))
+    took = system.until(lambda: system.parts.index.job(job).state is State.SUCCEEDED, 30, "the small job is done")
+    assert took < 5.0, "the promise is seconds"
+    assert system.parts.index.job(bulk).state is State.RUNNING
+
+
+def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "0.05"})
+    bulk = pipeline.submit(system.parts, request(grasps=3200), lane=Lane.BULK)[0].id
+    ended = threading.Event()
+
+    def keep_busy() -> None:
+        seed = 0
+        while not ended.is_set():
+            # There are always more small tasks than the one worker gets done.
+            if sum(n for (lane, _), n in system.parts.queue.depths().items() if lane is Lane.INTERACTIVE) < 8:
+                seed += 1
+                system.submit(request(grasps=128, seed=seed))
+            time.sleep(0.02)
+
+    thread = threading.Thread(target=keep_busy)
+    thread.start()
+    try:
+        system.until(lambda: system.parts.index.job(bulk).grasps >= 5 * 32, 60, "five batches of the dataset are done")
+    finally:
+        ended.set()
+        thread.join()
