@@ -37,6 +37,11 @@ def asset_model(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/model.glb"
 
 
+def object_prepared(digest: str, key: str) -> str:
+    """An object repaired and simplified; `key` is a digest of how."""
+    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
+
+
 def object_pieces(digest: str, key: str) -> str:
     """Convex pieces of an object as the referee knows it; `key` is a digest of how they were made."""
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"

@@ -12,8 +12,8 @@ from service.store import Store
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.objects.prepare import load_object
 from worker.stages.models import publish_model
+from worker.stages.prepared import prepared_object
 
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
@@ -41,8 +41,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     key = (store.url, AssetKind.OBJECT, name, digest, error)
 
     def load() -> ObjectModel:
-        files = load_asset_files(store, AssetKind.OBJECT, digest)
-        obj = load_object(files, name=name, digest=digest, face_error_m=error)
+        obj = prepared_object(store, digest, name=name, face_error_m=error)
         publish_model(store, AssetKind.OBJECT, obj)
         return obj
 

@@ -1,0 +1,79 @@
+"""Prepared objects in the store: repaired and simplified once, by the worker that meets the object first."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import fields
+from typing import Any, Final
+
+import numpy as np
+
+from service import names
+from service.digests import digest_json
+from service.domain import AssetKind
+from service.errors import NotFoundError
+from service.library import load_asset_files
+from service.store import Store
+from service.version import STAGE_REVISIONS
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import load_object
+
+_ARRAYS: Final = (
+    "vertices",
+    "faces",
+    "corner_normals",
+    "centre_of_mass",
+    "inertia",
+    "hull_vertices",
+    "hull_faces",
+)
+_NAMES: Final = ("name", "digest")
+
+
+def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
+    """An object as `load_object` makes it, from the store if it was prepared to this bound before.
+
+    Raises:
+        MeshError: the mesh cannot be used.
+        StoreUnavailable: the store does not answer.
+    """
+    key = names.object_prepared(digest, _address(face_error_m))
+    try:
+        return from_bytes(store.get(key), name=name, digest=digest)
+    except NotFoundError:
+        pass
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+        # What cannot be read is made again; it cannot be replaced, and costs no more than it did without a store.
+        return _load(store, digest, name=name, face_error_m=face_error_m)
+    obj = _load(store, digest, name=name, face_error_m=face_error_m)
+    store.put(key, to_bytes(obj))
+    return obj
+
+
+def to_bytes(obj: ObjectModel) -> bytes:
+    """All of an object but its name and digest, bit for bit."""
+    plain = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name not in (*_ARRAYS, *_NAMES)}
+    arrays: dict[str, Any] = {name: getattr(obj, name) for name in _ARRAYS}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays, plain=np.frombuffer(json.dumps(plain).encode(), np.uint8))
+    return buffer.getvalue()
+
+
+def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
+    """An object from `to_bytes`; ValueError, KeyError, OSError, EOFError or BadZipFile if they are none."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        plain = json.loads(stored["plain"].tobytes())
+        arrays = {field: stored[field] for field in _ARRAYS}
+    return ObjectModel(name=name, digest=digest, **arrays, **plain | {"repairs": tuple(plain["repairs"])})
+
+
+def _address(face_error_m: float) -> str:
+    # Whatever changes a prepared mesh changes the grasps on it, and with them the revision of their stage.
+    return digest_json({"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]})
+
+
+def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
+    files = load_asset_files(store, AssetKind.OBJECT, digest)
+    return load_object(files, name=name, digest=digest, face_error_m=face_error_m)
