@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
@@ -179,7 +179,7 @@ class Catalog:
     def asset(self, kind: AssetKind, name: str) -> AssetView:
         return self._parts.index.asset(kind, name)
 
-    def add_asset(self, kind: AssetKind, name: str, files: dict[str, bytes]) -> AssetView:
+    def add_asset(self, kind: AssetKind, name: str, files: Mapping[str, bytes]) -> AssetView:
         """Keep an uploaded hand or object; the keeper queues its check.
 
         Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import sys
+import tempfile
 
 import uvicorn
 
@@ -47,6 +48,10 @@ def serve(settings: Settings) -> None:
     """
     listener = bind(settings.host, settings.port)
     with listener:
+        # Uploads wait here, not in /tmp, which may be memory.
+        spool = settings.data_dir / "uploads"
+        spool.mkdir(parents=True, exist_ok=True)
+        tempfile.tempdir = str(spool)
         app = create_app(settings)
         host, port = listener.getsockname()[:2]
         shown = f"[{host}]" if ":" in host else host

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
+from collections import ChainMap
+from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
-from typing import Any, Final
+from typing import IO, Any, Final, cast
 
-from service.assets import check_path, unpack
+from service.assets import ZipFiles, check_path
 from service.domain import AssetKind
-from service.errors import InputError
+from service.errors import InputError, LimitError
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: (".urdf", ".xml"),
@@ -21,29 +24,39 @@ _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 def files_of_upload(
-    kind: AssetKind, filename: str, data: bytes, *, limit_bytes: int, options: str = ""
-) -> dict[str, bytes]:
+    kind: AssetKind, filename: str, data: bytes | IO[bytes], *, limit_bytes: int, options: str = ""
+) -> MutableMapping[str, bytes]:
     """Files of an asset, `asset.json` among them, from an uploaded file or ZIP.
+
+    Those of a ZIP are read from it when they are asked for, one at a time.
 
     Args:
         kind: hand or object.
         filename: as the user called it.
-        data: its bytes.
+        data: its bytes, or the open file that holds them.
         limit_bytes: largest upload [bytes].
         options: a JSON object; its keys go over those of `asset.json`.
 
     Raises:
         InputError: empty, an unknown suffix, options that are no JSON object, or a ZIP in which the main file cannot be
             told.
-        LimitError: the ZIP unpacks to more than `UNPACK_FACTOR` times the limit, or holds too many files.
+        LimitError: it is larger than the limit, or a file in the ZIP is; the ZIP unpacks to more than `UNPACK_FACTOR`
+            times the limit, or holds too many files.
     """
     leaf = PurePosixPath(filename.replace("\\", "/")).name
-    if not leaf or not data:
+    file = io.BytesIO(data) if isinstance(data, bytes) else data
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    if size > limit_bytes:
+        raise LimitError(f"{leaf} is larger than {limit_bytes} bytes; simplify it or raise the limit")
+    if not leaf or not size:
         raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
     if PurePosixPath(leaf).suffix.lower() == ".zip":
-        files = _without_common_folder(unpack(data, limit_bytes=limit_bytes * UNPACK_FACTOR))
+        # A file that would be too large by itself is no smaller for having been zipped.
+        unpacked = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR, file_bytes=limit_bytes)
+        files = ChainMap({}, cast(MutableMapping[str, bytes], unpacked.without_common_folder()))
     else:
-        files = {check_path(leaf): data}
+        files = ChainMap({check_path(leaf): file.read()})
     if "asset.json" not in files:
         files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
     if options:
@@ -69,7 +82,7 @@ def name_of_upload(filename: str) -> str:
     return _NAME.sub("-", stem).strip("-._")[:64] or "unnamed"
 
 
-def _main_file(kind: AssetKind, upload: str, files: dict[str, bytes]) -> str:
+def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:
     suffixes = MAIN_SUFFIXES[kind]
     found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in suffixes]
     if kind is AssetKind.HAND and any(name.lower().endswith(".urdf") for name in found):
@@ -83,11 +96,3 @@ def _main_file(kind: AssetKind, upload: str, files: dict[str, bytes]) -> str:
             f'{upload} holds several {kind.value} files ({names}); add an asset.json that says {{"file": ...}}'
         )
     return found[0]
-
-
-def _without_common_folder(files: dict[str, bytes]) -> dict[str, bytes]:
-    """A folder zipped whole has its own name before every file: take it off."""
-    tops = {name.partition("/")[0] for name in files}
-    if len(tops) != 1 or any("/" not in name for name in files):
-        return files
-    return {name.partition("/")[2]: data for name, data in files.items()}

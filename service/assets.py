@@ -9,9 +9,11 @@ import io
 import json
 import zipfile
 import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import IO, Final
 
 from service.digests import digest_files
 from service.domain import Asset, AssetKind
@@ -21,15 +23,21 @@ _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 #: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
+_PIECE_BYTES: Final = 1 << 16
 
 
-def pack(files: dict[str, bytes]) -> bytes:
+def pack(files: Mapping[str, bytes]) -> bytes:
     """ZIP of named files; equal files give equal bytes."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+    pack_into(files, buffer)
+    return buffer.getvalue()
+
+
+def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
+    """Write that ZIP into a file; one of the files at a time is in memory."""
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name in sorted(files):
             archive.writestr(zipfile.ZipInfo(check_path(name), _EPOCH), files[name], zipfile.ZIP_DEFLATED)
-    return buffer.getvalue()
 
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
@@ -39,15 +47,69 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
         InputError: not a ZIP, encrypted, or a name that leaves the archive.
         LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
     """
+    archive = _open_zip(io.BytesIO(data))
+    files: dict[str, bytes] = {}
+    total = 0
+    for name, entry in _entries(archive).items():
+        content = _read_entry(archive, entry, limit_bytes - total + 1)
+        total += len(content)
+        if total > limit_bytes:
+            raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
+        files[name] = content
+    return files
+
+
+class ZipFiles(Mapping[str, bytes]):
+    """Files of a ZIP that lies in a file, each unpacked when it is asked for. It was unpacked once to count its bytes.
+
+    Raises:
+        InputError: not a ZIP, encrypted, damaged, or a name that leaves the archive.
+        LimitError: one file larger than `file_bytes`, more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
+    """
+
+    def __init__(self, file: IO[bytes], *, limit_bytes: int, file_bytes: int) -> None:
+        self._archive = _open_zip(file)
+        self._found = _entries(self._archive)
+        total = 0
+        for name, entry in self._found.items():
+            size = _count_entry(self._archive, entry, min(file_bytes, limit_bytes - total) + 1)
+            total += size
+            if total > limit_bytes:
+                raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
+            if size > file_bytes:
+                raise LimitError(f"the file {name!r} in the archive is larger than {file_bytes} bytes")
+
+    def __getitem__(self, name: str) -> bytes:
+        entry = self._found[name]
+        return _read_entry(self._archive, entry, entry.file_size)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def without_common_folder(self) -> ZipFiles:
+        """A folder zipped whole has its own name before every file: take it off."""
+        tops = {name.partition("/")[0] for name in self._found}
+        if len(tops) == 1 and all("/" in name for name in self._found):
+            self._found = {name.partition("/")[2]: entry for name, entry in self._found.items()}
+        return self
+
+
+def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
     try:
-        archive = zipfile.ZipFile(io.BytesIO(data))
+        return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         raise InputError("the archive is not a readable ZIP file; zip the folder again") from None
+
+
+def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The files of an archive by their plain names, once all of them can be taken."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
         raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
-    files: dict[str, bytes] = {}
-    total = 0
+    found = {}
     for entry in entries:
         name = check_path(entry.filename)
         if (entry.external_attr >> 16) & 0o170000 == 0o120000:
@@ -57,19 +119,29 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             # Others may ask for gigabytes of memory before the first byte.
             raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
-        content = _read_entry(archive, entry, limit_bytes - total + 1)
-        total += len(content)
-        if total > limit_bytes:
-            raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
-        files[name] = content
-    return files
+        found[name] = entry
+    return found
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> bytes:
     """At most `limit` bytes of an entry, whatever its header says."""
+    with _damage_said(entry), archive.open(entry) as stream:
+        return stream.read(limit)
+
+
+def _count_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> int:
+    """Bytes of an entry, counted up to `limit`; holds a piece of it at a time."""
+    count = 0
+    with _damage_said(entry), archive.open(entry) as stream:
+        while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):
+            count += len(piece)
+    return count
+
+
+@contextmanager
+def _damage_said(entry: zipfile.ZipInfo) -> Iterator[None]:
     try:
-        with archive.open(entry) as stream:
-            return stream.read(limit)
+        yield
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError):
         raise InputError(f"the archive entry {entry.filename!r} is damaged; zip the folder again") from None
 
@@ -108,7 +180,7 @@ def builtin_names(kind: AssetKind) -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
 
 
-def describe(kind: AssetKind, name: str, files: dict[str, bytes], *, created: str, builtin: bool = False) -> Asset:
+def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
     """The asset record of a set of files with an `asset.json` that names the main file under `file`.
 
     `asset.json` of a hand may also hold palm, approach, preshape, couplings, ...; of an object units and density.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import tempfile
+from collections.abc import Mapping
 from typing import Final
 
 from service import names
-from service.assets import builtin_asset, builtin_model, builtin_names, describe, pack, unpack
+from service.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
 from service.clock import timestamp
 from service.digests import digest_files
 from service.domain import Asset, AssetKind
@@ -18,7 +20,7 @@ UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
 def publish_asset(
-    store: Store, kind: AssetKind, name: str, files: dict[str, bytes], *, builtin: bool = False, created: str = ""
+    store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], *, builtin: bool = False, created: str = ""
 ) -> Asset:
     """Put a hand or object into the store: the archive first, its record last. Doing it twice changes nothing.
 
@@ -31,7 +33,9 @@ def publish_asset(
     """
     asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
     record = names.asset_record(kind, asset.digest)
-    store.put(names.asset_files(kind, asset.digest), pack(files))
+    with tempfile.TemporaryFile() as archive:
+        pack_into(files, archive)
+        store.put_file(names.asset_files(kind, asset.digest), archive)
     if store.put(record, asset.model_dump_json().encode()):
         return asset
     known = load_asset(store, kind, asset.digest)

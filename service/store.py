@@ -6,16 +6,18 @@ Only what every back end offers is used: put if absent, get, range, list; no ove
 from __future__ import annotations
 
 import errno
+import io
 import os
 import random
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 from urllib.parse import unquote, urlsplit
 
 import obstore
@@ -58,12 +60,17 @@ class Store:
         Returns:
             True if it was written, False if the name was taken (for content-addressed names: the same bytes).
         """
+        return self.put_file(key, io.BytesIO(data))
+
+    def put_file(self, key: str, file: IO[bytes]) -> bool:
+        """The same from an open file, which a local store copies piece by piece."""
         check_key(key)
+        file.seek(0)
         with _mapped(key, self.url):
             if self._root is not None:
-                return _put_local(self._root, key, data)
+                return _put_local(self._root, key, file)
             try:
-                obstore.put(self._backend, key, data, mode="create")
+                obstore.put(self._backend, key, file.read(), mode="create")
             except AlreadyExistsError:
                 return False
             return True
@@ -187,7 +194,7 @@ def _open_local(folder: Path, url: str) -> Store:
         raise StoreUnavailable(f"the store folder {folder} cannot be written: {_line(error)}") from None
 
 
-def _put_local(root: Path, key: str, data: bytes) -> bool:
+def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
     """Write, flush to the disk, then link under the final name: a power cut leaves all of the object or nothing."""
     path = root / key
     if path.exists():
@@ -198,7 +205,7 @@ def _put_local(root: Path, key: str, data: bytes) -> bool:
     staged = path.with_name(f"{path.name}#{random.SystemRandom().randrange(10**12)}")
     try:
         with staged.open("wb") as file:
-            file.write(data)
+            shutil.copyfileobj(data, file, _STREAM_BYTES)
             file.flush()
             os.fsync(file.fileno())
         os.link(staged, path)

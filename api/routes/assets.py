@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import BoundedSemaphore
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
@@ -14,10 +15,13 @@ from api.problems import responses
 from api.uploads import files_of_upload, name_of_upload
 from service import names
 from service.domain import AssetKind, Name
-from service.errors import LimitError
+from service.errors import RateError
 from service.index.views import AssetView, Page
 
 _GLB: Final = "model/gltf-binary"
+#: Uploads being unpacked and packed in this process; each holds one of its files in memory.
+_AT_ONCE: Final = BoundedSemaphore(4)
+_TURN_S: Final = 20.0
 
 
 def asset_router(kind: AssetKind) -> APIRouter:
@@ -85,10 +89,16 @@ def asset_router(kind: AssetKind) -> APIRouter:
 def store_upload(
     catalog: Catalog, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int, options: str = ""
 ) -> AssetView:
-    """Take an upload whole: an asset of immutable bytes, and the task that checks it."""
-    data = file.file.read(limit_bytes + 1)
-    if len(data) > limit_bytes:
-        raise LimitError(f"{file.filename} is larger than {limit_bytes} bytes; simplify it or raise the limit")
+    """An asset of immutable bytes, and the task that checks it. The upload lies in a file of its own until then.
+
+    Raises:
+        RateError: too many others are being taken; their number bounds the memory that uploads use.
+    """
     filename = file.filename or ""
-    files = files_of_upload(kind, filename, data, limit_bytes=limit_bytes, options=options)
-    return catalog.add_asset(kind, name or name_of_upload(filename), files)
+    if not _AT_ONCE.acquire(timeout=_TURN_S):
+        raise RateError("too many uploads at once; try again in a moment")
+    try:
+        files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
+        return catalog.add_asset(kind, name or name_of_upload(filename), files)
+    finally:
+        _AT_ONCE.release()

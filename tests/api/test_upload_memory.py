@@ -1,0 +1,61 @@
+"""Uploads go through files, not through memory."""
+
+from __future__ import annotations
+
+import io
+import os
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from api.uploads import files_of_upload
+from service.domain import AssetKind
+from service.errors import InputError, LimitError
+from service.library import load_asset_files, publish_asset
+from service.parts import Parts
+
+MIB = 1 << 20
+
+
+def folder_of(count: int, size: int) -> bytes:
+    """ZIP of a folder with a mesh and textures that do not compress."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("thing/mesh.stl", b"solid x\nendsolid x\n")
+        for number in range(count):
+            archive.writestr(f"thing/texture-{number}.png", os.urandom(size))
+    return buffer.getvalue()
+
+
+def test_a_zip_is_kept_with_one_of_its_files_in_memory_at_a_time(parts: Parts, tmp_path: Path) -> None:
+    with (tmp_path / "upload.zip").open("w+b") as file:
+        file.write(folder_of(16, MIB))
+        tracemalloc.start()
+        files = files_of_upload(AssetKind.OBJECT, "thing.zip", file, limit_bytes=32 * MIB)
+        asset = publish_asset(parts.store, AssetKind.OBJECT, "thing", files)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    # One file, its copy on the way through zlib, and a piece of 1 MiB on its way into the store.
+    assert peak < 5 * MIB
+    assert len(load_asset_files(parts.store, AssetKind.OBJECT, asset.digest)) == 18
+
+
+def test_a_file_over_the_limit_is_no_smaller_for_being_zipped() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("mesh.stl", b"0" * 2000)
+    with pytest.raises(LimitError, match="mesh.stl"):
+        files_of_upload(AssetKind.OBJECT, "thing.zip", buffer.getvalue(), limit_bytes=1000)
+
+
+def test_a_zip_whose_header_understates_its_files_is_refused() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("mesh.stl", b"0" * 5000)
+    data = buffer.getvalue()
+    true, false = (5000).to_bytes(4, "little"), (10).to_bytes(4, "little")
+    assert data.count(true) == 2
+    with pytest.raises(InputError, match="damaged"):
+        files_of_upload(AssetKind.OBJECT, "thing.zip", data.replace(true, false), limit_bytes=1000)
