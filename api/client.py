@@ -16,13 +16,15 @@ from api.guard import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
 from api.problems import ERRORS
 from service.domain import AssetKind, JobRequest, State
-from service.errors import GraspdError, InputError, UnavailableError
+from service.errors import GraspdError, InputError, RateError, UnavailableError
 from service.index.views import AssetView, GraspView, Page
 
 _TIMEOUT: Final = httpx.Timeout(30.0, connect=5.0)
 #: The server sends a sign of life every 15 s.
 _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
+#: Longest waits before another try when the service says that requests come too fast [s].
+_WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
 
 
 class Client:
@@ -182,10 +184,19 @@ class Client:
     def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
         """The answer to a request; the error behind a problem document is raised."""
         given = {name: value for name, value in (params or {}).items() if value is not None}
-        with _Translated(self.url):
-            answer = self._http.request(method, path, params=given or None, **options)
+        for wait in (*_WAITS_S, None):
+            with _Translated(self.url):
+                answer = self._http.request(method, path, params=given or None, **options)
+            if wait is None or not _is_too_fast(answer):
+                break
+            time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
         _raise_for(answer)
         return answer
+
+
+def _is_too_fast(answer: httpx.Response) -> bool:
+    """A quota is used up for longer than anybody waits: only the rate of requests is worth another try."""
+    return answer.status_code == 429 and RateError.slug in answer.text
 
 
 def parse_events(lines: Iterator[str]) -> Iterator[tuple[str, Any]]:

@@ -11,7 +11,15 @@ import pytest
 from api.client import Client, parse_events
 from api.models import Job, Shard
 from service.domain import AssetKind, Stage, State
-from service.errors import ConflictError, GraspdError, InputError, NotFoundError, QueueUnavailable, UnavailableError
+from service.errors import (
+    ConflictError,
+    GraspdError,
+    InputError,
+    NotFoundError,
+    QueueUnavailable,
+    QuotaError,
+    UnavailableError,
+)
 
 Handler = Callable[[httpx.Request], httpx.Response]
 
@@ -113,3 +121,23 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_opened_is_the_callers_mistake(tmp_path: Path) -> None:
     with client_of(lambda _: httpx.Response(500)) as client, pytest.raises(InputError, match="nowhere"):
         client.upload(AssetKind.OBJECT, tmp_path / "nowhere.stl")
+
+
+def test_requests_that_come_too_fast_are_sent_again_when_the_service_says() -> None:
+    answers = iter([429, 429, 200])
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        status = next(answers)
+        body = {"type": "/problems/too-many-requests", "detail": "slower"} if status == 429 else {"items": []}
+        return httpx.Response(status, json=body, headers={"Retry-After": "0"})
+
+    assert client_of(handler).jobs().items == []
+
+
+def test_a_quota_that_is_used_up_is_reported_at_once() -> None:
+    def handler(request: httpx.Request) -> httpx.Response:
+        problem = {"type": "/problems/quota-exceeded", "detail": "no more jobs today"}
+        return httpx.Response(429, json=problem, headers={"Retry-After": "3600"})
+
+    with pytest.raises(QuotaError, match="no more jobs today"):
+        client_of(handler).jobs()
