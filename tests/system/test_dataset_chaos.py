@@ -1,0 +1,75 @@
+"""A dataset whose every process is killed in the middle: the same dataset goes on and makes nothing twice."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Callable
+
+import pytest
+
+from service import names
+from service.datasets import actions
+from service.datasets.status import status
+from service.domain import State
+from service.index.rebuild import differences
+from service.manifests import ShardManifest
+from service.records import read_record
+from tests.service.datasets.makers import add_asset, wanted
+from tests.system.conftest import System
+
+pytestmark = pytest.mark.chaos
+OBJECTS = tuple(f"object-{i}" for i in range(20))
+
+
+def made(system: System) -> dict[str, str]:
+    """When each shard was made."""
+    store = system.parts.store
+    keys = [entry.key for entry in store.list(names.SHARDS) if entry.key.endswith(".json")]
+    return {key: read_record(ShardManifest, store, key).created for key in keys}
+
+
+def test_a_dataset_goes_on_after_everything_was_killed(start: Callable[..., System]) -> None:
+    system = start(environment={"FAKE_SECONDS": "0.1"}, lease_s=2.0, retry_backoff_s=0.1)
+    for name in OBJECTS:
+        add_asset(system.parts, "object", name)
+    request = wanted("kitchen", hands=("gripper",), objects=OBJECTS, scenes=1)
+    actions.create(system.parts, request)
+    system.until(lambda: system.parts.index.dataset("kitchen").states[State.SUCCEEDED] >= 5, 60, "a quarter is done")
+    for pid in system.supervisor.pids.values():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    before = made(system)
+    again, new = actions.create(system.parts, request)
+    assert not new and not again.state.is_final
+    system.until(lambda: system.parts.index.dataset("kitchen").state.is_final, 120, "the dataset is done")
+    after = made(system)
+    assert {key: after[key] for key in before} == before
+    assert len(after) == 2 * len(OBJECTS)
+    assert {cell.state for cell in status(system.parts.index, "kitchen").cells} == {State.SUCCEEDED}
+    assert differences(system.parts.index, system.parts.store) == []
+    taken, _ = actions.snapshot(system.parts, "kitchen")
+    assert taken.complete and len(taken.shards) == len(after)
+
+
+def test_a_dataset_that_is_cancelled_stops_and_stays_so(start: Callable[..., System]) -> None:
+    system = start(environment={"FAKE_SECONDS": "0.3"}, lease_s=2.0, retry_backoff_s=0.1)
+    for name in OBJECTS:
+        add_asset(system.parts, "object", name)
+    actions.create(system.parts, wanted("kitchen", hands=("gripper",), objects=OBJECTS))
+    system.until(lambda: system.parts.index.dataset("kitchen").states[State.SUCCEEDED] >= 2, 60, "two are done")
+    actions.cancel(system.parts, "kitchen")
+    system.until(lambda: system.parts.index.dataset("kitchen").state is State.CANCELLED, 30, "it is cancelled")
+    system.kill("keeper")
+    system.until(lambda: _waits_for_nothing(system), 30, "nothing waits for it any more")
+    # A task that was at its end when the cancellation came has succeeded; the new keeper hears of it.
+    system.until(
+        lambda: not differences(system.parts.index, system.parts.store), 30, "the index is what the store says"
+    )
+    states = {cell.state for cell in status(system.parts.index, "kitchen").cells}
+    assert states == {State.SUCCEEDED, State.CANCELLED}
+
+
+def _waits_for_nothing(system: System) -> bool:
+    return not system.parts.queue.waiting() and not system.parts.queue.leases()
