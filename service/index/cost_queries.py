@@ -11,6 +11,7 @@ from sqlalchemy import select
 from service.domain import AssetKind, JobRequest, Stage
 from service.index.database import Database
 from service.index.tables import assets, shards
+from service.names import SHARD_KINDS
 
 #: Batches looked at of each stage, the newest first: what a machine did long ago says less.
 _NEWEST: Final = 2000
@@ -39,7 +40,7 @@ class CostQueries(Database):
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.stage == stage.value)
+            .where(shards.c.kind == SHARD_KINDS[stage])
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(_NEWEST)
         )
