@@ -52,7 +52,7 @@ class Certified:
     tried: int
     """Grasps planned, kept or not."""
     rejected: dict[str, int]
-    """Grasps that were not kept, by the reason: dropped, gate, surplus."""
+    """Grasps that were not kept, by the reason: diverged (hands that are no numbers), dropped, gate, surplus."""
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: nobody judged."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -202,7 +202,7 @@ class _Work:
         request = self.request
         planned = synthesize(
             self.hand, self.obj, count=size, method=request.method, fidelity=request.knobs, seed=request.seed,
-            batch=self.batch + number * ROUND_STRIDE, threads=self.threads, device=self.device,
+            batch=self.batch + number * ROUND_STRIDE, options=request.options, threads=self.threads, device=self.device,
             progress=self._part(0), cancelled=self.cancelled,
         )  # fmt: skip
         self.tried += size
@@ -210,7 +210,9 @@ class _Work:
         return self.score(planned)
 
     def score(self, planned: GraspSet) -> _Round:
-        """Judge and measure grasps, and keep those that are wanted."""
+        """Judge and measure grasps, and keep those that are wanted; a hand that is no number is never one of them."""
+        finite = np.flatnonzero(_finite(planned))
+        diverged, planned = len(planned) - len(finite), planned.take(finite)
         size, every = len(planned), self.request.want == "raw"
         columns = self._judged(planned)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
@@ -219,7 +221,8 @@ class _Work:
         held = columns.get("quality/success", np.ones(len(rows)))
         valid = (passes(columns) == 1) & (held == 1)
         columns["quality/valid"] = valid.astype(np.uint8)
-        rejected = {"dropped": size - len(rows), "gate": 0 if every else int(np.count_nonzero(~valid))}
+        gate = 0 if every else int(np.count_nonzero(~valid))
+        rejected = {"diverged": diverged, "dropped": size - len(rows), "gate": gate}
         if not every:
             grasps = grasps.take(np.flatnonzero(valid))
             columns = {path: array if path == _THRESHOLDS else array[valid] for path, array in columns.items()}
@@ -284,6 +287,13 @@ class _Work:
 
 
 _THRESHOLDS: Final = "quality/thresholds_m"
+
+
+def _finite(grasps: GraspSet) -> NDArray[np.bool_]:
+    """(N,) whether all numbers of a grasp's postures are finite."""
+    parts = (grasps.grasp, grasps.pregrasp, grasps.squeeze)
+    rows = np.concatenate([array for part in parts for array in (part.hand_pose, part.joint_positions)], axis=1)
+    return np.asarray(np.isfinite(rows).all(axis=1))
 
 
 def _joined_columns(parts: list[Mapping[str, NDArray[Any]]]) -> Arrays:

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.domain import JobRequest
+from service.errors import InputError
 from worker import certified
 from worker.certified import Certified, certified_grasps, next_round
 from worker.grasps import GraspSet, Posture
@@ -64,7 +65,11 @@ def test_the_same_batch_is_the_same_grasps(hand: HandModel, block: ObjectModel, 
 
 def test_raw_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
     found = certified_grasps(hand, block, wish(want="raw", audits=0), count=COUNT)
-    assert (len(found.grasps), found.tried, found.rejected) == (COUNT, COUNT, {"dropped": 0, "gate": 0, "surplus": 0})
+    assert (len(found.grasps), found.tried, found.rejected) == (
+        COUNT,
+        COUNT,
+        {"diverged": 0, "dropped": 0, "gate": 0, "surplus": 0},
+    )
     assert set(np.unique(found.columns["quality/success"])) <= {0, 1}
     assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()
 
@@ -73,6 +78,16 @@ def test_without_a_referee_nobody_judges(hand: HandModel, block: ObjectModel) ->
     found = certified_grasps(hand, block, wish(referee="none"), count=COUNT)
     assert found.verdict_key is None
     assert "quality/success" not in found.columns
+
+
+def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -> None:
+    wanted = {"method": "autograsp", "want": "raw", "referee": "none"}
+    near, far = (
+        certified_grasps(hand, block, wish(**wanted, options={"standoff_m": gap}), count=2) for gap in (0.0, 0.05)
+    )
+    assert not np.allclose(near.grasps.grasp.hand_pose, far.grasps.grasp.hand_pose)
+    with pytest.raises(InputError, match="its options: standoff_m"):
+        certified_grasps(hand, block, wish(**wanted, options={"speed": 3}), count=2)
 
 
 def test_a_budget_that_finds_nothing_ends_with_nothing(
@@ -96,6 +111,22 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
     assert (len(found.grasps), found.tried) == (0, 3 * COUNT)
     assert len(set(planned)) == len(planned), "each round draws other grasps"
     assert found.columns["quality/valid"].shape == (0,)
+
+
+def test_hands_that_are_no_numbers_are_dropped_and_counted(
+    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = certified.synthesize
+
+    def plan(*arguments: Any, **options: Any) -> GraspSet:
+        made = whole(*arguments, **options)
+        made.grasp.hand_pose[::2] = np.nan
+        return made
+
+    monkeypatch.setattr(certified, "synthesize", plan)
+    found = certified_grasps(hand, block, wish(want="raw", referee="none"), count=COUNT)
+    assert (len(found.grasps), found.tried, found.rejected["diverged"]) == (COUNT // 2, COUNT, COUNT // 2)
+    assert np.isfinite(found.grasps.grasp.hand_pose).all()
 
 
 @given(

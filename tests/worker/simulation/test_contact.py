@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.worker.simulation import reference
-from tests.worker.simulation.reference import Contacts, World
+from worker.simulation import reference
+from worker.simulation.reference import Contacts, World
 from worker.simulation.kernels import contact
 from worker.simulation.simulation import initial_motions
 

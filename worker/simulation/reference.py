@@ -1,4 +1,4 @@
-"""The contact step in float64 NumPy, written for clarity: the oracle of the kernels."""
+"""The contact step in float64 NumPy, written for clarity: the oracle of the kernels, and of studies of them."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Fl
             c = world.dilation - rho + n @ u
             if c <= 0:
                 continue
-            k = world.stiffness * w
+            k = float(world.stiffness * w)
             tangent = u - (n @ u) * n
-            slide = min(k, k * world.friction * c / max(np.linalg.norm(tangent), 1e-9))
+            slide = min(k, k * world.friction * float(c) / max(float(np.linalg.norm(tangent)), 1e-9))
             j = row(n, p)
             a = a + k * np.outer(j, j)
             rhs = rhs - k * (world.dilation - rho) * j
             for e in np.eye(3):
                 jt = row(e - (n @ e) * n, p)
                 a = a + slide * np.outer(jt, jt)
-        s = np.linalg.solve(a, rhs)
+        s = np.asarray(np.linalg.solve(a, rhs), float)
     return s
 
 

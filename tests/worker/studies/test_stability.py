@@ -1,0 +1,116 @@
+"""The maps of failure say what physics says, and the guards that they name hold."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.domain import FIDELITIES, JobRequest
+from service.errors import MeshError
+from worker import backend
+from worker.certified import certified_grasps
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.prepare import object_from_path
+from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.simulation.simulation import HandState, LossOptions
+from worker.studies.stability import descents, gradients, integrators, shapes
+from worker.studies.stability.maps import Cell, StabilityMap, graded
+from worker.studies.stability.report import markdown, write
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    backend.start()
+    return hand_from_path("barrett")
+
+
+@pytest.fixture(scope="module")
+def pair(hand: HandModel) -> Pair:
+    return pair_of(hand, object_from_path("block"), FIDELITIES["draft"], "cpu")
+
+
+@pytest.mark.parametrize("name", ["direct (default)", "Gauss-Seidel, one sweep", "Jacobi, averaged"])
+def test_the_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
+    way = LossOptions().step  # time step x speed [m]
+    energy, sunk = integrators.position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
+    assert graded(energy, *integrators.ENERGY) == "good"
+    assert graded(sunk, *integrators.SINK_M) == "good"
+
+
+@pytest.mark.parametrize(("share", "holds"), [(0.3, True), (2.5, False)])
+def test_a_penalty_force_blows_up_above_the_bound_of_theory(share: float, holds: bool) -> None:
+    stiffness, mass = 1e5, 1.0
+    bound = 2 * math.sqrt(mass / stiffness)  # of semi-implicit Euler on one spring
+    energy, _ = integrators.force_based(dt=share * bound, speed=0.05, stiffness=stiffness, mass=mass)
+    assert (energy < integrators.ENERGY[1]) is holds
+
+
+def test_summed_jacobi_overshoots_with_the_number_of_contacts() -> None:
+    found = integrators.contact_count_map(counts=(1, 64))
+    outcome = {(cell.panel, cell.x): cell.outcome for cell in found.cells if cell.y == 0.0}
+    assert outcome["Jacobi, summed", 1] == "good"
+    assert outcome["Jacobi, summed", 64] == "broken"
+    assert outcome["Jacobi, averaged", 64] == outcome["direct (default)", 64] == "good"
+
+
+def test_gradients_agree_at_the_sizes_of_hands_and_their_objects() -> None:
+    found = gradients.gradient_map(sizes=(0.01, 0.04), gaps=(0.1, 0.3), repeats=3)
+    assert [cell for cell in found.cells if cell.outcome == "broken"] == []
+
+
+def test_a_shape_is_refused_or_its_grasps_are_sound(hand: HandModel) -> None:
+    found = shapes.shape_map(
+        hand, fidelities=("draft",), count=4, families=(), defects=("a side is missing", "inside out")
+    )
+    by_name = {cell.x: cell for cell in found.cells}
+    assert by_name["a side is missing"].outcome == "refused"
+    assert by_name["inside out"].outcome in ("good", "weak"), by_name["inside out"].note
+
+
+def test_a_mesh_without_an_inside_is_refused_with_the_mend() -> None:
+    mesh, options = shapes.DEFECTS["a side is missing"]
+    with pytest.raises(MeshError, match="allow-open"):
+        shapes.prepared(mesh(), options, 1e-3)
+
+
+def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
+    state = descents.starts_of(pair, 2)
+    far = HandState(state.pivot + np.array([0.0, 0.0, 0.6]), state.rotation, state.q)
+    (cell,) = descents._cells(pair, descents.descend(pair, far, FIDELITIES["draft"]), "x", 0, 0)
+    assert cell.outcome == "broken"
+
+
+def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
+    crumb = shapes.prepared(shapes.cube(1), {"units": "m"}, 1e-5)
+    request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, audits=0)
+    found = certified_grasps(hand, crumb, request, count=2)
+    assert found.tried == len(found.grasps) + sum(found.rejected.values())
+    assert (found.columns["quality/valid"] == 1).all()
+
+
+def test_a_long_run_does_not_drift(pair: Pair) -> None:
+    state = descents.starts_of(pair, 2)
+    end, _, _ = descents.descend(pair, state, FIDELITIES["draft"], iterations=1500)
+    # float32: a normalised quaternion is off by a few units in the last place, 6e-8.
+    np.testing.assert_allclose(np.linalg.norm(end.rotation, axis=1), 1.0, atol=1e-6)
+
+
+def test_what_is_no_number_is_broken() -> None:
+    assert [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)] == [
+        "good", "weak", "broken", "broken", "broken",
+    ]  # fmt: skip
+
+
+def test_a_report_has_a_picture_and_a_table_for_each_map(tmp_path: Path) -> None:
+    cells = [Cell("a", 1.0, 10.0, 0.1, "good"), Cell("a", 2.0, 10.0, math.inf, "broken")]
+    one = StabilityMap("demo", "A demo", "x", "y", "m", "weak: 1", cells, "s", "g", "t", {"a": [(1.0, 10.0)]})
+    written = write([one], tmp_path, command="graspd stability", versions={"graspd": "0"})
+    assert {path.name for path in written} == {"stability.json", "stability.md", "stability-demo.png"}
+    assert json.loads(written[0].read_text())["maps"][0]["cells"][1]["value"] is None
+    assert "| a | 1 | 0 | 1 | 0 |" in markdown([one], command="c", versions={})
+    assert written[2].read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,1 @@
+"""Integrators and methods driven to where they fail: `graspd stability`."""

@@ -1,0 +1,189 @@
+"""The descent itself: from starts too deep or too far, with rates and weights too small or too large, for too long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.domain import FIDELITIES, Fidelity
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.merit import merits
+from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.simulation.projection import Projection, ProjectionOptions
+from worker.simulation.simulation import HandState, Schedule
+from worker.studies.stability.maps import Cell, StabilityMap, graded
+from worker.transforms import quat_rotate
+
+Floats = NDArray[np.float64]
+Say = Callable[[str], None]
+
+#: How far the start is moved along the approach [m]: towards the object where negative is away from it.
+MOVES_M: Final = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.03, 0.06, 0.1)
+#: Factors on the optimiser's rates, and on the weights of penetration.
+RATES: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
+WEIGHTS: Final = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
+LENGTHS: Final = (100, 1_000, 10_000)
+LONG: Final = 100_000
+#: Median penetration that is weak and broken [mm].
+DEPTH_MM: Final = (0.5, 2.0)
+#: Residual of the balance of contact forces that is weak and broken; 1: no balance at all.
+RESIDUAL: Final = (0.35, 0.9)
+
+
+def descend(
+    pair: Pair, state: HandState, fidelity: Fidelity, *, rates: float = 1.0, weights: float = 1.0,
+    iterations: int | None = None, optimizer: str = "adam",
+) -> tuple[HandState, Floats, Floats]:  # fmt: skip
+    """Coarse and fine phase and projection from given hands.
+
+    Args:
+        pair: hand and object.
+        state: n hands.
+        fidelity: its schedules.
+        rates: factor on the rates.
+        weights: factor on the weights of penetration.
+        iterations: of the fine phase, whose last row is repeated; by default the fidelity's.
+        optimizer: adam or gd.
+
+    Returns:
+        the hands, their losses (n,), and their deepest penetration before the projection (n,) [m].
+    """
+    n = len(state.pivot)
+    for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
+        simulation = pair.simulation(side, n)
+        scaled = _scaled(schedule, rates, weights)
+        simulation.set_schedule(_lengthened(scaled, iterations) if side is pair.fine else scaled)
+        simulation.set_state(state)
+        simulation.record_iteration(optimizer)
+        simulation.run(len(schedule) if side is pair.coarse or iterations is None else iterations)
+        state = simulation.state(n)
+        losses = simulation.loss.numpy()[:n].mean(axis=1).astype(float)
+    # No steps: this only tells how deep each hand is.
+    _, depths = Projection(simulation, ProjectionOptions()).run(state, 0)
+    state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
+    return state, losses, depths
+
+
+def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = lambda line: None) -> StabilityMap:
+    """Starts moved along the approach, into the object and away from it."""
+    fidelity = FIDELITIES["standard"]
+    pair = pair_of(hand, obj, fidelity, "cpu")
+    state = starts_of(pair, count)
+    along = quat_rotate(state.rotation, hand.palm.approach)
+    cells = []
+    for move in MOVES_M:
+        moved = replace(state, pivot=state.pivot + move * along)
+        cells += _cells(pair, descend(pair, moved, fidelity), f"{hand.name} on {obj.name}", move, "standard")
+        say(f"start moved by {move * 1e3:.0f} mm: {cells[-1].outcome}")
+    return StabilityMap(
+        "starts", f"{count} starts moved along the approach", "way towards the object [m]", "fidelity",
+        "median residual of balanced contact forces; 1: nothing holds", _BOUNDS, cells,
+        "a hand that stays away has no contacts; one that begins inside stays tangled",
+        "the planner's own starts are drawn back until nothing touches; the merit drops hands that hold nothing, the "
+        "gate those that sink in",
+        "tests/worker/studies/test_stability.py::test_a_start_that_is_too_far_is_flagged",
+    )  # fmt: skip
+
+
+def rate_map(
+    hand: HandModel, obj: ObjectModel, *, rates: Sequence[float] = RATES, weights: Sequence[float] = WEIGHTS,
+    count: int = 8, say: Say = lambda line: None,
+) -> StabilityMap:  # fmt: skip
+    """Learning rate x weight of penetration, for Adam and for plain descent."""
+    fidelity = FIDELITIES["draft"]
+    pair = pair_of(hand, obj, fidelity, "cpu")
+    state = starts_of(pair, count)
+    cells = []
+    for optimizer in ("adam", "gd"):
+        for rate in rates:
+            for weight in weights:
+                found = descend(pair, state, fidelity, rates=rate, weights=weight, optimizer=optimizer)
+                cells += _cells(pair, found, optimizer, rate, weight)
+            say(f"{optimizer} rate x {rate:g}: {[cell.outcome for cell in cells[-len(weights) :]]}")
+    return StabilityMap(
+        "rates", f"Rates and weights of the descent, draft, {hand.name} on {obj.name}", "factor on the rates",
+        "factor on the weights of penetration", "median residual of balanced contact forces; 1: nothing holds", _BOUNDS,
+        cells,
+        "hands jump past the object or sink into it",
+        "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others judged",
+        "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
+    )  # fmt: skip
+
+
+def length_map(
+    hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int] = LENGTHS, count: int = 4, say: Say = lambda line: None
+) -> StabilityMap:
+    """Fine phases far longer than any schedule: does anything drift?"""
+    fidelity = FIDELITIES["draft"]
+    pair = pair_of(hand, obj, fidelity, "cpu")
+    state = starts_of(pair, count)
+    cells = []
+    for length in lengths:
+        end, losses, depths = descend(pair, state, fidelity, iterations=length)
+        drift = float(np.abs(np.linalg.norm(end.rotation, axis=1) - 1.0).max())
+        (cell,) = _cells(pair, (end, losses, depths), "draft", length, "residual")
+        cells += [cell, Cell("draft", length, "quaternion drift", drift, graded(drift, 1e-5, 1e-3))]
+        say(f"{length} iterations: {cell.outcome}, quaternions off by {drift:.1e}")
+    return StabilityMap(
+        "length", f"Long runs of the fine phase, {hand.name} on {obj.name}", "iterations", "measure",
+        "median residual of balanced contact forces, and the largest departure of a quaternion's length from 1",
+        _BOUNDS + "; drift: 1e-5, 1e-3", cells,
+        "poses that are no rotations any more, hands that creep away",
+        "quaternions are normalised in each step; a grasp that does not improve is frozen after `patience` iterations",
+        "tests/worker/studies/test_stability.py::test_a_long_run_does_not_drift",
+    )  # fmt: skip
+
+
+_BOUNDS: Final = (
+    f"weak: residual {RESIDUAL[0]:g} or {DEPTH_MM[0]:g} mm deep; "
+    f"broken: {RESIDUAL[1]:g}, {DEPTH_MM[1]:g} mm, or no number"
+)
+
+
+def starts_of(pair: Pair, count: int) -> HandState:
+    """Starts as the planner draws them."""
+    hand, obj = pair.hand.model, pair.fine.obj.model
+    probe = pair.simulation(pair.coarse, count * len(RETREATS))
+    return sample_starts(hand, obj, probe, seed=11, batch=0, indices=range(count), each=1)
+
+
+def _cells(
+    pair: Pair, found: tuple[HandState, Floats, Floats], panel: str, x: float | str, y: float | str
+) -> list[Cell]:
+    state, losses, depths = found
+    finite = bool(np.isfinite(state.pivot).all() and np.isfinite(state.q).all() and np.isfinite(state.rotation).all())
+    if not finite:
+        return [Cell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
+    residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(losses)))))
+    depth = float(np.median(depths)) * 1e3
+    worst = max(graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM), key=("good", "weak", "broken").index)
+    return [Cell(panel, x, y, residual, worst, f"{depth:.2g} mm deep")]
+
+
+def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:
+    return replace(
+        schedule, rates=rates * schedule.rates, penetration=weights * schedule.penetration,
+        object_penetration=weights * schedule.object_penetration,
+    )  # fmt: skip
+
+
+def _lengthened(schedule: Schedule, iterations: int | None) -> Schedule:
+    """The schedule with its last row repeated."""
+    if iterations is None or iterations <= len(schedule):
+        return schedule
+    more = iterations - len(schedule)
+
+    def longer(values: Floats) -> Floats:
+        return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
+
+    return Schedule(
+        longer(schedule.dilation), longer(schedule.penetration), longer(schedule.object_penetration),
+        longer(schedule.self_penetration), longer(schedule.rates),
+    )  # fmt: skip

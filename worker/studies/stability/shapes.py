@@ -1,0 +1,137 @@
+"""Objects that are hard: thin, sharp, pierced, open, inside out, tiny and huge; through ingest to the referee."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+import trimesh
+
+from service.digests import digest_files
+from service.domain import FIDELITIES, AssetKind, JobRequest
+from service.errors import GraspdError
+from worker.certified import certified_grasps
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import load_object
+from worker.studies.stability.maps import Cell, Outcome, StabilityMap
+
+MILLIMETRES: Final = 1e-3
+
+
+def sheet(thickness_mm: float) -> Any:
+    """A plate of 80 x 60 mm."""
+    return trimesh.creation.box((0.08, 0.06, thickness_mm * MILLIMETRES))
+
+
+def wedge(angle_deg: float) -> Any:
+    """A prism of 80 mm with one sharp edge."""
+    half = 0.06 * np.tan(np.radians(angle_deg) / 2)
+    section = np.array([[0.0, 0.0], [0.06, -half], [0.06, half]])
+    ends = [np.column_stack([section, np.full(3, z)]) for z in (-0.04, 0.04)]
+    return trimesh.convex.convex_hull(np.concatenate(ends))
+
+
+def tunnel(diameter_mm: float) -> Any:
+    """A block's worth of ring: 30 mm of wall around a hole."""
+    inner = diameter_mm * MILLIMETRES / 2
+    return trimesh.creation.annulus(inner, inner + 0.015, 0.05, sections=48)
+
+
+def corner(depth_mm: float) -> Any:
+    """A cross of two bars: four concave corners, as deep as given."""
+    deep = depth_mm * MILLIMETRES
+    arms = [trimesh.creation.box((0.03 + 2 * deep, 0.03, 0.05)), trimesh.creation.box((0.03, 0.03 + 2 * deep, 0.05))]
+    return trimesh.boolean.union(arms, engine="manifold")
+
+
+def cube(side_mm: float) -> Any:
+    return trimesh.creation.box(3 * (side_mm * MILLIMETRES,))
+
+
+def _opened() -> Any:
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[2:], process=False)
+
+
+def _inverted() -> Any:
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+
+
+def _half_inverted() -> Any:
+    mesh = trimesh.creation.box((0.07, 0.06, 0.05))
+    faces = mesh.faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+#: Family -> unit of its parameter, how to make it, parameters.
+FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]] = {
+    "plate": ("thickness [mm]", sheet, (0.2, 0.5, 1, 2, 5, 10)),
+    "wedge": ("angle of the edge [deg]", wedge, (5, 10, 20, 40, 80)),
+    "ring": ("diameter of the hole [mm]", tunnel, (4, 8, 16, 32, 64)),
+    "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
+    "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
+}
+#: Meshes with a defect, and the options they are given with.
+DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
+    "a side is missing": (_opened, {}),
+    "a side is missing, --allow-open": (_opened, {"allow_open": True}),
+    "inside out": (_inverted, {}),
+    "every other face inside out": (_half_inverted, {}),
+}
+
+
+def shape_map(
+    hand: HandModel, *, fidelities: Sequence[str] = ("draft", "standard", "fine"), count: int = 8, threads: int = 0,
+    families: Sequence[str] = tuple(FAMILIES), defects: Sequence[str] = tuple(DEFECTS),
+    say: Callable[[str], None] = lambda line: None,
+) -> StabilityMap:  # fmt: skip
+    """Valid grasps on each shape at each fidelity, or the reason why it was refused."""
+    jobs: list[tuple[str, float | str, Any, dict[str, Any]]] = [
+        (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value), {"units": "m"})
+        for family in families
+        for value in FAMILIES[family][2]
+    ]
+    jobs += [("mesh of a box", name, DEFECTS[name][0](), {"units": "m", **DEFECTS[name][1]}) for name in defects]
+    cells = []
+    for panel, value, mesh, options in jobs:
+        for fidelity in fidelities:
+            cell = _cell(hand, panel, value, mesh, options, fidelity, count, threads)
+            say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
+            cells.append(cell)
+    return StabilityMap(
+        "shapes", f"{count} grasps of {hand.name} on shapes that are hard", "shape's parameter", "fidelity",
+        "share of tries that are valid: certified by the referee, and past the geometric gate",
+        "weak: under a half; broken: none, or a number that is none", cells,
+        "few or no valid grasps: a job ends with a note that its budget found fewer than asked for",
+        "ingest refuses what has no inside and says `thin` where walls are; the gate and the referee flag grasps that "
+        "sink in; a job that finds too few says so",
+        "tests/worker/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
+    )  # fmt: skip
+
+
+def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectModel:
+    """The mesh through the same door as an upload; MeshError where it is refused."""
+    files = {"shape.ply": bytes(mesh.export(file_type="ply"))}
+    digest = digest_files(AssetKind.OBJECT, files)
+    return load_object(files, name="shape", digest=digest, face_error_m=face_error_m, options=options)
+
+
+def _cell(
+    hand: HandModel, panel: str, value: float | str, mesh: Any, options: dict[str, Any], fidelity: str, count: int,
+    threads: int,
+) -> Cell:  # fmt: skip
+    request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", fidelity=fidelity, audits=0)
+    try:
+        obj = prepared(mesh, options, FIDELITIES[fidelity].face_error_m)
+        found = certified_grasps(hand, obj, request, count=count, threads=threads)
+    except GraspdError as error:
+        return Cell(panel, value, fidelity, float("nan"), "refused", str(error))
+    valid = float(found.columns["quality/valid"].mean())
+    depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
+    finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
+    outcome: Outcome = "broken" if not finite or valid == 0 else "weak" if valid < 0.5 else "good"
+    return Cell(panel, value, fidelity, valid, outcome, f"{depth:.2f} mm deep (median)")

@@ -1,0 +1,46 @@
+"""The studies by name, whole or quick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.studies.stability import descents, gradients, integrators, shapes
+from worker.studies.stability.maps import StabilityMap
+
+Say = Callable[[str], None]
+
+
+def run(
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, threads: int, say: Say
+) -> list[StabilityMap]:
+    """The maps of the named studies, in the order of the names."""
+    model, thing = hand_from_path(hand), object_from_path(obj)
+
+    def few(values: Sequence[float]) -> Sequence[float]:
+        return values[1::2] if quick else values
+
+    lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
+    studies: dict[str, Callable[[], StabilityMap]] = {
+        "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
+        "stiffness": lambda: integrators.stiffness_map(
+            few(integrators.STIFFNESSES), few(integrators.MASSES), few(integrators.TIME_STEPS)
+        ),
+        "contact_count": lambda: integrators.contact_count_map(integrators.COUNTS[:: 2 if quick else 1]),
+        "gradient": lambda: gradients.gradient_map(few(gradients.SIZES_M), few(gradients.GAPS)),
+        "shapes": lambda: shapes.shape_map(
+            model, fidelities=("draft",) if quick else ("draft", "standard", "fine"), count=4 if quick else 8,
+            families=("plate", "cube") if quick else tuple(shapes.FAMILIES), threads=threads, say=say,
+        ),
+        "starts": lambda: descents.start_map(model, thing, count=4 if quick else 8, say=say),
+        "rates": lambda: descents.rate_map(
+            model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
+        ),
+        "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
+    }  # fmt: skip
+    found = []
+    for name in names:
+        say(f"study {name}")
+        found.append(studies[name]())
+    return found
