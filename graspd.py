@@ -43,6 +43,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
     ("export", "worker.exchange.commands", "Without a server", "Grasps and pictures in the formats of others."),
     ("import", "worker.exchange.commands", "Without a server", "Grasps of others, judged and measured like ours."),
+    ("stability", "worker.studies.stability.commands", "Studies", "Where integrators and the planner fail."),
     ("gallery", "worker.rendering.studies", "Studies", "Hands and objects at rest, as a camera sees them."),
     ("bench-render", "worker.rendering.studies", "Studies", "Images per second, and where the time goes."),
 )
