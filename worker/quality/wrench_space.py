@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from service.errors import InputError
+from worker.quality.hull import MAX_POINTS, radius_and_volume
 
 Floats = NDArray[np.float64]
 Norm = Literal["l1", "linf"]
@@ -27,6 +28,8 @@ EDGES: Final = 8
 FLATNESS: Final = 1e-7
 #: Most contacts of an L-infinity space: its points grow ninefold with each.
 MAX_LINF_CONTACTS: Final = 4
+#: From this number of points on our own hull is the faster one.
+MANY: Final = 24
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
@@ -88,6 +91,10 @@ def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, f
     """
     dimension = edge_wrenches.shape[-1]
     points = edge_wrenches.reshape(-1, dimension) if norm == "l1" else _minkowski(edge_wrenches)
+    if dimension == 6 and MANY <= len(points) <= MAX_POINTS and not _flat(points):
+        found = radius_and_volume(points)
+        if found is not None:
+            return max(0.0, found[0]), found[1]
     hull = _hull(points)
     if hull is None:
         return 0.0, 0.0
@@ -95,10 +102,7 @@ def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, f
 
 
 def _hull(points: Floats) -> ConvexHull | None:
-    if len(points) <= points.shape[1]:
-        return None
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if spread[-1] <= FLATNESS * max(spread[0], 1e-300):
+    if len(points) <= points.shape[1] or _flat(points):
         return None
     # Joggled input is fastest and simplicial; exact merging is for what defeats it.
     for options in ("QJ", "Qt Qx"):
@@ -107,6 +111,11 @@ def _hull(points: Floats) -> ConvexHull | None:
         except QhullError:
             continue
     return None
+
+
+def _flat(points: Floats) -> bool:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[-1] <= FLATNESS * max(spread[0], 1e-300))
 
 
 def _minkowski(edge_wrenches: Floats) -> Floats:
