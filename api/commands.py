@@ -17,6 +17,7 @@ from api.dataset_client import DatasetClient
 from api.models import Job
 from api.reports import UrlOption, job_request, open_client, show_asset, show_job, watch
 from api.uploads import MAIN_SUFFIXES, name_of_upload
+from service import tracing
 from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
 from service.domain import AssetKind, State
 from service.errors import InputError
@@ -38,6 +39,9 @@ def submit(
     audits: Annotated[int, typer.Option(help="Valid grasps judged again by the letter.")] = 8,
     robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
     method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
+    option: Annotated[
+        list[str] | None, typer.Option(help="An option of the planner, such as steps=20000; several times.")
+    ] = None,
     fidelity: Annotated[str, typer.Option(help="draft, standard, fine, or auto with --target.")] = "standard",
     target: Annotated[
         str, typer.Option(help="With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest that meets it is taken.")
@@ -67,6 +71,7 @@ def submit(
                 "audits": audits,
                 "robustness": robustness,
                 "method": method,
+                "options": dict(_pair(text) for text in option or []),
                 "fidelity": fidelity,
                 "target": target,
                 "seed": seed,
@@ -83,6 +88,13 @@ def submit(
         if wait:
             job = watch(client, job.id)
         show_job(job, json=json, url=client.url)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise InputError(f"--option {text!r}: write it as name=value, for example steps=20000")
+    return name, value
 
 
 @app.command(epilog="graspd jobs --state running")
@@ -231,6 +243,7 @@ def api(
 
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")
+    tracing.set_up("api")
     serve(settings)
 
 

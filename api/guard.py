@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.metrics import Metrics
 from api.problems import ApiError, answer, log_unforeseen
+from service import tracing
 from service.errors import GraspdError
 from service.logs import bind
 
@@ -55,8 +56,11 @@ class RequestContext:
             return
         request_id = _request_id(Headers(scope=scope).get("x-request-id"))
         scope.setdefault("state", {})["request_id"] = request_id
-        with bind(request=request_id):
-            await self._answer(scope, receive, send, request_id)
+        parent = Headers(scope=scope).get("traceparent", "")
+        with tracing.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
+            with bind(request=request_id, traceparent=tracing.traceparent()):
+                await self._answer(scope, receive, send, request_id)
+            facts["http.route"] = _route(scope)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
         started = time.perf_counter()
@@ -90,15 +94,13 @@ class RequestContext:
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
         """Count the answer and write its line."""
-        route = getattr(scope.get("route"), "path", "unmatched")
-        # Clients may write any word for the method; only those that HTTP knows become names of series.
-        method = scope["method"] if scope["method"] in _METHODS else "other"
-        self.metrics.observe(method, route, status, seconds)
+        route = _route(scope)
+        self.metrics.observe(_method(scope), route, status, seconds)
         level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
         key = scope["state"].get("key")
         about = {"status": status, "ms": round(1000 * seconds, 1), "route": route, "key": key.name if key else ""}
         about["client"] = scope["client"][0] if scope.get("client") else ""
-        _access.log(level, "%s %s %d", method, scope["path"], status, extra=about)
+        _access.log(level, "%s %s %d", _method(scope), scope["path"], status, extra=about)
 
 
 class SameOrigin:
@@ -135,6 +137,15 @@ class SameOrigin:
         if origin is not None and urlsplit(origin).netloc != host:
             return ApiError(403, f"the request comes from {origin}; open the dashboard itself and try again")
         return None
+
+
+def _method(scope: Scope) -> str:
+    """Clients may write any word for the method; only those that HTTP knows become names of series."""
+    return scope["method"] if scope["method"] in _METHODS else "other"
+
+
+def _route(scope: Scope) -> str:
+    return getattr(scope.get("route"), "path", "unmatched")
 
 
 def _request_id(given: str | None) -> str:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from service import tracing
 from service.cli import load_settings, log_to_stderr, reporting_errors
 from service.domain import Stage
 from service.errors import InputError, UnavailableError
@@ -38,6 +39,7 @@ def worker(
         return
     from worker.main import run_worker
 
+    tracing.set_up("worker")
     ended_well = run_worker(
         settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
     )

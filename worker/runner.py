@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service import logs, names
+from service import logs, names, tracing
 from service.clock import timestamp
 from service.domain import IngestMessage, Origin, Stage, TaskMessage
 from service.errors import InputError, TaskCancelled, TaskRefused, UnavailableError
@@ -51,8 +51,12 @@ class Runner:
             TaskRefused: the message cannot be read, so there is no task to fail.
         """
         message = parse_message(raw)
-        with logs.bind(**_subjects(message)):
-            return self._run(message, raw, context)
+        subjects = _subjects(message)
+        parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
+        with logs.bind(**subjects), tracing.span(f"task {message.stage}", parent=parent, **subjects) as facts:
+            event = self._run(message, raw, context)
+            facts["graspd.outcome"] = event.kind.value if event is not None else "lost"
+            return event
 
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()

@@ -46,7 +46,7 @@ def test_a_file_over_the_limit_is_no_smaller_for_being_zipped() -> None:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("mesh.stl", b"0" * 2000)
-    with pytest.raises(LimitError, match="the file .mesh"):
+    with pytest.raises(LimitError, match=r"the file .mesh"):
         files_of_upload(AssetKind.OBJECT, "thing.zip", buffer.getvalue(), limit_bytes=1000)
 
 

@@ -1,0 +1,60 @@
+"""With OpenTelemetry a request and the tasks it caused are one trace; without it nothing is sent."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from starlette.testclient import TestClient
+
+from service import names, tracing
+from service.domain import Stage
+from service.parts import Parts
+from service.planning import message_of, plan
+from service.records import JobRecord, read_record
+from tests.fakes import fake_stages
+from worker.context import TaskContext
+from worker.runner import Runner
+
+_PARENT = "00-" + "a" * 32 + "-" + "b" * 16 + "-01"
+
+
+@pytest.fixture
+def spans() -> Iterator[InMemorySpanExporter]:
+    exporter = InMemorySpanExporter()
+    tracing.set_up("test", exporter=exporter)
+    yield exporter
+    tracing.stop()
+
+
+def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(
+    spans: InMemorySpanExporter, http: TestClient, parts: Parts
+) -> None:
+    body = {"hand": "allegro", "object": "mug", "grasps": 32}
+    made = http.post("/v1/jobs", json=body, headers={"traceparent": _PARENT}).json()
+    record = read_record(JobRecord, parts.store, names.job_record(made["id"]))
+    task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
+    message = message_of(record, task, attempt=1, max_attempt=3)
+    runner = Runner(fake_stages(), worker="w", publish=lambda event: None)
+    runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(parts.store))
+    found = {span.name: span for span in spans.get_finished_spans()}
+    request, work = found["HTTP POST"], found["task synthesize"]
+    assert f"{request.context.trace_id:032x}" == "a" * 32
+    assert work.context.trace_id == request.context.trace_id
+    assert work.parent is not None
+    assert work.parent.span_id == request.context.span_id
+    assert dict(work.attributes or {})["graspd.outcome"] == "finished"
+    assert dict(request.attributes or {})["http.route"] == "/v1/jobs"
+
+
+def test_without_an_endpoint_nothing_of_the_sdk_is_imported() -> None:
+    code = (
+        "import sys; from service import tracing; tracing.set_up('api')\n"
+        "with tracing.span('x'): assert tracing.traceparent() == ''\n"
+        "assert not [name for name in sys.modules if name.startswith('opentelemetry')]"
+    )
+    environment = {"PATH": "/usr/bin:/bin"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
