@@ -57,6 +57,7 @@ def shard_id(
             "method": request.method,
             "fidelity": request.knobs.model_dump(mode="json"),
             "friction": request.friction,
+            **({"options": request.options} if request.options else {}),
             **_judgement(request, batch),
         }
     elif stage is Stage.SCENE:

@@ -188,6 +188,12 @@ class JobRequest(JobOptions):
 
     hand: Name = Field(description="name of a hand known to the service")
     object: Name = Field(description="name of an object known to the service")
+    options: dict[
+        Annotated[str, Field(max_length=40)],
+        int | Annotated[float, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=80)],
+    ] = Field(
+        default_factory=dict, max_length=16, description="the method's own options, such as steps; see docs/planners.md"
+    )
     target: str = Field(
         "",
         max_length=40,

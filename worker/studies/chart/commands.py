@@ -76,7 +76,7 @@ def chart(
     result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | {"command": command}
     if sweep:
         result["sweeps"] = turn(
-            models[0], things[0], batch=4 if quick else 32, repeats=repeats, quick=quick, threads=threads,
+            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, threads=threads,
             device=resolved, say=_say,
         )  # fmt: skip
     if out is not None:
