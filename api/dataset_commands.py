@@ -65,14 +65,17 @@ def create(
             return
         if not yes and not _confirmed():
             raise InputError("nothing was started")
+        refused: list[str] = []
         if files is not None:
-            _upload(client, files, name_of_set(Path(objects)), console)
+            refused = _upload(client, files, name_of_set(Path(objects)), console)
             request = validated(DatasetRequest, {"name": name, **matrix, "objects": []})
         dataset = datasets.create(request)
         if wait:
             dataset = watch_dataset(datasets, name, Console(stderr=True))
-    _emit(json, estimate=found, dataset=dataset)
+    _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
+        if refused:
+            console.print(f"left out, because refused: {', '.join(refused)}", markup=False, soft_wrap=True)
         print_dataset(dataset, console)
         console.print(f"`graspd datasets status {name}` shows each cell", style="dim")
     _must_succeed(dataset, asked=wait)
@@ -215,11 +218,10 @@ def _matrix(client: Client, hands: str, objects: str, options: dict[str, Any]) -
     names = [word.strip() for word in objects.split(",") if word.strip()]
     wanted: dict[str, Any] = {"hands": [word.strip() for word in hands.split(",") if word.strip()], **options}
     path = Path(objects)
-    if path.is_dir() or path.suffix.lower() == ".zip":
-        files = files_of_set(path)
-        if files is None:
-            raise InputError(f"{objects} is one object; `graspd objects add {objects}`, then name it here")
+    if files := files_of_set(path):
         return files, wanted | {"objects": sorted(files), "sets": [name_of_set(path)]}
+    if path.is_file():
+        raise InputError(f"{objects} is one object; `graspd objects add {objects}`, then name it here")
     if "/" in objects:
         raise InputError(f"there is no folder {objects}; give one that exists, or names of objects and sets")
     known = {found.name for found in DatasetClient(client).object_sets()}
@@ -240,13 +242,14 @@ def _estimate(datasets: DatasetClient, matrix: dict[str, Any], files: Objects | 
     return found
 
 
-def _upload(client: Client, files: Objects, set_name: str, console: Console) -> None:
-    """The objects of a folder, as a set; what is refused is said and left out."""
+def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
+    """Send the objects of a folder and make them a set; returns those that are refused and so left out."""
     told = upload_set(client, files, say=lambda line: console.print(line, markup=False, soft_wrap=True))
     taken = [one["name"] for one in told if one["verdict"] != "refuse"]
     if not taken:
         raise InputError(f"none of the {len(told)} objects can be used; see above why")
     DatasetClient(client).add_object_set(set_name, taken)
+    return [one["name"] for one in told if one["verdict"] == "refuse"]
 
 
 def _confirmed() -> bool:
@@ -255,9 +258,9 @@ def _confirmed() -> bool:
     return typer.confirm("Start it?")
 
 
-def _emit(json: bool, **parts: Estimate | DatasetView) -> None:
+def _emit(json: bool, **parts: Estimate | DatasetView | list[str]) -> None:
     if json:
-        emit({name: part.model_dump(mode="json") for name, part in parts.items()})
+        emit({k: part if isinstance(part, list) else part.model_dump(mode="json") for k, part in parts.items()})
 
 
 def _show(dataset: DatasetView, *, json: bool) -> None:

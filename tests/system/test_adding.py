@@ -73,6 +73,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "toys").mkdir()
     trimesh.creation.icosphere(subdivisions=2, radius=0.02).export(folder / "toys" / "ball.ply")
     trimesh.creation.cylinder(radius=0.015, height=0.06).export(folder / "toys" / "rod.obj")
+    (folder / "toys" / "torn.off").write_text("OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n")
     return folder
 
 
@@ -127,10 +128,11 @@ def test_a_folder_of_objects_becomes_a_dataset_and_its_files(
     wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
     cheap = ("--fidelity", "draft", "--want", "raw", "--referee", "none")
     code, seen, _ = graspd(*wanted, *cheap, "--dry-run")
-    assert code == 0 and seen["estimate"]["cells"] == 2 and "dataset" not in seen
+    assert code == 0 and seen["estimate"]["cells"] == 3 and "dataset" not in seen
     code, made, said = graspd(*wanted, *cheap, "--yes", "--wait")
     assert code == 0, said
     assert (made["dataset"]["state"], made["dataset"]["grasps"]) == ("succeeded", 8)
+    assert made["refused"] == ["torn"]
     code, status, _ = graspd("datasets", "status", "play")
     assert [(cell["object"], cell["state"]) for cell in status["matrix"]] == [
         ("ball", "succeeded"),
