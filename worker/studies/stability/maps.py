@@ -22,6 +22,8 @@ class Cell:
     """The measure, in the map's unit; nan where there is none."""
     outcome: Outcome
     note: str = ""
+    label: str = ""
+    """What to write on it, where it is not the value."""
 
 
 @dataclass(frozen=True)

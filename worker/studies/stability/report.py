@@ -76,8 +76,8 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     for cell in cells:
         at = xs.index(cell.x), ys.index(cell.y)
         axes.add_patch(_square(at, cell))
-        if math.isfinite(cell.value):
-            axes.text(*at, f"{cell.value:.2g}", ha="center", va="center", fontsize=7, color="white")
+        if cell.label or math.isfinite(cell.value):
+            axes.text(*at, cell.label or f"{cell.value:.2g}", ha="center", va="center", fontsize=7, color="white")
     axes.set_xlim(-0.5, len(xs) - 0.5)
     axes.set_ylim(-0.5, len(ys) - 0.5)
     axes.set_xticks(range(len(xs)), [_label(x) for x in xs], fontsize=8, rotation=30 if len(xs) > 5 else 0)
