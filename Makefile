@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: help install demo test test-slow check format browser docs pins audit clean
+.PHONY: help install demo test test-slow check format browser screenshots docs pins audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
@@ -39,6 +39,9 @@ format: $(STAMP) ## rewrite the sources in the house style
 browser: $(STAMP) ## Chromium and Playwright for the dashboard's tests (Debian, as root)
 	command -v chromium > /dev/null || { apt-get update -qq && apt-get install -qq -y --no-install-recommends chromium; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
+
+screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/dashboard.md (needs make browser)
+	$(BIN)/python -m tests.browser.screenshots
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs

@@ -15,7 +15,7 @@ from api.dependencies import CatalogOf, may_read
 from api.models import GraspQuery, JobDetail
 
 _SHOWN_PICTURES: Final = 8
-_SHOWN_GRASPS: Final = 8
+_SHOWN_GRASPS: Final = 10
 
 router = APIRouter(include_in_schema=False)
 

@@ -37,7 +37,7 @@ async function start(figure) {
     stage.invalidate();
   };
   show();
-  stage.frame(all, besideHand(hand), 0.8);
+  stage.frame(all, besideHand(hand), 0.7);
   wire(figure, { stage, hand, thing, contacts, slider, show });
   figure.dataset.state = "ready";
 }

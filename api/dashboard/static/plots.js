@@ -25,7 +25,7 @@
     const font = `12px ${colour("--sans")}`;
     const axis = { stroke: ink, font, grid: { stroke: line, width: 1 }, ticks: { show: false } };
     return {
-      width, height: Number(figure.dataset.height ?? 180), padding: [8, 8, 0, 0],
+      width, height: Number(figure.dataset.height ?? 180), padding: [8, 18, 0, 0],
       cursor: { points: { size: 7 }, drag: { x: kind === "line", y: false } },
       legend: { live: true },
       scales: { x: { time: kind === "bars" }, y: log ? { distr: 3 } : { range: (_, low, high) => [0, Math.max(high, 1) * 1.08] } },

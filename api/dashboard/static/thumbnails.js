@@ -28,7 +28,7 @@ async function draw(canvas) {
   all.add(hand.group, thing.group);
   stage.scene.add(all);
   stage.size(SIDE, SIDE * 0.8, ratio);
-  stage.frame(all, besideHand(hand), 0.82);
+  stage.frame(all, besideHand(hand), 0.74);
   stage.draw();
   canvas.width = stage.renderer.domElement.width;
   canvas.height = stage.renderer.domElement.height;

@@ -1,0 +1,144 @@
+"""Pictures of every page of the dashboard for its documentation, of a real service with real grasps.
+
+usage: python -m tests.browser.screenshots [--data-dir DIR] [--out docs/images]
+
+Starts the service, gives it work (some minutes on two cores), measures a quick chart, and photographs each page at the
+width of a laptop or a phone, light or dark. With --data-dir the service and its work are kept, and the next call takes
+pictures of what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import httpx
+from PIL import Image
+
+from service.settings import Settings
+from service.supervisor import Supervisor
+from tests.browser.conftest import ARGUMENTS
+
+REPOSITORY: Final = Path(__file__).resolve().parents[2]
+READY_S: Final = 120.0
+WORK_S: Final = 3600.0
+SHOWN_MS: Final = 60_000
+LAPTOP: Final = (1440, 900)
+PHONE: Final = (390, 844)
+VIEWED: Final[dict[str, Any]] = {
+    "hand": "allegro", "object": "mug", "grasps": 64, "scenes": 2, "views": 2, "stereo": True,
+}  # fmt: skip
+DATASET: Final[dict[str, Any]] = {
+    "name": "kitchen-1", "hands": ["allegro", "barrett"], "objects": ["mug", "bottle", "block"], "grasps": 32,
+    "fidelity": "draft",
+}  # fmt: skip
+LONG: Final[dict[str, Any]] = {"hand": "shadow", "object": "mug", "grasps": 640, "fidelity": "draft"}
+CHART: Final = (
+    "--methods", "fast_graspd,autograsp,graspd2022", "--hands", "barrett", "--objects", "mug,block", "--batch", "16",
+    "--repeats", "1",
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Start, work, photograph."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data-dir", type=Path)
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "images")
+    given = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as scratch:
+        wanted = Settings(data_dir=given.data_dir or Path(scratch), port=0)
+        with Supervisor(wanted, workers=1) as supervisor:
+            supervisor.wait_ready(READY_S)
+            with httpx.Client(base_url=supervisor.api_url, trust_env=False, timeout=60) as client:
+                places = work(client, supervisor)
+                given.out.mkdir(parents=True, exist_ok=True)
+                photograph(supervisor.api_url, places, given.out)
+                client.post(f"/v1/jobs/{places['running']}/cancel")
+    return 0
+
+
+def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
+    """Jobs of every kind: finished with views, a dataset, one attempt that lost its worker, one that runs."""
+    viewed = client.post("/v1/jobs", json=VIEWED).raise_for_status().json()["id"]
+    if not client.get("/v1/datasets/kitchen-1").is_success:
+        until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "running", "a job runs")
+        # What a lost worker leaves: its task runs again, and the attempt keeps the reason.
+        os.kill(supervisor.pids["worker-0"], 9)
+    client.post("/v1/datasets", json=DATASET).raise_for_status()
+    until(lambda: client.get("/v1/datasets/kitchen-1").json()["state"] == "succeeded", "the dataset")
+    until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "succeeded", "the job with views")
+    if not client.get("/chart").text.count("<circle"):
+        folder = str(supervisor.settings.data_dir)
+        command = [sys.executable, "-m", "graspd", "chart", *CHART, "--publish", "--data-dir", folder]
+        subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
+    seed = int(time.time()) % 2**31
+    running = client.post("/v1/jobs", json=LONG | {"seed": seed}).raise_for_status().json()["id"]
+    until(lambda: client.get(f"/v1/jobs/{running}").json()["progress"] > 0.002, "the long job moves")
+    best = client.get("/v1/grasps", params={"job": viewed, "valid": "true", "limit": 3}).json()["items"][-1]
+    return {"viewed": viewed, "running": running, "grasp": f"{best['shard_id']}/{best['row']}"}
+
+
+def until(met: Any, what: str) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + WORK_S
+    while not met():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"after {WORK_S:.0f} s still not: {what}")
+        time.sleep(1.0)
+
+
+def photograph(address: str, places: dict[str, str], folder: Path) -> None:
+    """Every page; a full page where its end is worth seeing."""
+    from playwright.sync_api import sync_playwright
+
+    pictures: list[tuple[str, str, str, tuple[int, int], str, bool]] = [
+        ("home", "/", "#jobs tbody tr", LAPTOP, "light", False),
+        ("datasets", "/datasets", ".matrix", LAPTOP, "light", False),
+        ("dataset", "/datasets/kitchen-1", ".matrix", LAPTOP, "dark", False),
+        ("job", f"/jobs/{places['viewed']}", "#best canvas[data-state=ready]", LAPTOP, "light", True),
+        ("job-running", f"/jobs/{places['running']}", "#stages", LAPTOP, "dark", False),
+        ("grasps", "/grasps", "#found canvas[data-state=ready]", LAPTOP, "light", False),
+        ("grasp", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", (1440, 1000), "light", False),
+        ("grasp-dark", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", (1440, 1000), "dark", False),
+        ("workers", "/workers", ".worker", LAPTOP, "light", False),
+        ("chart", "/chart", ".trade circle", LAPTOP, "light", False),
+        ("submit", "/submit", "[data-thing=object] figure[data-state=ready]", (1440, 1100), "light", False),
+        ("phone-home", "/", "#jobs tbody tr", PHONE, "light", False),
+        ("phone-grasp", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", PHONE, "dark", False),
+        ("phone-datasets", "/datasets", ".matrix", PHONE, "light", False),
+    ]
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=list(ARGUMENTS))
+        for name, path, ready, (width, height), scheme, whole in pictures:
+            context: Any = browser.new_context(
+                base_url=address, viewport={"width": width, "height": height}, color_scheme=scheme,
+                device_scale_factor=2 if width < 500 else 1, reduced_motion="reduce",
+            )  # fmt: skip
+            page = context.new_page()
+            page.goto(path)
+            page.wait_for_selector(ready, timeout=SHOWN_MS)
+            page.wait_for_timeout(3000)
+            if whole:
+                # What is drawn as it comes into view must have come there once.
+                for share in range(11):
+                    page.evaluate(f"scrollTo(0, {share / 10} * document.body.scrollHeight)")
+                    page.wait_for_timeout(700)
+                page.evaluate("scrollTo(0, 0)")
+            picture = Image.open(io.BytesIO(page.screenshot(full_page=whole))).convert("RGB")
+            picture.save(folder / f"dashboard-{name}.png", optimize=True)
+            context.close()
+        browser.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
