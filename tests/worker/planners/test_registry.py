@@ -89,3 +89,11 @@ def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
     with h5py.File(out) as file:
         assert file.attrs["method"] == "mine"
         assert len(file["grasp/hand_pose"]) == 2
+
+
+@pytest.mark.parametrize("name", sorted(PLANNERS))
+def test_the_page_names_every_method_with_all_its_options_and_defaults(name: str) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "planners.md").read_text()
+    row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` | "))
+    for option, field in method(name).options.model_fields.items():
+        assert f"`{option}` ({field.default:g}" in row
