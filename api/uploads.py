@@ -5,10 +5,9 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections import ChainMap
 from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
-from typing import IO, Any, Final, cast
+from typing import IO, Any, Final
 
 from service.assets import ZipFiles, check_path
 from service.domain import AssetKind
@@ -28,7 +27,7 @@ def files_of_upload(
 ) -> MutableMapping[str, bytes]:
     """Files of an asset, `asset.json` among them, from an uploaded file or ZIP.
 
-    Those of a ZIP are read from it when they are asked for, one at a time.
+    Those of a ZIP are read from it when they are asked for.
 
     Args:
         kind: hand or object.
@@ -40,8 +39,8 @@ def files_of_upload(
     Raises:
         InputError: empty, an unknown suffix, options that are no JSON object, or a ZIP in which the main file cannot be
             told.
-        LimitError: it is larger than the limit, or a file in the ZIP is; the ZIP unpacks to more than `UNPACK_FACTOR`
-            times the limit, or holds too many files.
+        LimitError: it is larger than the limit; the ZIP unpacks to more than `UNPACK_FACTOR` times that, or holds too
+            many files.
     """
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     file = io.BytesIO(data) if isinstance(data, bytes) else data
@@ -52,11 +51,11 @@ def files_of_upload(
     if not leaf or not size:
         raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
     if PurePosixPath(leaf).suffix.lower() == ".zip":
-        # A file that would be too large by itself is no smaller for having been zipped.
-        unpacked = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR, file_bytes=limit_bytes)
-        files = ChainMap({}, cast(MutableMapping[str, bytes], unpacked.without_common_folder()))
+        files: MutableMapping[str, bytes] = ZipFiles(
+            file, limit_bytes=limit_bytes * UNPACK_FACTOR
+        ).without_common_folder()
     else:
-        files = ChainMap({check_path(leaf): file.read()})
+        files = {check_path(leaf): file.read()}
     if "asset.json" not in files:
         files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
     if options:

@@ -5,17 +5,19 @@ An archive is a ZIP made reproducibly: names sorted, fixed time stamps, no compr
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
+import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import IO, Final
+from typing import IO, Final, Self
 
-from service.digests import digest_files
+from service.digests import StreamedFiles, digest_bytes, digest_files
 from service.domain import Asset, AssetKind
 from service.errors import InputError, LimitError, NotFoundError
 
@@ -34,10 +36,16 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
-    """Write that ZIP into a file; one of the files at a time is in memory."""
+    """Write that ZIP into a file, piece by piece where the files are not in memory."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name in sorted(files):
-            archive.writestr(zipfile.ZipInfo(check_path(name), _EPOCH), files[name], zipfile.ZIP_DEFLATED)
+            entry = zipfile.ZipInfo(check_path(name), _EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            if isinstance(files, StreamedFiles):
+                with files.open(name) as source, archive.open(entry, "w") as packed:
+                    shutil.copyfileobj(source, packed, _PIECE_BYTES)
+            else:
+                archive.writestr(entry, files[name])
 
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
@@ -59,42 +67,66 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     return files
 
 
-class ZipFiles(Mapping[str, bytes]):
-    """Files of a ZIP that lies in a file, each unpacked when it is asked for. It was unpacked once to count its bytes.
+class ZipFiles(StreamedFiles):
+    """Files of a ZIP that lies in a file, unpacked piece by piece when they are asked for; others may be added.
+
+    It was unpacked once before, to count and to digest what is really in it.
 
     Raises:
         InputError: not a ZIP, encrypted, damaged, or a name that leaves the archive.
-        LimitError: one file larger than `file_bytes`, more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
+        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
     """
 
-    def __init__(self, file: IO[bytes], *, limit_bytes: int, file_bytes: int) -> None:
+    def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
         self._found = _entries(self._archive)
-        total = 0
+        self._added: dict[str, bytes] = {}
+        self._known: dict[str, tuple[int, str]] = {}
+        left = limit_bytes
         for name, entry in self._found.items():
-            size = _count_entry(self._archive, entry, min(file_bytes, limit_bytes - total) + 1)
-            total += size
-            if total > limit_bytes:
+            size, digest = _measure_entry(self._archive, entry, left + 1)
+            left -= size
+            if left < 0:
                 raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
-            if size > file_bytes:
-                raise LimitError(f"the file {name!r} in the archive is larger than {file_bytes} bytes")
+            self._known[name] = (size, digest)
 
-    def __getitem__(self, name: str) -> bytes:
-        entry = self._found[name]
-        return _read_entry(self._archive, entry, entry.file_size)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
-
-    def __len__(self) -> int:
-        return len(self._found)
-
-    def without_common_folder(self) -> ZipFiles:
+    def without_common_folder(self) -> Self:
         """A folder zipped whole has its own name before every file: take it off."""
         tops = {name.partition("/")[0] for name in self._found}
         if len(tops) == 1 and all("/" in name for name in self._found):
             self._found = {name.partition("/")[2]: entry for name, entry in self._found.items()}
+            self._known = {name.partition("/")[2]: facts for name, facts in self._known.items()}
         return self
+
+    def digest(self, name: str) -> str:
+        return digest_bytes(self._added[name]) if name in self._added else self._known[name][1]
+
+    def size(self, name: str) -> int:
+        return len(self._added[name]) if name in self._added else self._known[name][0]
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[IO[bytes]]:
+        if name in self._added:
+            yield io.BytesIO(self._added[name])
+            return
+        with _damage_said(self._found[name]), self._archive.open(self._found[name]) as stream:
+            yield stream
+
+    def __getitem__(self, name: str) -> bytes:
+        with self.open(name) as stream:
+            return stream.read()
+
+    def __setitem__(self, name: str, data: bytes) -> None:
+        self._added[name] = data
+
+    def __delitem__(self, name: str) -> None:
+        del self._added[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._found, **self._added})
+
+    def __len__(self) -> int:
+        return len(self._found.keys() | self._added.keys())
 
 
 def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
@@ -129,13 +161,14 @@ def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) ->
         return stream.read(limit)
 
 
-def _count_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> int:
-    """Bytes of an entry, counted up to `limit`; holds a piece of it at a time."""
-    count = 0
+def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
+    """Bytes of an entry, counted up to `limit`, and their digest; holds a piece of it at a time."""
+    count, digest = 0, hashlib.sha256()
     with _damage_said(entry), archive.open(entry) as stream:
         while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):
             count += len(piece)
-    return count
+            digest.update(piece)
+    return count, digest.hexdigest()[:32]
 
 
 @contextmanager
@@ -198,7 +231,7 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
         digest=digest_files(kind, files),
         filename=main,
         files=tuple(sorted(files)),
-        size_bytes=sum(map(len, files.values())),
+        size_bytes=sum(files.size(name) if isinstance(files, StreamedFiles) else len(files[name]) for name in files),
         created=created,
         builtin=builtin,
         facts=description.get("facts", {}),

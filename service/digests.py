@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, MutableMapping
+from contextlib import AbstractContextManager
+from typing import IO
 
 from service.domain import AssetKind, JobRequest, Stage
 from service.version import STAGE_REVISIONS
@@ -21,9 +24,29 @@ def digest_json(value: object) -> str:
     return digest_bytes(text.encode())
 
 
+class StreamedFiles(MutableMapping[str, bytes]):
+    """Named files that are not in memory, and whose digests are known."""
+
+    @abstractmethod
+    def digest(self, name: str) -> str:
+        """`digest_bytes` of a file."""
+
+    @abstractmethod
+    def size(self, name: str) -> int:
+        """Its bytes."""
+
+    @abstractmethod
+    def open(self, name: str) -> AbstractContextManager[IO[bytes]]:
+        """It, to be read piece by piece."""
+
+
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
     """Digest of a set of named files; independent of their order."""
-    return digest_json({"kind": kind, "files": {name: digest_bytes(data) for name, data in files.items()}})
+    if isinstance(files, StreamedFiles):
+        digests = {name: files.digest(name) for name in files}
+    else:
+        digests = {name: digest_bytes(data) for name, data in files.items()}
+    return digest_json({"kind": kind, "files": digests})
 
 
 def shard_id(

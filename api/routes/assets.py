@@ -19,7 +19,7 @@ from service.errors import RateError
 from service.index.views import AssetView, Page
 
 _GLB: Final = "model/gltf-binary"
-#: Uploads being unpacked and packed in this process; each holds one of its files in memory.
+#: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.
 _AT_ONCE: Final = BoundedSemaphore(4)
 _TURN_S: Final = 20.0
 
