@@ -43,9 +43,10 @@ RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
 #: Hand points within this of the object press on it [m].
 PRESSING_M: Final = 0.003
-#: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with.
+#: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
+#: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
-FRICTION: Final = 0.6
+FRICTION: Final = 0.3
 MAX_PRESSING: Final = 16
 
 _POINTS: Final = 600
