@@ -1,0 +1,186 @@
+"""What the service costs around the engine: queue, indexer, workers, API at a million grasps; prints Markdown.
+
+usage: python -m benchmarks.service_load queue|workers|indexer|api [--index-url URL] [--data-dir DIR]
+
+`api` needs a filled index: python -m benchmarks.large_index --data-dir DIR [--index-url URL].
+Workers do no work here (tests.fakes): what is measured is everything else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import httpx
+
+from service import names, pipeline
+from service.domain import Lane, State
+from service.index.index import Index
+from service.parts import Parts
+from service.planning import message_of, plan
+from service.queue.memory import MemoryQueue
+from service.records import JobRecord, read_record
+from service.settings import Settings
+from service.store import open_store
+from service.supervisor import Supervisor
+from tests.fakes import add_assets, make_shard, request
+
+#: A batch of 32 grasps takes at least this long on two cores (docs/performance.md) [s].
+BATCH_S: Final = 1.0
+
+
+#: Requests of each kind.
+REPEATS: Final = 100
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time a process has used [s]; on a machine that others use too it says more than the clock."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+@contextmanager
+def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[Parts]:
+    """A whole service of real processes with workers that wait `task_s` for each task."""
+    os.environ["FAKE_SECONDS"] = str(task_s)
+    with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
+        wanted = Settings(data_dir=Path(folder), port=0, device="cpu", log_level="WARNING", **settings)
+        fakes = (sys.executable, "-m", "tests.fakes")
+        with Supervisor(wanted, workers=workers, api=False, worker_command=fakes) as supervisor:
+            supervisor.wait_ready(120)
+            parts = Parts.open(supervisor.settings)
+            add_assets(parts)
+            yield parts
+            parts.close()
+
+
+def run(parts: Parts, batches: int, seed: int) -> float:
+    """Seconds from the submission of a bulk job to its end."""
+    start = time.perf_counter()
+    job = pipeline.submit(parts, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
+    while parts.index.job(job).state is not State.SUCCEEDED:
+        time.sleep(0.05)
+    return time.perf_counter() - start
+
+
+def queue() -> None:
+    """Seconds a task costs beyond its work: queue, lease, shard, manifest, events."""
+    with service(workers=1) as parts:
+        run(parts, 20, 0)
+        seconds = [run(parts, 200, seed) / 200 for seed in range(1, 4)]
+    each = statistics.median(seconds)
+    share = each / BATCH_S
+    say(f"| a task without work | {1000 * each:.1f} ms | {share:.1%} of a batch of {BATCH_S:g} s |")
+
+
+def workers() -> None:
+    """Tasks a second by N workers, each task a wait of half a second."""
+    task_s = 0.5
+    first = 0.0
+    for count in (1, 2, 4, 8):
+        with service(workers=count, task_s=task_s) as parts:
+            run(parts, 2 * count, 0)
+            rate = 20 * count / run(parts, 20 * count, 1)
+        first = first or rate
+        say(f"| {count} workers | {rate:.2f} tasks/s | {rate / first / count:.0%} of {count} times one worker |")
+
+
+def indexer(url: str | None) -> None:
+    """Shards of 32 grasps a second that the keeper can index, a hundred in a transaction."""
+    with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
+        index = Index(url or f"sqlite:///{folder}/index.sqlite")
+        parts = Parts(Settings(data_dir=Path(folder)), open_store("memory://"), index, MemoryQueue())
+        add_assets(parts)
+        job = pipeline.submit(parts, request(grasps=32 * 1000, seed=time.time_ns() % 10**6))[0].id
+        record = read_record(JobRecord, parts.store, names.job_record(job))
+        made = [make_shard(parts.store, message_of(record, t, attempt=1, max_attempt=3)) for t in plan(record)]
+        start = time.perf_counter()
+        for begin in range(0, len(made), 100):
+            index.add_manifests(made[begin : begin + 100])
+        rate = len(made) / (time.perf_counter() - start)
+        index.close()
+    say(f"| indexer | {rate:.0f} shards/s | {32 * rate:.0f} grasps/s |")
+
+
+def api(data_dir: Path, url: str | None) -> None:
+    """Latency of the API, one request after the other, on an index that is full."""
+    settings = Settings(
+        data_dir=data_dir, port=0, requests_per_minute=0, address_requests_per_minute=0, concurrency=0,
+        log_level="WARNING", **({"index_url": url} if url else {}),
+    )  # fmt: skip
+    with Supervisor(settings, workers=0) as supervisor:
+        supervisor.wait_ready(120)
+        with httpx.Client(base_url=supervisor.api_url, timeout=60, trust_env=False) as http:
+            _requests(http, supervisor.pids["api"])
+
+
+def _requests(http: httpx.Client, pid: int) -> None:
+    job = http.get("/v1/jobs", params={"state": "succeeded"}).json()["items"][0]["id"]
+    seeds = iter(range(time.time_ns() % 10**9, 2**31))
+
+    def submit() -> httpx.Response:
+        return http.post("/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 320, "seed": next(seeds)})
+
+    def get(path: str, **params: Any) -> Callable[[], httpx.Response]:
+        return lambda: http.get(path, params=params)
+
+    calls: dict[str, Callable[[], httpx.Response]] = {
+        "submit a job of 10 batches": submit,
+        "status of a job": get(f"/v1/jobs/{job}"),
+        "list 50 jobs": get("/v1/jobs"),
+        "list 50 grasps, best first": get("/v1/grasps"),
+        "of one hand, least penetration first": get(
+            "/v1/grasps", hand="allegro", sort="penetration_depth_mm", order="asc"
+        ),
+        "valid, by three bounds": get(
+            "/v1/grasps", valid="true", min_epsilon=0.2, min_contact_area_cm2=10, max_penetration_depth_mm=0.5
+        ),
+        "page: home": get("/"),
+        "page: a job": get(f"/jobs/{job}"),
+        "page: grasps": get("/grasps"),
+    }
+    say("| request | median | p95 | CPU of the API process |\n| --- | --: | --: | --: |")
+    for name, call in calls.items():
+        call().raise_for_status()
+        times = []
+        before = cpu_s(pid)
+        for _ in range(REPEATS):
+            start = time.perf_counter()
+            call().raise_for_status()
+            times.append(1000 * (time.perf_counter() - start))
+        p95 = statistics.quantiles(times, n=20)[-1]
+        cpu = 1000 * (cpu_s(pid) - before) / REPEATS
+        say(f"| {name} | {statistics.median(times):.1f} ms | {p95:.1f} ms | {cpu:.1f} ms |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["queue", "workers", "indexer", "api"])
+    parser.add_argument("--data-dir", type=Path, help="folder of a filled index, for `api`")
+    parser.add_argument("--index-url", help="PostgreSQL; default: SQLite")
+    given = parser.parse_args()
+    if given.what == "api":
+        if given.data_dir is None:
+            parser.error("`api` needs --data-dir with a filled index: see benchmarks/large_index.py")
+        api(given.data_dir, given.index_url)
+    elif given.what == "indexer":
+        indexer(given.index_url)
+    else:
+        {"queue": queue, "workers": workers}[given.what]()
+
+
+if __name__ == "__main__":
+    main()
