@@ -9,7 +9,7 @@ from api.server import bind
 
 
 def test_answers_are_sent_without_delay() -> None:
-    """Nagle's algorithm holds an answer's body back for the 40 ms that a client waits before it acknowledges the head."""
+    """Else Nagle holds an answer's body back for the 40 ms that a client waits before it acknowledges the head."""
 
     async def option() -> int:
         found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
