@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from service.errors import NotFoundError
+from service import charts as published
 from service.store import Store
 
-FOLDER: Final = "charts"
 WIDTH: Final = 860
 HEIGHT: Final = 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
@@ -81,11 +80,11 @@ class Drawing:
 
 
 def load(store: Store) -> Measured | None:
-    """The chart that was published last; None where there is none that can be read. Their names begin with the date."""
-    keys = [entry.key for entry in store.list(FOLDER) if entry.key.endswith(".json")]
+    """The chart that was published last; None where there is none that can be read."""
     try:
-        return Measured.model_validate_json(store.get(max(keys))) if keys else None
-    except (NotFoundError, ValidationError):
+        latest = published.latest(store)
+        return None if latest is None else Measured.model_validate(latest)
+    except ValueError:
         return None
 
 
