@@ -10,13 +10,14 @@ repeated, and how far the estimate was off.
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -103,6 +104,28 @@ class Run:
         return found
 
 
+@dataclass
+class Kept:
+    """What a run that is gone on with later must know of its beginning."""
+
+    estimate_s: float = 0.0
+    killed_at: float = 0.0
+    up_again_s: float = 0.0
+    seconds: float = 0.0
+    shards: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """Those in the store when all was killed."""
+
+    @classmethod
+    def load(cls, file: Path) -> Kept:
+        if not file.is_file():
+            return cls()
+        stored = json.loads(file.read_text())
+        return cls(**stored | {"shards": {name: tuple(made) for name, made in stored["shards"].items()}})
+
+    def save(self, file: Path) -> None:
+        file.write_text(json.dumps(asdict(self)))
+
+
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with hands/ and objects/.")],
     data_dir: Annotated[Path, typer.Option(help="Folder of the service and its log.")],
@@ -110,10 +133,13 @@ def main(
     grasps: Annotated[int, typer.Option(help="Valid grasps of each cell.")] = 32,
     fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
     kill_at: Annotated[float, typer.Option(help="Share of the work at which all is killed.")] = 0.33,
+    minutes: Annotated[float, typer.Option(help="Write the page after so many minutes, done or not.")] = math.inf,
 ) -> None:
-    """Run it and write the page."""
+    """Run it and write the page. What is not done after so many minutes is gone on with by the same command."""
     data_dir.mkdir(parents=True, exist_ok=True)
     run = Run(data_dir, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")})
+    kept = Kept.load(data_dir / "run.json")
+    end = time.monotonic() + 60 * minutes
     run.up()
     for name, urdf in HANDS.items():
         typer.echo(run.graspd("hands", "add", str(data / "hands" / urdf), "--name", name)["message"])
@@ -123,41 +149,43 @@ def main(
     )  # fmt: skip
     start = time.monotonic()
     estimate = run.graspd(*create)["estimate"]
-    killed_at = follow(run, until=kill_at)
-    run.kill()
-    before = run.shards()
-    down = time.monotonic()
-    ready = run.up()
-    run.graspd(*create)
-    follow(run, until=1.0)
-    seconds = time.monotonic() - start
+    kept.estimate_s = kept.estimate_s or estimate["seconds"]
+    if not kept.shards:
+        kept.killed_at = follow(run, until=kill_at, end=end)
+        run.kill()
+        kept.shards = run.shards()
+        kept.up_again_s = run.up()
+        run.graspd(*create)
+    follow(run, until=1.0, end=end)
+    kept.seconds += time.monotonic() - start
+    kept.save(data_dir / "run.json")
     after = run.shards()
     found, cells = run.datasets().dataset(DATASET), list(run.datasets().cells(DATASET))
     check = run.graspd("index", "rebuild", "--check", "--data-dir", str(data_dir / "data"))
     run.stop()
     facts = {
-        "killed at": f"{100 * killed_at:.0f} % of the tasks, {len(before)} shards in the store",
-        "up again after": f"{ready:.1f} s",
-        "shards made again": str(sum(after.get(name) != facts for name, facts in before.items())),
+        "killed at": f"{100 * kept.killed_at:.0f} % of the tasks, {len(kept.shards)} shards in the store",
+        "up again after": f"{kept.up_again_s:.1f} s",
+        "shards made again": str(sum(after.get(name) != made for name, made in kept.shards.items())),
         "differences between index and store": str(len(check["differences"])),
-        "wall time": f"{duration(seconds)}, of which {duration(time.monotonic() - down)} after the kill",
+        "wall time": duration(kept.seconds),
         "worker time": duration(found.seconds),
-        "estimate before the start": duration(estimate["seconds"]),
+        "estimate before the start": duration(kept.estimate_s),
         "size": size(found.size_bytes),
     }
     out.write_text(page(found, cells, facts, f"--grasps {grasps} --fidelity {fidelity}"))
     typer.echo(out.read_text())
 
 
-def follow(run: Run, *, until: float) -> float:
-    """Wait until a share of the tasks is done, or the dataset has ended; returns the share."""
+def follow(run: Run, *, until: float, end: float) -> float:
+    """Wait until a share of the tasks is done, the dataset has ended, or the time is over; returns the share."""
     said = 0.0
     while True:
         found = run.datasets().dataset(DATASET)
         if found.progress - said > 0.02:
             said = found.progress
             typer.echo(f"{time.strftime('%H:%M:%S')} {100 * found.progress:.0f} % {found.valid} of {found.tried}")
-        if found.state.is_final or found.tasks_done >= until * found.tasks:
+        if found.state.is_final or found.tasks_done >= until * found.tasks or time.monotonic() > end:
             return found.tasks_done / found.tasks
         time.sleep(_POLL_S)
 
@@ -188,12 +216,16 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
     lines.append(f"| **all** | {' | '.join(_sum(of_hand) for of_hand in sums)} |")
     failed = [cell for cell in cells if cell.reason]
     lines += ["", *(f"- {cell.hand} on {cell.object} failed: {cell.reason}" for cell in failed)]
+    if missing := [cell for cell in cells if not cell.state.is_final]:
+        lines += ["", f"{len(missing)} of {len(cells)} cells were still to be done when this page was written."]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _cell(cell: CellView) -> str:
     if cell.reason:
         return "failed"
+    if not cell.grasps:
+        return ""
     each = f"{cell.seconds / cell.valid:.2f} s" if cell.valid else "-"
     return f"{cell.valid}/{cell.asked}, {100 * (cell.valid_yield or 0):.0f} %, {each}"
 
