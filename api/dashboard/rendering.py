@@ -37,8 +37,15 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """A page. `page` marks the place in the navigation, `events` the stream that moves it."""
-    context = {"page": "", "events": "", "refresh_s": 0, "health": request.app.state.catalog.health()} | context
+    """A page. `page` marks the place in the navigation, `events` the stream that moves it, `poll_s`
+    how often it looks again where no stream tells."""
+    context = {
+        "page": "",
+        "events": "",
+        "refresh_s": 0,
+        "poll_s": 0,
+        "health": request.app.state.catalog.health(),
+    } | context
     context |= {"navigation": NAVIGATION, "version": PACKAGE_VERSION, "signed_in": not request.app.state.keys.is_open}
     text = request.app.state.templates.get_template(template).render(context)
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})

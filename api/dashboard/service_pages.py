@@ -23,6 +23,8 @@ PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
 _MINUTES: Final = 60
 _DATASETS: Final = 6
+#: A chart takes minutes to measure, and nothing tells when it is published.
+_CHART_S: Final = 10
 
 router = APIRouter(include_in_schema=False)
 
@@ -83,6 +85,7 @@ def chart_page(request: Request, catalog: CatalogOf, y: str = "gsr", hand: str =
         request,
         "chart.html",
         page="/chart",
+        poll_s=_CHART_S,
         measured=measured,
         chart=tradeoff.draw(measured, axis=axis, hand=hand, object=object) if measured else None,
         axes=tradeoff.AXES,

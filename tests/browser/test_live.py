@@ -110,6 +110,13 @@ def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, parts: Parts) -> Non
     assert page.locator("#found tbody tr").count() == count
 
 
+def test_a_chart_that_is_published_appears(page: Any, parts: Parts) -> None:
+    page.goto("/chart")
+    page.wait_for_selector("text=Nothing is measured yet")
+    parts.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    page.wait_for_selector(".trade circle", timeout=2 * LIVE_MS)
+
+
 def test_no_page_scrolls_sideways(page: Any, places: list[str]) -> None:
     for width in (390, 768, 1440):
         page.set_viewport_size({"width": width, "height": 800})

@@ -82,4 +82,6 @@
   setInterval(() => sayTimes(document), 15000);
   document.addEventListener("htmx:after:swap", () => sayTimes(document));
   if (document.body.dataset.events) watch();
+  const poll = Number(document.body.dataset.poll);
+  if (poll) setInterval(() => { if (!document.hidden) refresh().catch(() => {}); }, 1000 * poll);
 })();
