@@ -21,6 +21,7 @@ from typing import Any, Final
 
 import httpx
 
+import worker.main
 from service import names, pipeline
 from service.domain import Lane, State
 from service.index.index import Index
@@ -31,7 +32,7 @@ from service.records import JobRecord, read_record
 from service.settings import Settings
 from service.store import open_store
 from service.supervisor import Supervisor
-from tests.fakes import add_assets, make_shard, request
+from tests.fakes import add_assets, fake_stages, make_shard, request
 
 #: A batch of 32 grasps takes at least this long on two cores (docs/performance.md) [s].
 BATCH_S: Final = 1.0
@@ -77,13 +78,26 @@ def run(parts: Parts, batches: int, seed: int) -> float:
 
 
 def queue() -> None:
-    """Seconds a task costs beyond its work: queue, lease, shard, manifest, events."""
-    with service(workers=1) as parts:
-        run(parts, 20, 0)
-        seconds = [run(parts, 200, seed) / 200 for seed in range(1, 4)]
-    each = statistics.median(seconds)
-    share = each / BATCH_S
-    say(f"| a task without work | {1000 * each:.1f} ms | {share:.1%} of a batch of {BATCH_S:g} s |")
+    """What a task costs beyond its work: the queue alone, then with its shard, manifest and place in the index."""
+    spent: list[float] = []
+
+    class Timed(worker.main.Runner):
+        def run(self, *args: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return super().run(*args)
+            finally:
+                spent.append(time.perf_counter() - start)
+
+    with service(workers=0) as parts:
+        pipeline.submit(parts, request(grasps=32 * 500), lane=Lane.BULK)
+        worker.main.Runner = Timed  # type: ignore[misc]
+        start = time.perf_counter()
+        worker.main.run_worker(parts.settings, table=fake_stages(), max_tasks=400)
+        whole = (time.perf_counter() - start) / len(spent)
+    alone = whole - statistics.fmean(spent)
+    say(f"| queue, lease and events | {1000 * alone:.1f} ms | {alone / BATCH_S:.1%} of a batch of {BATCH_S:g} s |")
+    say(f"| with shard, manifest, index | {1000 * whole:.1f} ms | {whole / BATCH_S:.1%} |")
 
 
 def workers() -> None:

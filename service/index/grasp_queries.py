@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any, Literal
 
-from sqlalchemy import func, select, tuple_
+from sqlalchemy import select, tuple_
 
 from service.errors import NotFoundError
 from service.index import cursors
 from service.index.database import Database
 from service.index.filters import GraspFilter, GraspSort
-from service.index.grasp_search import search, sql_conditions
+from service.index.grasp_search import count, search
 from service.index.tables import grasps, shards, tasks
 from service.index.views import GraspView, Page, ShardView
 
@@ -50,7 +50,7 @@ class GraspQueries(Database):
     def grasp_count(self, where: GraspFilter | None = None) -> int:
         """Number of grasps that match."""
         with self.reading() as connection:
-            return int(connection.scalar(select(func.count()).select_from(grasps).where(*sql_conditions(where))) or 0)
+            return count(connection, where or GraspFilter())
 
     def shards(
         self,

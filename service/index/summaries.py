@@ -93,7 +93,8 @@ class Summaries(Database):
             sampled = [] if share == 1.0 else [grasps.c.shard_id < f"{round(share * 16**8):08x}"]
             tests = [c.sql(["shard", "job"]) for c in conditions(where)]
             query = select(*(grasps.c[metric] for metric in metrics)).where(*tests, *sampled)
-            values = np.array(connection.execute(query).all(), float).reshape(-1, len(metrics))
+            rows = [tuple(row) for row in connection.execute(query)]
+        values = np.array(rows, float).reshape(-1, len(metrics))
         found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
         return Distributions(len(values), share, {metric: data for metric, data in found.items() if data is not None})
 

@@ -495,3 +495,15 @@ def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server:
     with pytest.raises(InputError, match="cannot hold"), index.writing() as connection:
         connection.execute(tables.workers.insert().values(name="x" * 999))
     index.close()
+
+
+@pytest.mark.parametrize("where", [
+    {}, {"valid": True}, {"valid": False, "hand": "gripper"}, {"object": "cube"}, {"success": True},
+    {"valid": True, "at_least": {"epsilon": 0.5}}, {"hand": "gripper", "at_most": {"epsilon": 0.9, "wrench_volume": 0.3}},
+])  # fmt: skip
+def test_grasps_are_counted_as_they_are_listed(parts: Parts, where: dict[str, object]) -> None:
+    job, _ = pipeline.submit(parts, request(grasps=96))
+    run_all(parts, job.id)
+    for place in ({}, {"job": job.id}, {"shard": parts.index.shards().items[0].id}):
+        some = GraspFilter(**where, **place)  # type: ignore[arg-type]
+        assert parts.index.grasp_count(some) == len(parts.index.grasps(some, limit=200).items)
