@@ -1,0 +1,1 @@
+"""What graspd leaves out, priced: what modelling it would cost and what it would change (docs/modelling.md)."""

@@ -1,0 +1,68 @@
+"""Measure what graspd leaves out: what it would cost and what it would change. Prints Markdown.
+
+usage: python -m benchmarks.modelling [--data DATA_DIR] [--out DIR] [--only STUDY ...] [--grasps N]
+DATA_DIR holds hands/ and objects/ (YCB); without it the built-in hand and objects are taken. `--out` keeps the numbers
+in DIR/modelling.json, study by study: a stopped run goes on with `--only`. Costs are ratios of CPU time within a run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.modelling import drops, motion, pictures, shape
+from benchmarks.modelling.common import Subject, hand_of, object_of
+from benchmarks.modelling.tables import tables
+
+OBJECTS = ("006_mustard_bottle", "011_banana", "025_mug", "035_power_drill")
+DROPPED = ("025_mug", "024_bowl", "011_banana")
+SHAPED = ("025_mug", "011_banana")
+PICTURED = "025_mug"
+BUILT_IN = ("mug", "bottle", "block")
+#: The studies, and grasps of each object (drops of each, for `drops`): as many as a few minutes of one core allow.
+STUDIES = {"motion": 32, "shape": 24, "drops": 32, "pictures": 0}
+
+
+def studies(data: Path | None, count: dict[str, int]) -> dict[str, Callable[[], dict[str, Any]]]:
+    """The studies by name, each run when called; they share the plain grasps of the subjects."""
+    hand = hand_of(data)
+    names = OBJECTS if data else BUILT_IN
+    subjects = [Subject(hand, object_of(data, name), count["motion"]) for name in names]
+    dropped = DROPPED if data else BUILT_IN
+    shaped = list(SHAPED if data else BUILT_IN[:2])
+    return {
+        "motion": lambda: motion.study(subjects),
+        "shape": lambda: shape.study(data, shaped, count["shape"]),
+        "drops": lambda: drops.study(subjects, lambda: [object_of(data, name) for name in dropped], count["drops"]),
+        "pictures": lambda: pictures.study(data, PICTURED if data else BUILT_IN[0]),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the studies, keep their numbers, print their tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder with hands/ and objects/; by default what is built in")
+    parser.add_argument("--out", type=Path, help="folder for modelling.json")
+    parser.add_argument("--only", nargs="+", choices=STUDIES, default=list(STUDIES))
+    parser.add_argument("--grasps", type=int, help="grasps of each object, and drops, instead of each study's own")
+    args = parser.parse_args(arguments)
+    file = args.out / "modelling.json" if args.out else None
+    found = json.loads(file.read_text()) if file and file.is_file() else {}
+    count = {name: args.grasps or own for name, own in STUDIES.items()}
+    for name, study in studies(args.data, count).items():
+        if name not in args.only:
+            continue
+        found[name] = study()
+        if file:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
+    for title, text in tables(found).items():
+        sys.stdout.write(f"{title}\n\n{text}\n\n")
+
+
+if __name__ == "__main__":
+    main()

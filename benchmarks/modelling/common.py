@@ -1,0 +1,121 @@
+"""What the studies share: subjects with grasps and verdicts' terms, CPU clock, rates with intervals, ranking power."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest, rankdata
+
+from service.domain import FIDELITIES
+from worker.grasps import GraspSet
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.model import Scene
+from worker.quality.referee.protocol import Test
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Row = dict[str, Any]
+
+#: Not a seed that any setting was chosen with.
+SEED = 9109
+ALLEGRO = "hands/allegro/allegro_hand_right.urdf"
+#: One descent a grasp, nothing chosen: about half of them hold, so that a predictor has both kinds to tell apart.
+PLAIN = FIDELITIES["standard"].model_copy(update={"starts": 1, "finalists": 1})
+
+
+@dataclass
+class Spent:
+    """CPU seconds of a block: neighbours on the machine move them less than wall time."""
+
+    seconds: float = 0.0
+
+
+@contextmanager
+def cpu() -> Iterator[Spent]:
+    """Clock of this process's CPU time, all threads."""
+    spent, began = Spent(), time.process_time()
+    yield spent
+    spent.seconds = time.process_time() - began
+
+
+@dataclass
+class Subject:
+    """A hand and an object with plain grasps of it."""
+
+    hand: HandModel
+    obj: ObjectModel
+    count: int
+
+    @cached_property
+    def grasps(self) -> GraspSet:
+        return synthesize(self.hand, self.obj, count=self.count, fidelity=PLAIN, seed=SEED, threads=1)
+
+    @cached_property
+    def pieces(self) -> ConvexPieces:
+        return decompose(self.obj)
+
+
+def hand_of(data: Path | None) -> HandModel:
+    """The Allegro of the data folder, or the built-in one."""
+    return hand_from_path("allegro" if data is None else data / ALLEGRO)
+
+
+def object_of(data: Path | None, name: str, face_error_m: float = FIDELITIES["standard"].face_error_m) -> ObjectModel:
+    """A YCB object of the data folder, or a built-in one."""
+    return object_from_path(name if data is None else data / "objects" / name / "clean.stl", face_error_m=face_error_m)
+
+
+def verdicts(scene: Scene, grasps: GraspSet) -> Bools:
+    """(N,) whether each grasp holds, by the certificate in any physics; one thread."""
+    test = Test(scene)
+    return np.array([test.certificate(grasps, row).success for row in range(len(grasps))], bool)
+
+
+def share(good: int, total: int) -> Row:
+    """A rate with its 95 % interval (Wilson)."""
+    bounds = binomtest(int(good), total).proportion_ci(method="wilson")
+    return {"value": good / total, "low": float(bounds.low), "high": float(bounds.high), "n": total}
+
+
+def mean(values: Floats) -> Row:
+    """A mean with its 95 % interval (normal)."""
+    half = 1.96 * float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    middle = float(np.mean(values))
+    return {"value": middle, "low": middle - half, "high": middle + half, "n": len(values)}
+
+
+def auc(score: Floats, held: Bools) -> float:
+    """Chance that a grasp that holds scores higher than one that does not (Mann-Whitney); 0.5 is a coin."""
+    good, bad = int(held.sum()), int((~held).sum())
+    if not good or not bad:
+        return float("nan")
+    return float((rankdata(score)[held].sum() - good * (good + 1) / 2) / (good * bad))
+
+
+def ranking(scores: list[Floats], held: list[Bools], draws: int = 400) -> Row:
+    """Mean AUC over objects with a 95 % bootstrap interval over grasps; objects where all grasps end alike say nothing.
+
+    Ranked within each object, as the planner does: between objects the scales differ.
+    """
+    pairs = [(s, h) for s, h in zip(scores, held, strict=True) if 0 < h.sum() < len(h)]
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(draws):
+        rows = [rng.integers(len(h), size=len(h)) for _, h in pairs]
+        found.append(np.nanmean([auc(s[r], h[r]) for (s, h), r in zip(pairs, rows, strict=True)]))
+    low, high = np.percentile(found, [2.5, 97.5])
+    value = float(np.mean([auc(s, h) for s, h in pairs]))
+    return {"value": value, "low": float(low), "high": float(high), "n": sum(len(h) for _, h in pairs)}

@@ -1,0 +1,124 @@
+"""Drops with the hull against drops with convex pieces; and what an arm behind the hand would forbid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from benchmarks.modelling.common import SEED, Floats, Row, Subject, cpu, share
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.scenes import simulate
+from worker.scenes.clearance import transfer
+from worker.scenes.rest import RestingFaces, same_face
+from worker.transforms import compose, quat_rotate
+
+#: A forearm: a straight round rod that begins at the palm and points away from the fingers [m].
+FOREARM_RADIUS_M, FOREARM_M = 0.04, 0.3
+
+
+def drops(objects: list[ObjectModel], count: int) -> list[Row]:
+    """The same releases with either collision model: shares of resting faces, and CPU time of the pieces' over the
+    hull's."""
+    rows = []
+    for obj in objects:
+        pieces = decompose(obj)
+        hull = simulate._build(obj)
+        model = _in_pieces(obj, pieces, hull.model)
+        tables = {"hull": hull, "pieces": replace(hull, model=model, data=mujoco.MjData(model))}
+        rests, seconds = {}, {}
+        for name, table in tables.items():
+            with cpu() as clock:
+                rests[name] = [simulate._redo_until_rest(table, obj.name, (SEED, k)) for k in range(count)]
+            seconds[name] = clock.seconds
+        faces = {name: np.array([rest.face for rest in found]) for name, found in rests.items()}
+        again = np.array([simulate._redo_until_rest(hull, obj.name, (SEED + 1, k)).face for k in range(count)])
+        rows.append(
+            {
+                "object": obj.name,
+                "pieces": len(pieces),
+                "drops": count,
+                "same_face": share(
+                    int(sum(_same(hull.faces, a, b) for a, b in zip(faces["hull"], faces["pieces"], strict=True))),
+                    count,
+                ),
+                "distance": _distance(hull.faces, faces["hull"], faces["pieces"]),
+                "distance_of_two_seeds": _distance(hull.faces, faces["hull"], again),
+                "cost_ratio": seconds["pieces"] / seconds["hull"],
+            }
+        )
+    return rows
+
+
+def _in_pieces(obj: ObjectModel, pieces: ConvexPieces, hull: Any) -> Any:
+    """The scene of a drop with the object's pieces as collision shapes; masses, friction and table as in `hull`."""
+    spec = mujoco.MjSpec.from_string(simulate._SCENE.format(timestep=simulate.TIMESTEP_S))
+    body = spec.body("object")
+    spec.delete(spec.body("object").geoms[0])
+    spec.delete(spec.mesh("hull"))
+    for i, corners in enumerate(pieces.vertices):
+        mesh = spec.add_mesh(name=f"piece{i}")
+        mesh.uservert = np.asarray(corners, np.float32).ravel()
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        geom = body.add_geom(condim=6, friction=[0.8, 0.005, 0.002], solref=[0.006, 1.0])
+        geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"piece{i}"
+        # The table alone is touched: pieces of one body never touch each other.
+    mass = simulate.DENSITY * obj.volume
+    body.explicitinertial = True
+    body.mass, body.ipos = mass, obj.centre_of_mass
+    inertia = mass * obj.inertia
+    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    model = spec.compile()
+    assert np.isclose(model.body_mass[1], hull.body_mass[1])
+    return model
+
+
+def _same(faces: RestingFaces, a: int, b: int) -> bool:
+    return bool(same_face(faces, int(a), np.array([b]))[0])
+
+
+def _distance(faces: RestingFaces, a: Any, b: Any) -> float:
+    """Total variation of the shares of resting faces: 0 the same, 1 nothing in common."""
+    left, total = list(b), 0
+    for face in a:
+        match = next((k for k, other in enumerate(left) if _same(faces, face, other)), None)
+        if match is not None:
+            left.pop(match)
+            total += 1
+    return 1.0 - total / len(a)
+
+
+def wrist_direction(hand: HandModel) -> tuple[Floats, Floats]:
+    """Where a forearm begins and points, root frame: from the palm away from the fingers with all joints at 0."""
+    zero = np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)[None]
+    bodies = body_poses(hand, np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(zero))[0]
+    away = hand.palm.centre - bodies[list(hand.fingertips), :3].mean(axis=0)
+    return hand.palm.centre, away / np.linalg.norm(away)
+
+
+def arm(subjects: list[Subject], scenes: int) -> Row:
+    """Share of the grasps kept on a table through which a forearm would run, at contact."""
+    kept, hit, tried = 0, 0, 0
+    for s in subjects:
+        poses = simulate.drop(s.obj, count=scenes, seed=SEED)["scene/object_pose"]
+        found = transfer(s.hand, s.grasps.grasp, s.grasps.pregrasp, poses)
+        valid = np.flatnonzero(found["grasp/valid"])
+        base = s.grasps.grasp.hand_pose[found["grasp/base_index"][valid]]
+        root = compose(poses[found["grasp/scene_index"][valid]], base)
+        start, away = wrist_direction(s.hand)
+        ends = [root[:, 2] + quat_rotate(root[:, 3:], start + reach * away)[:, 2] for reach in (0.0, FOREARM_M)]
+        slope = quat_rotate(root[:, 3:], away)[:, 2] if len(root) else np.zeros(0)
+        # The lowest point of the far end's rim.
+        lowest = ends[1] - FOREARM_RADIUS_M * np.sqrt(np.maximum(0.0, 1 - slope**2)) if len(root) else np.zeros(0)
+        kept, hit, tried = kept + len(valid), hit + int((lowest < 0).sum()), tried + len(found["grasp/valid"])
+    return {"tried": tried, "kept": kept, "in_the_table": share(hit, kept) if kept else None}
+
+
+def study(subjects: list[Subject], objects: Callable[[], list[ObjectModel]], count: int) -> dict[str, Any]:
+    return {"drops": drops(objects(), count), "arm": arm(subjects, max(4, count // 4))}

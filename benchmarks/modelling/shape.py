@@ -1,0 +1,62 @@
+"""How finely the object's faces and the hand's points must be, told on the unsimplified object by other points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of, share, verdicts
+from service.domain import FIDELITIES
+from worker.planners import synthesize
+from worker.quality.penetration import penetration_depth
+from worker.quality.probe import probe_of
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.model import Physics, build
+
+STANDARD = FIDELITIES["standard"]
+SETTINGS: dict[str, dict[str, Any]] = {
+    "standard": {},
+    "all faces": {"face_error_m": 0.0},
+    "faces to 1 mm": {"face_error_m": 1e-3},
+    "faces to 3 mm": {"face_error_m": 3e-3},
+    "500 hand points": {"fine_points": 500},
+    "4000 hand points": {"fine_points": 4000},
+}
+
+
+def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
+    """Success, penetration and CPU time of a setting, the same seeds for all."""
+    hand = hand_of(data)
+    true = {name: object_of(data, name, 0.0) for name in objects}
+    scenes = {}
+    for name in objects:
+        # One judge for all settings: pieces of the standard object, whose digest is in the cache.
+        standard = object_of(data, name)
+        scenes[name] = build(hand, standard, decompose(standard), Physics())
+    rows: list[Row] = []
+    for setting, change in SETTINGS.items():
+        fidelity = STANDARD.model_copy(update=change)
+        held, depth, seconds, faces = 0, [], 0.0, []
+        for name in objects:
+            obj = object_of(data, name, fidelity.face_error_m)
+            synthesize(hand, obj, count=1, fidelity=fidelity, seed=1, threads=1)
+            with cpu() as clock:
+                found = synthesize(hand, obj, count=count, fidelity=fidelity, seed=SEED, threads=1)
+            seconds += clock.seconds
+            faces.append(len(obj.faces))
+            held += int(verdicts(scenes[name], found).sum())
+            probe = probe_of(hand, true[name], hand_points=2000, object_points=3000)
+            depth.append(1e3 * penetration_depth(probe.measure(found.grasp)))
+        rows.append(
+            {
+                "setting": setting,
+                "faces": faces,
+                "held": share(held, count * len(objects)),
+                "penetration_mm": mean(np.concatenate(depth)),
+                "seconds": seconds,
+                "cost_ratio": seconds / rows[0]["seconds"] if rows else 1.0,
+            }
+        )
+    return {"objects": objects, "settings": rows}

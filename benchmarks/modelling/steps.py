@@ -1,0 +1,93 @@
+"""Several steps of the contact simulation instead of one: the object moves on, contacts are found anew.
+
+The planner's own step (worker/simulation/kernels/contact.py, `direct`) in float64, for one grasp and one velocity at a
+time, with distances of the flat mesh. The hand stands still, as in the loss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.quality.probe import Probe
+from worker.simulation.reference import World, loss
+from worker.simulation.simulation import REFERENCE_POINTS, initial_motions
+from worker.transforms import quat_from_axis_angle, quat_to_matrix
+
+Floats = NDArray[np.float64]
+
+PASSES = 4
+VELOCITIES = 7
+
+
+def rollout(probe: Probe, grasp: Posture, world: World, steps: tuple[int, ...]) -> Floats:
+    """(N, K) L_stable of N grasps after each of K numbers of steps: the mean over the velocities of the whole motion.
+
+    The motion counts in units of what one free step is, whatever the number of steps; ranks do not depend on that.
+    """
+    weight = probe.points.area * (REFERENCE_POINTS / probe.points.area.sum())
+    hands = probe.posed_points(body_poses(probe.hand, grasp.hand_pose, grasp.joint_positions))
+    motions = initial_motions(VELOCITIES, world.step, world.gyration)
+    out = np.zeros((len(grasp), len(steps)))
+    for row, points in enumerate(hands):
+        ends = [_follow(probe, points - probe.obj.centre_of_mass, weight, s0, world, steps) for s0 in motions]
+        out[row] = np.mean(ends, axis=0)
+    return out
+
+
+def _follow(
+    probe: Probe, points: Floats, weight: Floats, motion: Floats, world: World, steps: tuple[int, ...]
+) -> list[float]:
+    """Losses after each of `steps`; the object starts at rest's pose with the free motion `motion` of one step."""
+    place, rotation, turned = np.zeros(3), np.eye(3), np.zeros(3)
+    losses = []
+    for number in range(1, max(steps) + 1):
+        local = (points - place) @ rotation
+        distance, _, normal = probe.signed_distance(local + probe.obj.centre_of_mass)
+        near = distance < 4 * world.step
+        motion = step(
+            points[near] - place, normal[near] @ rotation.T, distance[near], weight[near], motion, world,
+            rotation @ world.inertia @ rotation.T,
+        )  # fmt: skip
+        place, turned = place + motion[:3], turned + motion[3:]
+        angle = float(np.linalg.norm(motion[3:]))
+        if angle > 0:
+            rotation = quat_to_matrix(quat_from_axis_angle(motion[3:] / angle, np.array(angle))) @ rotation
+        if number in steps:
+            losses.append(loss(np.concatenate([place, turned]), world))
+    return losses
+
+
+def step(
+    points: Floats, normals: Floats, distance: Floats, weight: Floats, s0: Floats, world: World, inertia: Floats,
+    passes: int = PASSES,
+) -> Floats:  # fmt: skip
+    """(6,) motion of the object under all contacts at once: compliant, with Coulomb friction."""
+    mass = np.eye(6)
+    mass[3:, 3:] = inertia
+    rows = np.concatenate([normals, np.cross(points, normals)], axis=1)
+    # (n, 3, 6): motion of the object's material at each point.
+    at = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_skew(points)], axis=2)
+    s = s0
+    for _ in range(passes):
+        u = at @ s
+        along = np.einsum("ni,ni->n", normals, u)
+        depth = world.dilation - distance + along
+        on = depth > 0
+        k = world.stiffness * weight[on]
+        slip = np.linalg.norm(u[on] - along[on, None] * normals[on], axis=1)
+        slide = np.minimum(k, k * world.friction * depth[on] / np.maximum(slip, 1e-9))
+        j, t = rows[on], at[on]
+        a = mass + (j * (k - slide)[:, None]).T @ j + np.einsum("n,nij,nik->jk", slide, t, t, optimize=True)
+        s = np.linalg.solve(a, mass @ s0 - j.T @ (k * (world.dilation - distance[on])))
+    return s
+
+
+def _skew(points: Floats) -> Floats:
+    out = np.zeros((len(points), 3, 3))
+    x, y, z = points.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
+    return out

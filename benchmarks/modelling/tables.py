@@ -1,0 +1,97 @@
+"""The numbers of the studies as Markdown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def tables(found: dict[str, Any]) -> dict[str, str]:
+    """Title -> table, of the studies that are there."""
+    out = {}
+    if "motion" in found:
+        study = found["motion"]
+        out["engines"] = _table(
+            "model|holds|same verdict (95 %)|holds only here / only by the certificate|cost",
+            map(_engine, study["engines"]),
+        )
+        out["predictors"] = _table("model|AUC (95 %)|cost", map(_predictor, study["predictors"]))
+        out["pads"] = _table(
+            "hand surface that touches|contact area cm²|ε",
+            (
+                (f"within {r['give_mm']:g} mm", f"{r['contact_area_cm2']:.1f}", f"{r['epsilon']:.2f}")
+                for r in study["pads"]
+            ),
+        )
+    if "shape" in found:
+        out["shape"] = _table("setting|faces|success (95 %)|depth mm|cost", map(_shape, found["shape"]["settings"]))
+    if "drops" in found:
+        out["drops"] = _table(
+            "object|pieces|same face from the same release|face shares apart|of two seeds|cost",
+            map(_drop, found["drops"]["drops"]),
+        )
+    if "pictures" in found:
+        out["pictures"] = _table(
+            "picture|cost|colour off, of 255|labels changed|depth off mm", map(_rays, found["pictures"]["rays"])
+        )
+    return out
+
+
+def _table(head: str, rows: Any) -> str:
+    names = head.split("|")
+    lines = [names, ["---", *["--:"] * (len(names) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def percent(rate: Row) -> str:
+    """A rate with its interval, in percent."""
+    return f"{100 * rate['value']:.0f} % ({100 * rate['low']:.0f} to {100 * rate['high']:.0f})"
+
+
+def _engine(row: Row) -> list[str]:
+    return [
+        row["model"],
+        f"{100 * row['held']['value']:.0f} %",
+        percent(row["agreement"]),
+        f"{row['only_here']} / {row['only_certificate']}",
+        f"{row['cost_ratio']:.2f}",
+    ]
+
+
+def _predictor(row: Row) -> list[str]:
+    auc = row["auc"]
+    cost = f"{row['cost_ratio']:.3f}" if row["cost_ratio"] is not None else f"{row['steps_ratio']:g} of one step"
+    return [row["model"], f"{auc['value']:.2f} ({auc['low']:.2f} to {auc['high']:.2f})", cost]
+
+
+def _shape(row: Row) -> list[str]:
+    depth = row["penetration_mm"]
+    return [
+        row["setting"],
+        ", ".join(map(str, row["faces"])),
+        percent(row["held"]),
+        f"{depth['value']:.2f} ({depth['low']:.2f} to {depth['high']:.2f})",
+        f"{row['cost_ratio']:.2f}",
+    ]
+
+
+def _drop(row: Row) -> list[str]:
+    return [
+        row["object"],
+        str(row["pieces"]),
+        percent(row["same_face"]),
+        f"{row['distance']:.2f}",
+        f"{row['distance_of_two_seeds']:.2f}",
+        f"{row['cost_ratio']:.1f}",
+    ]
+
+
+def _rays(row: Row) -> list[str]:
+    return [
+        row["picture"],
+        f"{row['cost_ratio']:.2f}",
+        f"{row['rms_of_255']:.1f}",
+        f"{100 * row['labels_changed']:.1f} %",
+        f"{row['depth_changed_mm']:.2f}",
+    ]
