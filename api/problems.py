@@ -17,6 +17,7 @@ from starlette.routing import Match
 from service.errors import (
     BusyError,
     ConflictError,
+    DamagedError,
     GraspdError,
     HandError,
     IndexUnavailable,
@@ -44,8 +45,8 @@ ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
         InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
-        QueueUnavailable, StoreUnavailable, IndexUnavailable, RateError, BusyError, TaskError, TaskCancelled,
-        TaskRefused, GraspdError,
+        QueueUnavailable, StoreUnavailable, IndexUnavailable, RateError, BusyError, DamagedError, TaskError,
+        TaskCancelled, TaskRefused, GraspdError,
     )
 }  # fmt: skip
 

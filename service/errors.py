@@ -14,6 +14,7 @@
     │   ├── IndexUnavailable
     │   └── RateError             too many requests: exit 1, HTTP 429
     ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
+    ├── DamagedError              a record in the store is not what its name says: exit 1, HTTP 500
     └── TaskError                 a task ended without a result: exit 1, HTTP 500
         ├── TaskCancelled
         └── TaskRefused           unknown schema or function: never retried
@@ -116,6 +117,12 @@ class BusyError(GraspdError):
     """Another process owns the resource."""
 
     slug, status, title = "busy", 409, "Already in use"
+
+
+class DamagedError(GraspdError):
+    """A record in the store is not what its name says; to try again does not help."""
+
+    slug, title = "damaged", "A record in the store is damaged"
 
 
 class TaskError(GraspdError):

@@ -11,6 +11,7 @@ from typing import Final
 from service import names
 from service.clock import timestamp
 from service.domain import AssetKind, IngestMessage, Stage, TaskMessage
+from service.errors import DamagedError
 from service.indexer import Indexer
 from service.manifests import shard_exists
 from service.parts import Parts
@@ -72,7 +73,7 @@ class Reaper:
         again = []
         for task, (stage, shard) in self._parts.index.outputs(missing).items():
             if shard_exists(self._parts.store, Stage(stage), shard):
-                self._indexer.finished(Stage(stage), shard)
+                self._find(task, Stage(stage), shard)
                 continue
             known = self._parts.index.task(task).attempt
             recorded = [a for a in task_attempts(self._parts.store, task) if a.number >= known]
@@ -83,6 +84,26 @@ class Reaper:
         if again:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
             self._indexer.tell(self._parts.index.set_waiting(again))
+
+    def _find(self, task_id: str, stage: Stage, shard: str) -> None:
+        """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again."""
+        try:
+            self._indexer.finished(stage, shard)
+        except DamagedError as error:
+            task = self._parts.index.task(task_id)
+            attempt = AttemptRecord(
+                task_id=task_id,
+                job_id=task.job_id,
+                stage=stage,
+                number=task.attempt,
+                kind=type(error).__name__,
+                reason=str(error),
+                worker="keeper",
+                ended=timestamp(),
+                last=True,
+            )
+            put_record(self._parts.store, names.attempt(task_id, attempt.number), attempt)
+            self._indexer.failed(attempt)
 
     def _recover_check(self, kind: AssetKind, digest: str) -> None:
         if self._parts.store.exists(names.asset_check(kind, digest)):
@@ -102,7 +123,7 @@ class Reaper:
 
     def _lose_task(self, lease: Lease, message: TaskMessage) -> None:
         if shard_exists(self._parts.store, message.stage, message.output):
-            self._indexer.finished(message.stage, message.output)
+            self._find(message.task_id, message.stage, message.output)
             return
         attempt = AttemptRecord(
             task_id=message.task_id,

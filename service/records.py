@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from service import names
 from service.clock import timestamp
 from service.domain import Digest, JobRequest, Lane, Origin, Stage
-from service.errors import StoreUnavailable
+from service.errors import DamagedError
 from service.store import Store
 from service.version import STAGE_REVISIONS
 
@@ -73,7 +73,7 @@ class AttemptRecord(Record):
 
 
 def read_record(model: type[RecordT], store: Store, key: str) -> RecordT:
-    """A record by its key; NotFoundError if there is none, StoreUnavailable if it is not what its name says."""
+    """A record by its key; NotFoundError if there is none, DamagedError if it is not what its name says."""
     return parse_record(model, store.get(key), key)
 
 
@@ -83,7 +83,10 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
         return model.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
-        raise StoreUnavailable(f"the record {key} in the store is damaged: {first['loc']}: {first['msg']}") from None
+        raise DamagedError(
+            f"the record {key} in the store is damaged ({first['loc']}: {first['msg']}); put a copy in its place, or "
+            "remove it and retry its job"
+        ) from None
 
 
 def put_record(store: Store, key: str, record: BaseModel) -> bool:

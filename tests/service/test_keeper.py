@@ -274,6 +274,23 @@ def test_a_lost_failure_event_is_made_good_from_the_store(bench: Bench) -> None:
     assert [a.number for a in bench.parts.index.attempts(job=job.id)] == [1]
 
 
+def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> None:
+    bad, _ = pipeline.submit(bench.parts, request(seed=1))
+    delivery = bench.take()
+    assert isinstance(delivery.message, TaskMessage)
+    key = names.shard_manifest(delivery.message.stage, delivery.message.output)
+    bench.parts.store.put(key, b'{"version": 1, "shard_id": torn')
+    bench.do(delivery)
+    good, _ = pipeline.submit(bench.parts, request(seed=2))
+    bench.work_off()
+    bench.pass_time(LOST_AFTER_S + 2)
+    assert bench.parts.index.job(good.id).state is State.SUCCEEDED
+    failed = bench.parts.index.job(bad.id)
+    assert failed.state is State.FAILED
+    assert key in (failed.reason or "")
+    assert "remove it and retry its job" in (failed.reason or "")
+
+
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
     pipeline.submit(bench.parts, request())
     delivery = bench.take()
