@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,8 @@ def hand_of(data: Path | None) -> HandModel:
 
 def object_of(data: Path | None, name: str, face_error_m: float = FIDELITIES["standard"].face_error_m) -> ObjectModel:
     """A YCB object of the data folder, or a built-in one."""
-    return object_from_path(name if data is None else data / "objects" / name / "clean.stl", face_error_m=face_error_m)
+    found = object_from_path(name if data is None else data / "objects" / name / "clean.stl", face_error_m=face_error_m)
+    return replace(found, name=name)
 
 
 def verdicts(scene: Scene, grasps: GraspSet) -> Bools:

@@ -98,13 +98,14 @@ def wrist_direction(hand: HandModel) -> tuple[Floats, Floats]:
     """Where a forearm begins and points, root frame: from the palm away from the fingers with all joints at 0."""
     zero = np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)[None]
     bodies = body_poses(hand, np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(zero))[0]
-    away = hand.palm.centre - bodies[list(hand.fingertips), :3].mean(axis=0)
+    # The median: a thumb that stands aside does not turn the arm.
+    away = hand.palm.centre - np.median(bodies[list(hand.fingertips), :3], axis=0)
     return hand.palm.centre, away / np.linalg.norm(away)
 
 
 def arm(subjects: list[Subject], scenes: int) -> Row:
     """Share of the grasps kept on a table through which a forearm would run, at contact."""
-    kept, hit, tried = 0, 0, 0
+    kept, hit, down, tried = 0, 0, 0, 0
     for s in subjects:
         poses = simulate.drop(s.obj, count=scenes, seed=SEED)["scene/object_pose"]
         found = transfer(s.hand, s.grasps.grasp, s.grasps.pregrasp, poses)
@@ -116,9 +117,12 @@ def arm(subjects: list[Subject], scenes: int) -> Row:
         slope = quat_rotate(root[:, 3:], away)[:, 2] if len(root) else np.zeros(0)
         # The lowest point of the far end's rim.
         lowest = ends[1] - FOREARM_RADIUS_M * np.sqrt(np.maximum(0.0, 1 - slope**2)) if len(root) else np.zeros(0)
-        kept, hit, tried = kept + len(valid), hit + int((lowest < 0).sum()), tried + len(found["grasp/valid"])
-    return {"tried": tried, "kept": kept, "in_the_table": share(hit, kept) if kept else None}
+        kept, tried = kept + len(valid), tried + len(found["grasp/valid"])
+        hit, down = hit + int((lowest < 0).sum()), down + int((slope < 0).sum())
+    if not kept:
+        return {"tried": tried, "kept": 0}
+    return {"tried": tried, "kept": kept, "in_the_table": share(hit, kept), "downward": share(down, kept)}
 
 
 def study(subjects: list[Subject], objects: Callable[[], list[ObjectModel]], count: int) -> dict[str, Any]:
-    return {"drops": drops(objects(), count), "arm": arm(subjects, max(4, count // 4))}
+    return {"drops": drops(objects(), count), "arm": arm(subjects, count // 2)}

@@ -61,7 +61,8 @@ def _engine(row: Row) -> list[str]:
 
 def _predictor(row: Row) -> list[str]:
     auc = row["auc"]
-    cost = f"{row['cost_ratio']:.3f}" if row["cost_ratio"] is not None else f"{row['steps_ratio']:g} of one step"
+    steps = row.get("steps_ratio")
+    cost = f"{row['cost_ratio']:.3f} of a verdict" if steps is None else f"{steps:g} × the planner's step"
     return [row["model"], f"{auc['value']:.2f} ({auc['low']:.2f} to {auc['high']:.2f})", cost]
 
 
