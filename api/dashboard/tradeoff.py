@@ -15,6 +15,8 @@ from service.store import Store
 WIDTH: Final = 860
 HEIGHT: Final = 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
+#: Room of the longest label.
+_LABEL: Final = 190
 #: Accuracies to choose from: label, unit, whether more is better, factor from the stored number.
 AXES: Final[dict[str, tuple[str, str, bool, float]]] = {
     "gsr": ("Success in MuJoCo", "%", True, 100.0),
@@ -64,6 +66,11 @@ class Point:
     y: float = 0.0
     label_y: float = 0.0
     series: int = 0
+
+    @property
+    def is_right(self) -> bool:
+        """Whether a label to the right of the point would leave the chart."""
+        return self.x > WIDTH - _LABEL
 
 
 @dataclass(frozen=True)

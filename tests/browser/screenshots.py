@@ -53,6 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data-dir", type=Path)
     parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "images")
+    parser.add_argument("--only", default="", help="names of pictures, with commas between")
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
         wanted = Settings(data_dir=given.data_dir or Path(scratch), port=0)
@@ -61,8 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with httpx.Client(base_url=supervisor.api_url, trust_env=False, timeout=60) as client:
                 places = work(client, supervisor)
                 given.out.mkdir(parents=True, exist_ok=True)
-                photograph(supervisor.api_url, places, given.out)
-                client.post(f"/v1/jobs/{places['running']}/cancel")
+                try:
+                    photograph(supervisor.api_url, places, given.out, set(filter(None, given.only.split(","))))
+                finally:
+                    client.post(f"/v1/jobs/{places['running']}/cancel")
     return 0
 
 
@@ -96,7 +99,7 @@ def until(met: Any, what: str) -> None:
         time.sleep(1.0)
 
 
-def photograph(address: str, places: dict[str, str], folder: Path) -> None:
+def photograph(address: str, places: dict[str, str], folder: Path, only: set[str]) -> None:
     """Every page; a full page where its end is worth seeing."""
     from playwright.sync_api import sync_playwright
 
@@ -120,6 +123,8 @@ def photograph(address: str, places: dict[str, str], folder: Path) -> None:
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=list(ARGUMENTS))
         for name, path, ready, (width, height), scheme, whole in pictures:
+            if only and name not in only:
+                continue
             context: Any = browser.new_context(
                 base_url=address, viewport={"width": width, "height": height}, color_scheme=scheme,
                 device_scale_factor=2 if width < 500 else 1, reduced_motion="reduce",
