@@ -17,6 +17,7 @@ from service.store import open_store
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.studies.chart.commands import app
+from worker.studies.chart.report import markdown
 from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
 from worker.studies.chart.sweeps import Turn, _asking, _run, turns
@@ -130,6 +131,15 @@ def test_a_method_that_makes_nothing_valid_is_on_no_front() -> None:
     assert able["front"] == ["gsr", "epsilon", "pd_mm"]
     assert unable["front"] == []
     assert unable["seconds_to_first_valid"] is None
+
+
+def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
+    """10 valid/s against 0 of 10 at 100 grasps/s: at most 3 of 10 hold, so at least a third of a time more."""
+    rows = summed([run_of("fast_graspd", 10, 1.0, 0.5), run_of("graspit", 0, 0.1, 0.0)])
+    assert "> × 0.333 (0 of 10 valid)" in markdown(
+        {"summary": rows, "runs": [], "created": "", "device": "", "threads": 2, "versions": {"graspd": "", "warp": ""},
+         "referee": {"level": ""}, "friction": 1.0, "threshold_m": 0.005}
+    )  # fmt: skip
 
 
 def test_each_knob_has_the_default_among_its_values_once() -> None:

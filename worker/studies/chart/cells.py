@@ -80,7 +80,11 @@ class Cell:
     setting: Setting
     hand: HandModel
     obj: ObjectModel
+    """As the planner sees it."""
+    true: ObjectModel
+    """As metrics and referee see it: the same for all settings."""
     pieces: ConvexPieces
+    """Of `true`."""
     seconds: list[float] = field(default_factory=list)
     success: list[NDArray[np.int8]] = field(default_factory=list)
     columns: list[dict[str, Floats]] = field(default_factory=list)
@@ -100,9 +104,9 @@ class Cell:
         found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds))
         self.seconds.append(time.perf_counter() - began)
         table = measure(
-            self.hand, self.obj, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], threads=threads
+            self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], threads=threads
         )  # fmt: skip
-        verdicts = judge(self.hand, self.obj, found, pieces=self.pieces, threads=threads)
+        verdicts = judge(self.hand, self.true, found, pieces=self.pieces, threads=threads)
         self.success.append(verdicts.success)
         self.columns.append({key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()})
         self.postures.append(found.grasp)
@@ -133,7 +137,7 @@ class Cell:
             for name in ("hand_pose", "joint_positions")
         )
         slip = simulated_displacement_cm(
-            self.hand, self.obj, Posture(pose, joints), pieces=self.pieces, threads=self.setting.threads
+            self.hand, self.true, Posture(pose, joints), pieces=self.pieces, threads=self.setting.threads
         )
         names = ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume")
         row = {name: float(np.nanmean(self.values(name)[order])) for name in names}

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import warp as wp
 
 from service.clock import timestamp
+from service.domain import FIDELITIES
 from service.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -19,6 +20,9 @@ from worker.studies.chart.cells import FRICTION, THRESHOLD_M, Cell, Setting
 from worker.studies.chart.statistics import figures, plain, summed
 
 Say = Callable[[str], None]
+
+#: Error bound of the object that all settings are measured and judged on [m]: what a coarser mesh costs is seen.
+TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,9 @@ def chart(
     runs: list[dict[str, Any]] = []
     for thing in things:
         for hand in hands:
-            cells = [_cell(setting, hand, thing) for setting in settings]
+            true = thing.load(TRUE_ERROR_M)
+            pieces = decompose(true)
+            cells = [Cell(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
             for cell in cells:
                 cell.warm_up()
             for _ in range(repeats):
@@ -75,11 +81,6 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> dict
         "runs": list(runs),
         "summary": summed(runs),
     }
-
-
-def _cell(setting: Setting, hand: HandModel, thing: Thing) -> Cell:
-    obj = thing.load(setting.knobs.face_error_m)
-    return Cell(setting, hand, obj, decompose(obj))
 
 
 def _row(cell: Cell, hand: HandModel, thing: Thing) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from worker.quality.referee.decomposition import decompose
 from worker.simulation.simulation import LossOptions, Simulation
 from worker.studies.chart import kernels
 from worker.studies.chart.cells import Cell, Setting
-from worker.studies.chart.chart import Thing
+from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import figures, plain
 
 Say = Callable[[str], None]
@@ -125,10 +125,14 @@ def sweep(
     """
     wp.load_module(module=kernels, device=device)
     default = Turn("", "default")
+    true = thing.load(TRUE_ERROR_M)
+    pieces = decompose(true)
     cells: dict[tuple[str, str], Cell] = {}
     for turn in [default, *turns(quick)]:
         if turn is default or not turn.default:
-            cells[turn.knob, turn.value] = _cell(turn, hand, thing, batch, threads, device)
+            cells[turn.knob, turn.value] = Cell(
+                _setting(turn, batch, threads, device), hand, thing.load(turn.fidelity.face_error_m), true, pieces
+            )
     for cell in cells.values():
         cell.warm_up()
     for _ in range(repeats):
@@ -147,11 +151,9 @@ def sweep(
     return rows
 
 
-def _cell(turn: Turn, hand: HandModel, thing: Thing, batch: int, threads: int, device: str) -> Cell:
-    obj = thing.load(turn.fidelity.face_error_m)
+def _setting(turn: Turn, batch: int, threads: int, device: str) -> Setting:
     run = partial(_run, turn=turn, threads=threads, device=device)
-    setting = Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, threads=threads, device=device, run=run)
-    return Cell(setting, hand, obj, decompose(obj))
+    return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, threads=threads, device=device, run=run)
 
 
 def _run(
