@@ -77,7 +77,7 @@ class KeyFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._stamp: tuple[int, int] | None = None
+        self._stamp: tuple[int, ...] | None = None
         self._document = _Document(session_secret="")
 
     def list(self) -> list[Key]:
@@ -196,7 +196,8 @@ class KeyFile:
             status = self.path.stat()
         except FileNotFoundError:
             return _Document(session_secret="")
-        stamp = (status.st_mtime_ns, status.st_ino)
+        # The clock of a file system ticks slowly, and numbers of files are used again: the size tells two changes apart.
+        stamp = (status.st_mtime_ns, status.st_ino, status.st_size)
         if stamp != self._stamp:
             try:
                 self._document = _Document.model_validate_json(self.path.read_bytes())
