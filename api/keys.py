@@ -196,7 +196,7 @@ class KeyFile:
             status = self.path.stat()
         except FileNotFoundError:
             return _Document(session_secret="")
-        # The clock of a file system ticks slowly, and numbers of files are used again: the size tells two changes apart.
+        # File clocks tick slowly and file numbers are used again: the size tells two quick changes apart.
         stamp = (status.st_mtime_ns, status.st_ino, status.st_size)
         if stamp != self._stamp:
             try:
