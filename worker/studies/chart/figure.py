@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from worker.studies.chart.statistics import most_valid
+
 Row = Mapping[str, Any]
 
 #: Title, key, whether more is better.
@@ -36,7 +38,7 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
     last.set_xlabel("seconds to the first valid grasp (less is better)")
     last.set_title("Success in MuJoCo", loc="left", fontsize=11)
     for axes in (panels.flat[0], last):
-        axes.set_ylim(-0.02, 1.04)
+        axes.set_ylim(-0.07, 1.04)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     for file in files:
         figure.savefig(file, dpi=150)
@@ -52,19 +54,26 @@ def _panel(axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]]
     shown: set[str] = set()
     labels = []
     for row in rows:
-        if not row[x]:
-            continue  # without one valid grasp there is no place on a logarithmic axis
         colour, marker = styles[row["method"]]
-        bars = {f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row}
+        # None valid: at the most there can be, hollow, with an arrow to where it may lie.
+        none = x == "valid_per_second" and not row[x]
+        at = most_valid(row) if none else row[x]
+        bars: dict[str, Any] = {
+            f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
+        }
+        if none:
+            bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
         axes.errorbar(
-            row[x], row[y], **bars, fmt=marker, color=colour, ecolor=colour, elinewidth=1, capsize=2, markersize=7,
-            markeredgecolor="white", label=None if row["method"] in shown else row["method"], zorder=3,
+            at, row[y], **bars, fmt=marker, color=colour, ecolor=colour, elinewidth=1, capsize=2, markersize=7,
+            markeredgecolor=colour if none else "white", markerfacecolor="white" if none else colour,
+            label=None if row["method"] in shown else row["method"], zorder=3,
         )  # fmt: skip
         shown.add(row["method"])
-        labels.append((row[x], row[y], _label(row, rows), colour))
-    _logarithmic(axes, [row[x] for row in rows if row[x]])
+        text = _label(row, rows)
+        labels.append((at, row[y], f"{text}, 0 of {row['grasps']}" if none else text, colour))
+    _logarithmic(axes, [at * (0.5 if ", 0 of" in text else 1.0) for at, _, text, _ in labels])
     top = max([row[f"{y}_high"] for row in rows] or [1.0])
-    axes.set_ylim(-0.03 * top, 1.08 * top)
+    axes.set_ylim(-0.09 * top, 1.08 * top)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     placed: list[tuple[float, float]] = []

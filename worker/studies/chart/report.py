@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from worker.studies.chart.figure import draw, draw_sweeps
+from worker.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
 
@@ -107,9 +108,7 @@ def _ratios(rows: Sequence[Row]) -> str:
     for row in others:
         times = f"× {best['valid_per_second'] / row['valid_per_second']:.3g}" if row["valid_per_second"] else ""
         if not times:
-            # None of n grasps held: with 95 % at most 3 / n of all do (rule of three).
-            most = row["grasps_per_second"] * min(1.0, 3.0 / row["grasps"])
-            times = f"> × {best['valid_per_second'] / most:.3g} (0 of {row['grasps']} valid)"
+            times = f"> × {best['valid_per_second'] / most_valid(row):.3g} (0 of {row['grasps']} valid)"
         lines.append(
             f"| {row['method']} {row['fidelity']} | {times} | {best['gsr'] - row['gsr']:+.2f} "
             f"| {best['epsilon'] - row['epsilon']:+.3f} | {best['pd_mm'] - row['pd_mm']:+.2f} |"
