@@ -86,6 +86,9 @@ def draw(found: dict[str, Any], file: Path) -> None:
     figure.suptitle(
         "Grasp quality against contact threshold", x=0.045, y=0.975, ha="left", fontsize=14, fontweight="bold"
     )
+    objects = " / ".join(sorted({str(one["objects"]) for one in found.values()}))
+    said = f"means of the {TOP} best grasps by ε on each of {objects} objects"
+    figure.text(0.985, 0.975, said, ha="right", va="top", color=FAINT, fontsize=10)
     figure.legend(handles=legend(found), loc="lower center", ncols=6, frameon=False, handlelength=2.4)
     figure.subplots_adjust(left=0.045, right=0.985, top=0.77, bottom=0.185, wspace=0.16)
     figure.savefig(file, dpi=160)
@@ -102,10 +105,6 @@ def panel(axis: Axes, key: str, found: dict[str, Any]) -> None:
             if key == "ca_cm2" and friction != "1":
                 continue
             values = by_friction[friction][key]
-            if friction == "1":
-                axis.fill_between(
-                    THRESHOLDS_MM, values["low"], values["high"], color=COLOURS[hand], alpha=0.10, linewidth=0
-                )
             axis.plot(THRESHOLDS_MM, values["mean"], color=COLOURS[hand], linestyle=style, linewidth=2)
         # Two hands have the same values in the paper: side by side both are seen.
         axis.plot(5 + SHIFT[hand], PAPER[hand][key], "o", markersize=7, markerfacecolor="white", markeredgewidth=1.8,
@@ -126,7 +125,7 @@ def legend(found: dict[str, Any]) -> list[Line2D]:
     hands = [Line2D([], [], color=COLOURS[hand], linewidth=2.5, label=hand.capitalize()) for hand in found]
     return [
         *hands,
-        Line2D([], [], color=INK, linewidth=2, label="μ = 1, quartiles shaded"),
+        Line2D([], [], color=INK, linewidth=2, label="μ = 1"),
         Line2D([], [], color=INK, linewidth=2, linestyle=(0, (4, 2)), label="μ = 0.5"),
         Line2D([], [], color=INK, marker="o", markerfacecolor="white", linestyle="", label="Fast-Grasp'D, table 2"),
     ]
