@@ -39,8 +39,12 @@ class Database:
         """
         self._engine = _engine(url)
         self._write_lock = threading.Lock()
-        with _mapped():
-            _migrate(self._engine)
+        try:
+            with _mapped():
+                _migrate(self._engine)
+        except BaseException:
+            self._engine.dispose()
+            raise
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
