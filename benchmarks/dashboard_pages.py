@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import socket
 import statistics
 import sys
 import threading
@@ -26,6 +25,7 @@ import httpx
 import uvicorn
 
 from api.app import create_app
+from api.server import bind
 from service.index.index import Index
 from service.parts import Parts
 from service.queue.memory import MemoryQueue
@@ -114,7 +114,7 @@ def first_paints(address: str, paths: Sequence[str]) -> dict[str, float]:
 @contextmanager
 def serving(settings: Settings, parts: Parts) -> Iterator[str]:
     """The application on a free port of this machine."""
-    listener = socket.create_server(("127.0.0.1", 0))
+    listener = bind("127.0.0.1", 0)
     app = create_app(settings, parts)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
