@@ -46,7 +46,8 @@ def create(parts: Parts, request: DatasetRequest) -> tuple[DatasetView, bool]:
     new = put_record(parts.store, names.dataset_record(record.name), record)
     if not new:
         known = load_dataset(parts.store, record.name)
-        if known.digest != record.digest:
+        # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
+        if (known.hands, known.objects, known.options) != (record.hands, record.objects, record.options):
             raise ConflictError(
                 f"there is another dataset named {record.name!r} ({_difference(known, record)}); take another name"
             )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from service import names, pipeline
@@ -13,6 +15,7 @@ from service.errors import ConflictError, InputError, LimitError, NotFoundError
 from service.index.rebuild import differences, rebuild
 from service.parts import Parts
 from service.records import job_events
+from service.store import open_store
 from tests.service.datasets.makers import add_asset, fail, finish, jobs_of, plan_all, wanted
 
 
@@ -69,6 +72,16 @@ def test_a_name_stands_for_one_dataset(parts: Parts) -> None:
     actions.create(parts, wanted())
     with pytest.raises(ConflictError, match="its objects are ball, cube; its grasps is 32\\); take another name"):
         actions.create(parts, wanted(objects=("ball",), grasps=64))
+
+
+def test_a_dataset_of_an_older_graspd_with_fewer_options_is_the_same(parts: Parts) -> None:
+    actions.create(parts, wanted())
+    old = json.loads(parts.store.get(names.dataset_record("grasps")))
+    del old["options"]["robustness"]
+    fresh = Parts(parts.settings, open_store("memory://"), parts.index, parts.queue)
+    fresh.store.put(names.dataset_record("grasps"), json.dumps(old | {"digest": "0" * 32}).encode())
+    dataset, new = actions.create(fresh, wanted())
+    assert not new and dataset.digest == "0" * 32
 
 
 def test_a_dataset_keeps_the_versions_it_was_created_with(parts: Parts) -> None:
