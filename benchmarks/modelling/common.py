@@ -116,7 +116,10 @@ def ranking(scores: list[Floats], held: list[Bools], draws: int = 400) -> Row:
     found = []
     for _ in range(draws):
         rows = [rng.integers(len(h), size=len(h)) for _, h in pairs]
-        found.append(np.nanmean([auc(s[r], h[r]) for (s, h), r in zip(pairs, rows, strict=True)]))
+        each = np.array([auc(s[r], h[r]) for (s, h), r in zip(pairs, rows, strict=True)])
+        # A draw of an object may hold one kind of grasp only.
+        if (known := each[~np.isnan(each)]).size:
+            found.append(known.mean())
     low, high = np.percentile(found, [2.5, 97.5])
     value = float(np.mean([auc(s, h) for s, h in pairs]))
     return {"value": value, "low": float(low), "high": float(high), "n": sum(len(h) for _, h in pairs)}

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 import numpy as np
 
 from benchmarks.modelling.common import SEED, Floats, Row, Subject, cpu, share
-from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.scenes import simulate
@@ -19,8 +17,10 @@ from worker.scenes.clearance import transfer
 from worker.scenes.rest import RestingFaces, same_face
 from worker.transforms import compose, quat_rotate
 
-#: A forearm: a straight round rod that begins at the palm and points away from the fingers [m].
-FOREARM_RADIUS_M, FOREARM_M = 0.04, 0.3
+#: A forearm: a straight round rod from the palm through the Allegro's flange, which looks along -z of its root [m].
+AWAY: Final = np.array([0.0, 0.0, -1.0])
+FOREARM_RADIUS_M: Final = 0.04
+FOREARM_M: Final = 0.3
 
 
 def drops(objects: list[ObjectModel], count: int) -> list[Row]:
@@ -94,34 +94,36 @@ def _distance(faces: RestingFaces, a: Any, b: Any) -> float:
     return 1.0 - total / len(a)
 
 
-def wrist_direction(hand: HandModel) -> tuple[Floats, Floats]:
-    """Where a forearm begins and points, root frame: from the palm away from the fingers with all joints at 0."""
-    zero = np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)[None]
-    bodies = body_poses(hand, np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(zero))[0]
-    # The median: a thumb that stands aside does not turn the arm.
-    away = hand.palm.centre - np.median(bodies[list(hand.fingertips), :3], axis=0)
-    return hand.palm.centre, away / np.linalg.norm(away)
+def forearm(root: Floats, palm: Floats) -> tuple[Floats, Floats]:
+    """Lowest height (K,) of the far end of forearms on hands with poses (K, 7), and the sine (K,) of their slopes."""
+    far = quat_rotate(root[:, 3:], np.tile(palm + FOREARM_M * AWAY, (len(root), 1)))[:, 2]
+    slope = quat_rotate(root[:, 3:], np.tile(AWAY, (len(root), 1)))[:, 2]
+    # The lowest point of the end's rim.
+    return root[:, 2] + far - FOREARM_RADIUS_M * np.sqrt(np.maximum(0.0, 1 - slope**2)), slope
 
 
 def arm(subjects: list[Subject], scenes: int) -> Row:
     """Share of the grasps kept on a table through which a forearm would run, at contact."""
-    kept, hit, down, tried = 0, 0, 0, 0
+    kept, hit, down, tried, distinct = 0, 0, 0, 0, 0
     for s in subjects:
         poses = simulate.drop(s.obj, count=scenes, seed=SEED)["scene/object_pose"]
         found = transfer(s.hand, s.grasps.grasp, s.grasps.pregrasp, poses)
         valid = np.flatnonzero(found["grasp/valid"])
+        distinct += len(np.unique(found["grasp/base_index"][valid]))
         base = s.grasps.grasp.hand_pose[found["grasp/base_index"][valid]]
         root = compose(poses[found["grasp/scene_index"][valid]], base)
-        start, away = wrist_direction(s.hand)
-        ends = [root[:, 2] + quat_rotate(root[:, 3:], start + reach * away)[:, 2] for reach in (0.0, FOREARM_M)]
-        slope = quat_rotate(root[:, 3:], away)[:, 2] if len(root) else np.zeros(0)
-        # The lowest point of the far end's rim.
-        lowest = ends[1] - FOREARM_RADIUS_M * np.sqrt(np.maximum(0.0, 1 - slope**2)) if len(root) else np.zeros(0)
+        lowest, slope = forearm(root, s.hand.palm.centre)
         kept, tried = kept + len(valid), tried + len(found["grasp/valid"])
         hit, down = hit + int((lowest < 0).sum()), down + int((slope < 0).sum())
     if not kept:
         return {"tried": tried, "kept": 0}
-    return {"tried": tried, "kept": kept, "in_the_table": share(hit, kept), "downward": share(down, kept)}
+    return {
+        "tried": tried,
+        "kept": kept,
+        "distinct_grasps": distinct,
+        "in_the_table": share(hit, kept),
+        "downward": share(down, kept),
+    }
 
 
 def study(subjects: list[Subject], objects: Callable[[], list[ObjectModel]], count: int) -> dict[str, Any]:
