@@ -44,6 +44,7 @@ def chart(
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
+    remark: Annotated[str, typer.Option(help="A sentence on the conditions, for the report.")] = "",
     publish: Annotated[
         bool, typer.Option("--publish", help="Also into the store, for the dashboard and `fidelity: auto`.")
     ] = False,
@@ -67,13 +68,13 @@ def chart(
         options=option or [], quick=quick, threads=threads, device=resolved,
     )  # fmt: skip
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
-    command = shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])])
+    said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
 
     def keep(so_far: dict[str, Any]) -> None:
         if out is not None:
-            write(so_far | {"command": command}, out)
+            write(so_far | said, out)
 
-    result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | {"command": command}
+    result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | said
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, threads=threads,
@@ -91,7 +92,13 @@ def chart(
 
 def _short(word: str) -> str:
     """A word of the command line without the folders of this machine that everybody else calls otherwise."""
-    return ",".join("DATA/" + part.split("/data/", 1)[1] if "/data/" in part else part for part in word.split(","))
+
+    def one(part: str) -> str:
+        if "/data/" in part:
+            return "DATA/" + part.split("/data/", 1)[1]
+        return Path(part).name if part.startswith("/") else part
+
+    return ",".join(one(part) for part in word.split(","))
 
 
 def _say(line: str) -> None:

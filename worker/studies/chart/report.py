@@ -62,7 +62,8 @@ def _head(chart: Row) -> str:
         f"Objects: {objects}. Warm, repeats in turn. Valid: holds in MuJoCo (DexGraspBench protocol, level "
         f"*{chart['referee']['level']}*). Speed counts planner and postures, not the referee. "
         f"ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
-        "medians of a pair's grasps, then means over the pairs. Bars and ± are 95 % (bootstrap).\n\n"
+        "medians of a pair's grasps, then means over the pairs. Bars and ± are 95 % (Wilson for success, else "
+        f"bootstrap).{' ' + chart['remark'] if chart.get('remark') else ''}\n\n"
         "![Speed against accuracy](chart.png)"
     )
 

@@ -40,7 +40,24 @@ def figures(cell: Cell) -> dict[str, Any]:
     row |= {key: float(np.median(cell.values(key))) for key in MEDIANS}
     for key, values in draws.items():
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
+    widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
     return {key: plain(value) for key, value in row.items()}
+
+
+def wilson(valid: int, grasps: int) -> tuple[float, float]:
+    """95 % interval of a share (Wilson 1927): of none or all, where a bootstrap sees no spread, it is not empty."""
+    z2 = 1.959964**2
+    middle = (valid + z2 / 2) / (grasps + z2)
+    half = float(np.sqrt(z2 * (valid * (grasps - valid) / grasps + z2 / 4))) / (grasps + z2)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
+    """Bars of success, and of speed where it depends on it, from the counts; speed keeps the wider of both its bars."""
+    low, high = wilson(valid, grasps)
+    row["gsr_low"], row["gsr_high"] = low, high
+    row["valid_per_second_low"] = min(row["valid_per_second_low"], low * per_second)
+    row["valid_per_second_high"] = max(row["valid_per_second_high"], high * per_second)
 
 
 def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
@@ -94,6 +111,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row["valid_per_second"] = valid / seconds
         low, high = (_ratio_bar(own, end) for end in ("low", "high"))
         row["valid_per_second_low"], row["valid_per_second_high"] = low, high
+        widen(row, valid, row["grasps"], row["grasps_per_second"])
         rows.append({key: plain(value) for key, value in row.items()})
     for key, more in METRICS.items():
         # Who makes no valid grasp is on no front: a hand that touches nothing does not penetrate either.
