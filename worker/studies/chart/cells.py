@@ -86,6 +86,8 @@ class Cell:
     pieces: ConvexPieces
     """Of `true`."""
     seconds: list[float] = field(default_factory=list)
+    processor_seconds: list[float] = field(default_factory=list)
+    """Of all threads: what a call costs whatever else the machine does; without meaning for a GPU."""
     success: list[NDArray[np.int8]] = field(default_factory=list)
     columns: list[dict[str, Floats]] = field(default_factory=list)
     postures: list[Posture] = field(default_factory=list)
@@ -100,9 +102,10 @@ class Cell:
     def repeat(self) -> None:
         """One timed call, then quality and verdict of its grasps."""
         batch, threads = self.setting.batch, self.setting.threads
-        began = time.perf_counter()
+        began, used = time.perf_counter(), time.process_time()
         found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds))
         self.seconds.append(time.perf_counter() - began)
+        self.processor_seconds.append(time.process_time() - used)
         table = measure(
             self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], threads=threads
         )  # fmt: skip

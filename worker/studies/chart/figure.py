@@ -132,15 +132,15 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     figure = Figure(figsize=(11, 3.1 * lines), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     for axes, knob in zip(panels.flat, knobs, strict=False):
-        own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["grasps_per_second"])
-        axes.plot([r["grasps_per_second"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
+        own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
+        axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
         for row in own:
             axes.errorbar(
-                row["grasps_per_second"], row["gsr"], yerr=_error(row, "gsr"), fmt="o", color=COLOURS[0], capsize=2,
+                row["speedup"], row["gsr"], yerr=_error(row, "gsr"), fmt="o", color=COLOURS[0], capsize=2,
                 elinewidth=1, markerfacecolor=COLOURS[0] if row["default"] else "white", markersize=6,
             )  # fmt: skip
             axes.annotate(
-                str(row["value"]), (row["grasps_per_second"], row["gsr"]), xytext=(5, 6), textcoords="offset points",
+                str(row["value"]), (row["speedup"], row["gsr"]), xytext=(5, 6), textcoords="offset points",
                 fontsize=8,
             )  # fmt: skip
         axes.set_title(knob, loc="left", fontsize=10)
@@ -150,9 +150,9 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     for axes in panels.flat[len(knobs) :]:
         axes.set_visible(False)
     # From zero, and alike in all panels: a difference looks as large as it is.
-    panels.flat[0].set_xlim(0, 1.35 * max(row["grasps_per_second"] for row in rows))
+    panels.flat[0].set_xlim(0, 1.35 * max(row["speedup"] for row in rows))
     for axes in panels.flat[len(knobs) - columns : len(knobs)]:
         axes.tick_params(labelbottom=True)
-    figure.supxlabel("raw grasps per second (full marker: the default)", fontsize=10)
+    figure.supxlabel("speed against the default (full marker)", fontsize=10)
     figure.supylabel("success in MuJoCo", fontsize=10)
     figure.savefig(file, dpi=150)

@@ -49,7 +49,8 @@ def markdown(chart: Row) -> str:
         best_table(chart["runs"]),
     ]
     if chart.get("sweeps"):
-        parts += ["## What each knob costs and buys", "![Knobs](sweeps.png)", sweeps_table(chart["sweeps"])]
+        parts += ["## What each knob costs and buys", _sweep_head(chart["sweeps"]), "![Knobs](sweeps.png)"]
+        parts += [sweeps_table(chart["sweeps"])]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -151,6 +152,14 @@ def best_table(runs: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
+def _sweep_head(sweeps: Sequence[Row]) -> str:
+    first = sweeps[0]
+    return (
+        f"{first['hand']} on {first['object']}, {first['grasps']} grasps a value, standard with one knob turned; "
+        "speed is against the default, by processor seconds on a CPU. There is no float64 path to set against float32."
+    )
+
+
 def _mean(values: Sequence[float | None]) -> float:
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else float("nan")
@@ -159,12 +168,12 @@ def _mean(values: Sequence[float | None]) -> float:
 def sweeps_table(sweeps: Sequence[Row]) -> str:
     """A row per value of each knob: gain in speed and price in accuracy against the default's row."""
     lines = [
-        "| knob | value | raw grasps/s | speed | GSR | ε | penetration mm |",
+        "| knob | value | processor s/grasp | speed | GSR | ε | penetration mm |",
         "| --- | --- | --: | --: | --: | --: | --: |",
     ]
     lines += [
         f"| {row['knob']} | {row['value']}{' (default)' if row['default'] else ''} "
-        f"| {row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
+        f"| {row['processor_seconds_per_grasp']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
         f"| {_with_bar(row, 'epsilon', '.3f')} | {_with_bar(row, 'pd_mm', '.2f')} |"
         for row in sweeps
     ]

@@ -121,7 +121,8 @@ def sweep(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
 
-    Values are run in turn, repeat by repeat. `speedup` is raw grasps per second over the default's.
+    Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
+    processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
     """
     wp.load_module(module=kernels, device=device)
     default = Turn("", "default")
@@ -142,13 +143,20 @@ def sweep(
     rows = []
     for turn in turns(quick):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
-        faster = found["grasps_per_second"] / base["grasps_per_second"]
+        faster = _cost(base, device) / _cost(found, device)
         rows.append(
             {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
             | {"speedup": plain(faster), **found}
         )
         say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
     return rows
+
+
+def _cost(row: dict[str, Any], device: str) -> float:
+    """Seconds per grasp."""
+    if wp.get_device(device).is_cuda:
+        return 1.0 / float(row["grasps_per_second"])
+    return float(row["processor_seconds_per_grasp"])
 
 
 def _setting(turn: Turn, batch: int, threads: int, device: str) -> Setting:
