@@ -49,6 +49,11 @@ def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
     return digest_json({"kind": kind, "files": digests})
 
 
+def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
+    """Digest of a hand or object whose files are read with options besides those in them; without any, its own."""
+    return digest_json({"files": digest, "options": dict(options)}) if options else digest
+
+
 def shard_id(
     stage: Stage,
     *,

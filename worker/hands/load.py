@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from service.assets import builtin_files, builtin_names, unpack
-from service.digests import digest_files
+from service.digests import digest_files, digest_variant
 from service.domain import AssetKind
 from service.errors import HandError, NotFoundError
 from service.settings import Settings
@@ -162,7 +162,10 @@ def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None) -
     """
     name, files, stated = files_from_path(path)
     return load_hand(
-        files, name=name, digest=digest_files(AssetKind.HAND, files), options={**stated, **(options or {})}
+        files,
+        name=name,
+        digest=digest_variant(digest_files(AssetKind.HAND, files), options),
+        options={**stated, **(options or {})},
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from service.assets import builtin_files, builtin_names, unpack
-from service.digests import digest_files
+from service.digests import digest_files, digest_variant
 from service.domain import AssetKind
 from service.errors import GraspdError, MeshError, NotFoundError
 from service.settings import Settings
@@ -128,7 +128,7 @@ def object_from_path(
     return load_object(
         files,
         name=name,
-        digest=digest_files(AssetKind.OBJECT, files),
+        digest=digest_variant(digest_files(AssetKind.OBJECT, files), options),
         face_error_m=face_error_m,
         options={**stated, **(options or {})},
     )

@@ -190,3 +190,10 @@ def test_a_hand_that_lacks_a_joint_is_told() -> None:
 
     with pytest.raises(InputError, match="has no joint 'elbow'"):
         joints_by_name(hand_from_path("barrett"), ["elbow"], [[0.0]], what="x")
+
+
+def test_an_object_at_two_scales_is_two_objects() -> None:
+    from worker.exchange.objects import scaled_object
+
+    # What is kept of a pair between calls is found by digest.
+    assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
