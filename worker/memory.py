@@ -1,4 +1,4 @@
-"""How much memory this process holds. Engines and drivers leak: a worker that grew too large makes room for a new one."""
+"""How much memory this process holds. Engines and drivers leak: a worker that grew makes room for a new one."""
 
 from __future__ import annotations
 
