@@ -134,10 +134,10 @@ def sweep(
             cells[turn.knob, turn.value] = Cell(
                 _setting(turn, batch, threads, device), hand, thing.load(turn.fidelity.face_error_m), true, pieces
             )
-    for cell in cells.values():
-        cell.warm_up()
     for _ in range(repeats):
         for cell in cells.values():
+            # More settings than are kept ready on the device: each is made ready just before it is timed.
+            cell.warm_up()
             cell.repeat()
     base = figures(cells[default.knob, default.value])
     rows = []
