@@ -499,7 +499,8 @@ def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server:
 
 @pytest.mark.parametrize("where", [
     {}, {"valid": True}, {"valid": False, "hand": "gripper"}, {"object": "cube"}, {"success": True},
-    {"valid": True, "at_least": {"epsilon": 0.5}}, {"hand": "gripper", "at_most": {"epsilon": 0.9, "wrench_volume": 0.3}},
+    {"valid": True, "at_least": {"epsilon": 0.5}},
+    {"hand": "gripper", "at_most": {"epsilon": 0.9, "wrench_volume": 0.3}},
 ])  # fmt: skip
 def test_grasps_are_counted_as_they_are_listed(parts: Parts, where: dict[str, object]) -> None:
     job, _ = pipeline.submit(parts, request(grasps=96))
