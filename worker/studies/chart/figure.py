@@ -19,6 +19,8 @@ PANELS: Final = (
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
 INK: Final = "#1f2937"
+#: Heights of neighbouring labels over their points, so that none lies on the next.
+LABELS_PT: Final = (6, -14, 18, -26)
 
 
 def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
@@ -134,14 +136,14 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     for axes, knob in zip(panels.flat, knobs, strict=False):
         own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
         axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
-        for row in own:
+        for number, row in enumerate(own):
             axes.errorbar(
                 row["speedup"], row["gsr"], yerr=_error(row, "gsr"), fmt="o", color=COLOURS[0], capsize=2,
                 elinewidth=1, markerfacecolor=COLOURS[0] if row["default"] else "white", markersize=6,
             )  # fmt: skip
             axes.annotate(
-                str(row["value"]), (row["speedup"], row["gsr"]), xytext=(5, 6), textcoords="offset points",
-                fontsize=8,
+                str(row["value"]), (row["speedup"], row["gsr"]), xytext=(5, LABELS_PT[number % 4]),
+                textcoords="offset points", fontsize=8,
             )  # fmt: skip
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)
