@@ -38,6 +38,8 @@ ROUND_STRIDE: Final = 1 << 20
 SMALLEST_ROUND: Final = 8
 #: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
 _LEAST_RATE: Final = 0.1
+#: Why a grasp is not kept: its hand is no number, the referee dropped it, or it failed the geometric gate.
+REJECTIONS: Final = ("diverged", "dropped", "gate")
 #: Shares of a round's progress: planned, judged, measured.
 _PARTS: Final = (0.6, 0.8, 1.0)
 
@@ -50,11 +52,13 @@ class Certified:
     columns: Arrays
     """The `quality/...` columns of a base shard."""
     tried: int
-    """Grasps planned, kept or not."""
+    """Grasps planned up to the last one that is kept, or all where fewer were found than wanted."""
     rejected: dict[str, int]
-    """Grasps that were not kept, by the reason: diverged (hands that are no numbers), dropped, gate, surplus."""
+    """Those of them that were not kept, by `REJECTIONS`."""
     verdict_key: str | None
     """Digest of the terms of the verdicts; None: nobody judged."""
+    planned: int
+    """Grasps planned in all."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of planning, judging and measuring [s]."""
 
@@ -65,7 +69,8 @@ class _Round:
 
     grasps: GraspSet
     columns: Arrays
-    rejected: dict[str, int]
+    fates: NDArray[np.str_]
+    """What became of each grasp that was planned: kept, or one of `REJECTIONS`."""
 
 
 def certified_grasps(
@@ -183,16 +188,20 @@ class _Work:
         """The rounds as one batch, cut to `count`, with audits and robustness."""
         grasps = joined([part.grasps for part in rounds])
         columns = _joined_columns([part.columns for part in rounds])
-        rejected = {name: sum(part.rejected[name] for part in rounds) for name in rounds[0].rejected}
-        rejected["surplus"] = max(0, len(grasps) - count)
+        fates = np.concatenate([part.fates for part in rounds])
+        # The last round may find more than were missing: its tries count up to the last grasp that is kept, or else
+        # the share of valid ones would look worse than it is.
+        places = np.flatnonzero(fates == "kept")
+        tried = int(places[count - 1]) + 1 if len(places) > count else len(fates)
+        rejected = {name: int(np.count_nonzero(fates[:tried] == name)) for name in REJECTIONS}
         kept = np.arange(min(count, len(grasps)))
         grasps = grasps.take(kept)
         columns = {path: array if path == _THRESHOLDS else array[kept] for path, array in columns.items()}
         if self.pieces is None:
-            return Certified(grasps, columns, self.tried, rejected, None, self.seconds)
+            return Certified(grasps, columns, tried, rejected, None, len(fates), self.seconds)
         columns |= self._second_opinions(grasps, columns["quality/valid"])
         key = verdict_key(self.hand, self.obj, self._level, False, pieces=self.pieces.result())
-        return Certified(grasps, columns, self.tried, rejected, key, self.seconds)
+        return Certified(grasps, columns, tried, rejected, key, len(fates), self.seconds)
 
     @property
     def _level(self) -> Any:
@@ -211,8 +220,9 @@ class _Work:
 
     def score(self, planned: GraspSet) -> _Round:
         """Judge and measure grasps, and keep those that are wanted; a hand that is no number is never one of them."""
-        finite = np.flatnonzero(_finite(planned))
-        diverged, planned = len(planned) - len(finite), planned.take(finite)
+        fates = np.where(_finite(planned), "kept", "diverged")
+        finite = np.flatnonzero(fates == "kept")
+        planned = planned.take(finite)
         size, every = len(planned), self.request.want == "raw"
         columns = self._judged(planned)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
@@ -221,12 +231,12 @@ class _Work:
         held = columns.get("quality/success", np.ones(len(rows)))
         valid = (passes(columns) == 1) & (held == 1)
         columns["quality/valid"] = valid.astype(np.uint8)
-        gate = 0 if every else int(np.count_nonzero(~valid))
-        rejected = {"diverged": diverged, "dropped": size - len(rows), "gate": gate}
         if not every:
+            fates[np.delete(finite, rows)] = "dropped"
+            fates[finite[rows[~valid]]] = "gate"
             grasps = grasps.take(np.flatnonzero(valid))
             columns = {path: array if path == _THRESHOLDS else array[valid] for path, array in columns.items()}
-        return _Round(grasps, columns, rejected)
+        return _Round(grasps, columns, fates)
 
     def _judged(self, grasps: GraspSet) -> Arrays:
         if self.pieces is None:

@@ -33,7 +33,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         cancelled=context.cancelled,
     )
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
-    info = {**seconds, "rejected": found.rejected, **_json(found.grasps.info)}
+    info = {**seconds, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}
     return Output({**postures(found.grasps), **found.columns}, attributes_of(hand, message, found), info)
 
 
