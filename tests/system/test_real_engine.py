@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.domain import FIDELITIES, AssetKind, JobRequest, State
+from service.domain import AssetKind, JobRequest, State
 from service.index.rebuild import differences
 from service.shards import read_shard
 from tests.system.conftest import System
+from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
 
 pytestmark = pytest.mark.chaos
 
@@ -37,10 +37,9 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     assert [attempt.kind for attempt in index.attempts(job=job)] == ["WorkerLost"]
     (shard,) = index.shards(job=job, kind="base").items
     kept = read_shard(system.parts.store.get(shard.key))
-    undisturbed = synthesize(
-        hand_from_path("barrett"), object_from_path("block", face_error_m=FIDELITIES["draft"].face_error_m),
-        count=24, fidelity=FIDELITIES["draft"], seed=7,
-    )  # fmt: skip
+    undisturbed = certified_grasps(
+        hand_from_path("barrett"), object_from_path("block", face_error_m=request.knobs.face_error_m), request, count=24
+    ).grasps
     np.testing.assert_array_equal(kept["grasp/hand_pose"], undisturbed.grasp.hand_pose)
     np.testing.assert_array_equal(kept["grasp/joint_positions"], undisturbed.grasp.joint_positions)
     assert differences(index, system.parts.store) == []
