@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from service.domain import FIDELITIES
+from service.transforms import apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -18,7 +19,6 @@ from worker.hands.surface import sample_surface
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.quality.table import measure
-from worker.transforms import apply
 
 COMPACT = ("061_foam_brick", "005_tomato_soup_can", "006_mustard_bottle", "011_banana", "056_tennis_ball")
 SHELLS = ("025_mug", "024_bowl")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -187,7 +187,7 @@ class _Work:
     def finish(self, rounds: list[_Round], count: int) -> Certified:
         """The rounds as one batch, cut to `count`, with audits and robustness."""
         grasps = joined([part.grasps for part in rounds])
-        columns = _joined_columns([part.columns for part in rounds])
+        columns = joined_columns([part.columns for part in rounds])
         fates = np.concatenate([part.fates for part in rounds])
         # The last round may find more than were missing: its tries count up to the last grasp that is kept, or else
         # the share of valid ones would look worse than it is.
@@ -306,8 +306,8 @@ def _finite(grasps: GraspSet) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(rows).all(axis=1))
 
 
-def _joined_columns(parts: list[Mapping[str, NDArray[Any]]]) -> Arrays:
-    """Columns of several rounds as one; the thresholds are common to all."""
+def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> Arrays:
+    """Base columns of several sets of grasps as one; the thresholds are common to all."""
     return {
         path: parts[0][path] if path == _THRESHOLDS else np.concatenate([part[path] for part in parts])
         for path in parts[0]

@@ -10,12 +10,12 @@ import numpy as np
 import trimesh
 
 from benchmarks.modelling.common import SEED, Row, cpu, object_of
+from service.transforms import apply, invert
 from worker.rendering.cameras import Cameras
 from worker.rendering.scenery import Pictures
 from worker.rendering.setting import CameraPlan, Setting
 from worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
 from worker.scenes.simulate import drop
-from worker.transforms import apply, invert
 
 SCENES, VIEWS = 2, 2
 SAMPLES = (2, 4, 12, 24)

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import quat_from_axis_angle, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.quality.probe import Probe
 from worker.simulation.reference import World, loss
 from worker.simulation.simulation import REFERENCE_POINTS, initial_motions
-from worker.transforms import quat_from_axis_angle, quat_to_matrix
 
 Floats = NDArray[np.float64]
 

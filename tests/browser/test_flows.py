@@ -15,12 +15,12 @@ from PIL import Image
 
 from service.assets import builtin_files
 from service.domain import AssetKind
+from service.transforms import apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface
 from worker.objects.prepare import object_from_path
 from worker.stages.glb import SURFACE_POINTS
-from worker.transforms import apply
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import InputError
+from service.transforms import IDENTITY_POSE, compose, invert
 from worker.exchange.imported import Imported
 from worker.exchange.objects import mesh_file, scaled_object
 from worker.exchange.pickles import load_npy
@@ -24,7 +25,6 @@ from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.transforms import IDENTITY_POSE, compose, invert
 
 Floats = NDArray[np.float64]
 

@@ -14,13 +14,13 @@ from typing import Any, Final
 import numpy as np
 
 from service.errors import InputError
+from service.transforms import compose, quat_from_axis_angle, quat_multiply
 from worker.exchange.imported import Imported, completed, joints_by_name
 from worker.exchange.objects import scaled_object
 from worker.exchange.pickles import load_npy
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.transforms import compose, quat_from_axis_angle, quat_multiply
 
 _TRANSLATION: Final = ("WRJTx", "WRJTy", "WRJTz")
 _ROTATION: Final = ("WRJRx", "WRJRy", "WRJRz")

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import InputError
+from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.exchange.imported import Imported, completed
 from worker.exchange.objects import scaled_object
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
-from worker.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 
 Floats = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from service.errors import InputError
+from service.transforms import pose_from_matrix
 from worker.exchange.imported import Imported, completed, joints_by_name
 from worker.exchange.objects import scaled_object
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
-from worker.transforms import pose_from_matrix
 
 
 def read(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[Imported]:

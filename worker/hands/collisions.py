@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 from scipy.optimize import nnls
 
+from service.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
-from worker.transforms import IDENTITY_POSE, apply
 
 #: Pieces closer than this [m] at rest count as touching.
 TOUCH_M = 1e-4

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import HandError
+from service.transforms import IDENTITY_POSE, apply, compose, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel, PalmFrame
 from worker.hands.options import HandOptions
 from worker.hands.tree import Tree
-from worker.transforms import IDENTITY_POSE, apply, compose, quat_rotate
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import quat_rotate
 from worker.hands.model import Floats, HandModel, JointType
-from worker.transforms import quat_rotate
 
 
 def ancestors(hand: HandModel) -> NDArray[np.bool_]:

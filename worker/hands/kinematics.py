@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.transforms import compose, quat_from_axis_angle
 from worker.hands.model import Floats, HandModel, JointType
-from worker.transforms import compose, quat_from_axis_angle
 
 
 def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> Floats:

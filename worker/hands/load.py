@@ -15,6 +15,7 @@ from service.digests import digest_files, digest_variant
 from service.domain import AssetKind
 from service.errors import HandError, NotFoundError
 from service.settings import Settings
+from service.transforms import compose
 from worker.hands.collisions import resting_neighbours
 from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
@@ -23,7 +24,6 @@ from worker.hands.primitives import volume
 from worker.hands.shapes import Hulls, find_mesh, make_piece
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.urdf import Urdf, read_urdf
-from worker.transforms import compose
 
 #: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
 DENSITY = 1000.0

@@ -10,11 +10,11 @@ import numpy as np
 
 from service.assets import check_path
 from service.errors import HandError, InputError, MeshError
+from service.transforms import IDENTITY_POSE, apply
 from worker.hands.model import ConvexPiece, Floats, Ints
 from worker.hands.primitives import hull, signed_distance, tessellate, volume
 from worker.hands.urdf import Shape
 from worker.objects.formats import read_mesh
-from worker.transforms import IDENTITY_POSE, apply
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50

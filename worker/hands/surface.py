@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from service.errors import HandError
+from service.transforms import IDENTITY_POSE, apply, invert, quat_rotate
 from worker.hands import primitives
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints
-from worker.transforms import IDENTITY_POSE, apply, invert, quat_rotate
 
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.errors import HandError
+from service.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
 from worker.hands.urdf import Joint, Mimic, Urdf
-from worker.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
 from service.errors import HandError, LimitError
-from worker.transforms import Floats, quat_from_axis_angle, quat_multiply
+from service.transforms import Floats, quat_from_axis_angle, quat_multiply
 
 MAX_BYTES: Final = 4 * 2**20
 MAX_LINKS: Final = 256

@@ -16,6 +16,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 from service.domain import BATCH_SIZE, FIDELITIES, Fidelity
 from service.errors import InputError
 from service.shards import Attribute, json_attribute, write_shard
+from worker.certified import joined_columns
 from worker.devices import Device
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -90,7 +91,7 @@ def synth(
                 )
             )  # fmt: skip
     seconds = time.perf_counter() - began
-    arrays = joined(parts)
+    arrays = joined_columns(parts)
     attributes = _attributes(model, obj, method, knobs, seed, friction, device, seconds)
     out.write_bytes(write_shard("base", arrays, attributes))
     found = summary(arrays, out, seconds)
@@ -132,14 +133,6 @@ def _batch(
     )  # fmt: skip
     quality = measure(hand, obj, found, friction=friction, threads=threads)
     return {**postures(found), **quality, "quality/valid": passes(quality)}
-
-
-def joined(parts: list[Arrays]) -> Arrays:
-    """Base columns of several batches as one; the thresholds are common to all."""
-    shared = "quality/thresholds_m"
-    return {
-        path: parts[0][path] if path == shared else np.concatenate([part[path] for part in parts]) for path in parts[0]
-    }
 
 
 def _attributes(

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import IDENTITY_POSE, apply, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.surface import farthest_points, sample_surface
-from worker.transforms import IDENTITY_POSE, apply, quat_rotate
 
 Floats = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import quat_rotate
 from worker.grasps import Posture
 from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
@@ -18,7 +19,6 @@ from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, hold
-from worker.transforms import quat_rotate
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
 #: comes back faster and kicks the object away more often.

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.transforms import compose, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints
@@ -20,7 +21,6 @@ from worker.objects.model import ObjectModel
 from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import distance as kernels
 from worker.simulation.sampling import object_samples
-from worker.transforms import compose, quat_to_matrix
 
 Floats = NDArray[np.float64]
 

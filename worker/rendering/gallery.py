@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from service.domain import FIDELITIES
+from service.transforms import apply
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
@@ -21,7 +22,6 @@ from worker.rendering.hands import DrawnHand
 from worker.rendering.sheets import label_page, scene_cells
 from worker.rendering.views import Extras, render
 from worker.scenes import Neighbours, drop, drop_together, transfer
-from worker.transforms import apply
 
 Say = Callable[[str], None]
 #: Size of one picture [px].

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import IDENTITY_POSE, apply, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
@@ -17,7 +18,6 @@ from worker.rendering.kernels import CATCHER
 from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
 from worker.rendering.stage import Stage
-from worker.transforms import IDENTITY_POSE, apply, quat_rotate
 
 #: Sides from which `three_sides` looks, measured from the side view of the hand [rad].
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())

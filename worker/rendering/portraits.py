@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from service.errors import InputError
+from service.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
 from worker.hands.guess import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
@@ -25,7 +26,6 @@ from worker.rendering.palette import hexadecimal
 from worker.rendering.pictures import FIELD_OF_VIEW, FLOOR, FLOOR_SIZE, OBJECT_LOOK, STUDIO, TOWARD_LAMP, fit_camera
 from worker.rendering.scenery import Box, Look, Shot, Solid
 from worker.rendering.stage import Stage
-from worker.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
 
 #: Size of one picture of a portrait [px].
 SIZE: Final = (340, 360)

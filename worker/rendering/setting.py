@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from service.transforms import apply
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere, stereo_pair
 from worker.rendering.given import SAMPLED, GivenCameras
@@ -16,7 +17,6 @@ from worker.rendering.hands import DrawnHand, drawn_bodies, hand_solids, look_of
 from worker.rendering.palette import lamp, object_look, table_look
 from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
 from worker.rendering.stage import Stage
-from worker.transforms import apply
 
 #: The table: a slab whose top is z = 0 [m].
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)

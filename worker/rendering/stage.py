@@ -21,12 +21,12 @@ from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
 from service.errors import TaskCancelled
+from service.transforms import compose, pose_from_matrix, quat_from_axis_angle, quat_rotate
 from worker import backend
 from worker.rendering import kernels
 from worker.rendering.cameras import Floats, pixel_rays
 from worker.rendering.passes import LightPass, light_passes
 from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
-from worker.transforms import compose, pose_from_matrix, quat_from_axis_angle, quat_rotate
 
 #: The camera frame of the tracer (x right, y up, looks down -z) in the camera frame used here.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import InputError
+from service.transforms import apply
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.annotate import box_corners, in_camera, loose_boxes, tight_boxes
 from worker.rendering.cameras import BASELINE_M, Cameras
@@ -19,7 +20,6 @@ from worker.rendering.hands import DrawnHand
 from worker.rendering.scenery import Pictures
 from worker.rendering.setting import TABLE_SIZE, CameraPlan, Setting
 from worker.scenes.neighbours import Neighbours
-from worker.transforms import apply
 
 __all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import InputError
+from service.transforms import compose, quat_rotate, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel
 from worker.scenes.neighbours import Neighbours, neighbour_clearance
-from worker.transforms import compose, quat_rotate, quat_to_matrix
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
 MARGIN_M: Final = 0.002
@@ -86,7 +86,7 @@ def transfer(
     clearance = np.concatenate(
         [np.empty((len(poses), 0, 2))]
         + [
-            _clearance(hand, _rows(grasp, part), _rows(pregrasp, part), poses)
+            _clearance(hand, grasp.take(part), pregrasp.take(part), poses)
             for part in np.array_split(np.arange(len(grasp)), max(1, -(-len(grasp) // _CHUNK)))
             if len(part)
         ],
@@ -140,10 +140,6 @@ def _beside(hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, n
     path = approach(grasp, pregrasp)
     distance = neighbour_clearance(hand, path, poses, neighbours).reshape(len(poses), len(grasp), -1)
     return np.stack([distance[..., -1], distance.min(axis=2)], axis=-1)
-
-
-def _rows(posture: Posture, rows: NDArray[np.intp]) -> Posture:
-    return Posture(np.asarray(posture.hand_pose, float)[rows], np.asarray(posture.joint_positions, float)[rows])
 
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:

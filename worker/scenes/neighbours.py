@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from service.errors import InputError, MeshError
+from service.transforms import compose, quat_rotate
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel
@@ -30,7 +31,6 @@ from worker.scenes.simulate import (
     TIMESTEP_S,
     rest_probability,
 )
-from worker.transforms import compose, quat_rotate
 
 TIMEOUT_S: Final = 6.0
 #: Neighbours fall at this distance from the object, as a multiple of the sum of both bounding radii.

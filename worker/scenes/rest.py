@@ -12,8 +12,8 @@ import numpy as np
 import trimesh
 
 from service.errors import MeshError
+from service.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from worker.objects.model import Floats, Ints, ObjectModel
-from worker.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 
 #: Hull triangles within this angle of each other are one flat face [rad].
 COPLANAR_ANGLE = np.radians(0.05)

@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from service.errors import InputError, MeshError
+from service.transforms import quat_rotate
 from worker.objects.model import Floats, ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
-from worker.transforms import quat_rotate
 
 #: Any density will do: the motion of a free body on a plane does not depend on it [kg/m^3].
 DENSITY: Final = 500.0

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from service.errors import InputError
 from service.shards import read_shard
+from service.transforms import compose, quat_to_matrix
 from worker.exchange import ddgc, dexgraspbench, dexgraspnet, multidex
 from worker.exchange.imported import Origin
 from worker.exchange.pickles import load_npy
@@ -21,7 +22,6 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.judge import judge
-from worker.transforms import compose, quat_to_matrix
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
 

@@ -9,12 +9,12 @@ import pytest
 
 from service.assets import builtin_asset, builtin_files, builtin_names
 from service.domain import AssetKind
+from service.transforms import IDENTITY_POSE, compose, invert
 from worker.hands.builtins import HANDS, files_of
 from worker.hands.collisions import touching_bodies
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import piece_distance
-from worker.transforms import IDENTITY_POSE, compose, invert
 
 ALLEGRO = [f"{f}_{j}" for f in ("index", "middle", "ring") for j in ("abduction", "proximal", "middle", "distal")]
 ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from service.errors import HandError
+from service.transforms import IDENTITY_POSE
 from tests.worker.hands.urdfs import chain, joint, link, robot
 from worker.hands.kinematics import body_poses
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
-from worker.transforms import IDENTITY_POSE
 
 
 def load(urdf: bytes, **options: Any) -> HandModel:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from service.domain import FIDELITIES
+from service.transforms import apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
-from worker.transforms import apply
 
 #: Mean distance between the same surface points of two hands [m]. A difference of 5 mm is seen at a glance.
 ALIKE_M = 0.005

@@ -13,6 +13,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from service.errors import InputError, NotFoundError
+from service.transforms import apply, invert
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import plate_hand, posture
 from worker.grasps import GraspSet
@@ -22,7 +23,6 @@ from worker.quality.commands import app
 from worker.quality.evaluate import combine, evaluate
 from worker.quality.postures import pregrasp, squeeze
 from worker.quality.sources import Case, expand, load_case
-from worker.transforms import apply, invert
 
 CONTRACT = {
     "n", "protocol", "gsr", "osr", "sgs", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm",

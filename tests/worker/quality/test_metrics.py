@@ -10,6 +10,7 @@ import trimesh
 
 from service.errors import InputError, TaskCancelled
 from service.shards import SCHEMAS
+from service.transforms import compose
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, plate_hand, posture
 from worker.grasps import Posture
@@ -19,7 +20,6 @@ from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, Probe
 from worker.quality.table import measure
 from worker.quality.volume import SharedVolume, VoxelVolume
-from worker.transforms import compose
 
 #: Single precision of coordinates around 0.1 m.
 SINGLE = 1e-6

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from service.transforms import apply
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import plate_hand, posture
 from worker.grasps import Posture
@@ -16,7 +17,6 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.quality.postures import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M, hold_forces, pregrasp, squeeze
 from worker.quality.probe import Probe
-from worker.transforms import apply
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 PLATES = plate_hand()

@@ -10,12 +10,12 @@ import trimesh
 
 from service.errors import InputError, TaskCancelled
 from service.shards import check_columns
+from service.transforms import apply, quat_from_axis_angle
 from tests.worker.models import object_from_mesh
 from worker.objects.model import ObjectModel
 from worker.rendering import render
 from worker.rendering.cameras import Cameras
 from worker.rendering.views import TABLE_SIZE
-from worker.transforms import apply, quat_from_axis_angle
 
 #: What a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it.
 DEPTH_M = 1e-4

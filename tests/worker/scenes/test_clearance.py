@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import InputError
+from service.transforms import apply, compose, invert, quat_from_axis_angle
 from tests.worker.models import two_finger_hand
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.scenes import transfer
 from worker.scenes.clearance import MARGIN_M, Rejection, approach
-from worker.transforms import apply, compose, invert, quat_from_axis_angle
 
 HAND = two_finger_hand()
 #: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.

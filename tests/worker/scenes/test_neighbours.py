@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from service.errors import InputError
+from service.transforms import apply, compose, quat_from_axis_angle
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.scenes.test_clearance import postures
 from worker.grasps import Posture
@@ -14,7 +15,6 @@ from worker.hands.kinematics import body_poses
 from worker.scenes import Neighbours, drop_together, transfer
 from worker.scenes.clearance import Rejection
 from worker.scenes.neighbours import FARTHEST_M, neighbour_clearance
-from worker.transforms import apply, compose, quat_from_axis_angle
 
 HAND = two_finger_hand()
 #: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.

@@ -9,12 +9,12 @@ from scipy.spatial import ConvexHull
 from scipy.stats import chisquare
 
 from service.errors import InputError, MeshError
+from service.transforms import apply, quat_rotate
 from tests.worker.models import object_from_mesh
 from worker.objects.model import ObjectModel
 from worker.scenes import drop
 from worker.scenes.rest import resting_faces
 from worker.scenes.simulate import REACH, _build
-from worker.transforms import apply, quat_rotate
 
 #: Rest poses are computed in float64 from hull vertices of size 0.1 m.
 ROUNDING_M = 1e-9

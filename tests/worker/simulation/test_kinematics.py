@@ -10,13 +10,13 @@ import pytest
 import warp as wp
 import yourdfpy
 
+from service.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
 from tests.worker.simulation.rigs import ball, rig
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.simulation.kernels import kinematics
 from worker.simulation.simulation import HandState
-from worker.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
 
 #: float32 positions of a hand 0.2 m large through at most 8 joints.
 FK_TOLERANCE = 3e-7

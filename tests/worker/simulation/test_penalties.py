@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.transforms import apply, invert, quat_from_axis_angle, quat_multiply
 from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.test_kinematics import root_poses
 from worker.hands.kinematics import body_poses
@@ -16,7 +17,6 @@ from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance, sample_surface
 from worker.simulation.sampling import object_samples
 from worker.simulation.simulation import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, HandState, LossOptions, Schedule
-from worker.transforms import apply, invert, quat_from_axis_angle, quat_multiply
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
 #: difference add the rest.

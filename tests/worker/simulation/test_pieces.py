@@ -7,13 +7,13 @@ import pytest
 import trimesh
 import warp as wp
 
+from service.transforms import apply, invert
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance
 from worker.simulation import kernels
 from worker.simulation.device import DeviceHand, face_planes
 from worker.simulation.kernels import pieces
-from worker.transforms import apply, invert
 
 
 @wp.kernel

@@ -13,12 +13,12 @@ from service import names
 from service.assets import builtin_files, builtin_model, builtin_names
 from service.domain import AssetKind
 from service.store import open_store
+from service.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.stages.glb import hand_glb, object_glb
 from worker.stages.models import model_of, publish_model
-from worker.transforms import IDENTITY_POSE, apply
 
 #: Positions are single precision: half a micrometre at half a metre.
 TOLERANCE_M = 5e-7

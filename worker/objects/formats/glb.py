@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from service.errors import MeshError
+from service.transforms import quat_to_matrix
 from worker.objects.formats.soup import Soup, check_face_count
-from worker.transforms import quat_to_matrix
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 _FLOAT, _TRIANGLES, _MAX_DEPTH = 5126, 4, 32

@@ -13,13 +13,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.transforms import quat_rotate
 from worker.hands.jacobian import ancestors
 from worker.hands.model import HandModel, JointType, SurfacePoints
 from worker.planners.autograsp import kernels
 from worker.planners.fast_graspd.pairs import Pair
 from worker.simulation.kernels import kinematics
 from worker.simulation.simulation import HandState, Simulation
-from worker.transforms import quat_rotate
 
 Floats = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.planners.dfc import kernels
@@ -18,7 +19,6 @@ from worker.planners.inside import inside_points
 from worker.planners.parts import Steps
 from worker.simulation.kernels import kinematics, optimizers
 from worker.simulation.simulation import HandState, Simulation, still_schedule
-from worker.transforms import IDENTITY_POSE, apply
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel
 from worker.simulation.simulation import HandState
-from worker.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 
 #: Distance of the palm from the hull [m]: the source puts the root, which is a palm's length behind, at 0.2 to 0.3.
 DISTANCE: Final = (0.1, 0.2)

@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import quat_rotate
 from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import hold_forces
 from worker.simulation.simulation import HandState
-from worker.transforms import quat_rotate
 
 Floats = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import InputError
+from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.simulation import HandState, Simulation, still_schedule
-from worker.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 
 Floats = NDArray[np.float64]
 

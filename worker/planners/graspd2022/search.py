@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.transforms import quat_rotate
 from worker.hands.surface import sample_surface
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
@@ -15,7 +16,6 @@ from worker.planners.graspd2022.grid import distance_grid
 from worker.planners.parts import Steps
 from worker.simulation.kernels import kinematics, optimizers, pieces
 from worker.simulation.simulation import MAX_DILATION, HandState, Schedule, Simulation
-from worker.transforms import quat_rotate
 
 Floats = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.errors import InputError
+from service.transforms import quat_from_matrix
 from worker.hands.model import HandModel
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspit import kernels
@@ -18,7 +19,6 @@ from worker.planners.graspit.schedule import FIRST_STEP
 from worker.planners.parts import Steps
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.simulation import HandState, body_points, still_schedule
-from worker.transforms import quat_from_matrix
 
 Floats = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import compose, invert, quat_from_axis_angle
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.judge import Cancelled, Progress, judge
 from worker.quality.referee.key import Level
-from worker.transforms import compose, invert, quat_from_axis_angle
 
 Floats = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.domain import FIDELITIES, Fidelity
+from service.transforms import quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.merit import merits
@@ -19,7 +20,6 @@ from worker.planners.fast_graspd.starts import RETREATS, sample_starts
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule
 from worker.studies.stability.maps import Cell, StabilityMap, graded
-from worker.transforms import quat_rotate
 
 Floats = NDArray[np.float64]
 Say = Callable[[str], None]

@@ -1,3 +1,0 @@
-"""Rigid transforms, see `service.transforms`."""
-
-from service.transforms import *  # noqa: F403
