@@ -1,37 +1,20 @@
-"""Charts of speed against accuracy in the store, and the cheapest setting that a chart promises for a wanted accuracy.
-
-A chart is an immutable object `charts/{created}.json`; the last by name is the one that counts.
-"""
+"""The cheapest setting that the stored chart of speed against accuracy promises for a wanted accuracy."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from service.domain import AUTO, OFFERED, JobRequest
 from service.errors import InputError
+from service.published import latest
 from service.store import Store
 
-PREFIX: Final = "charts"
 #: Accuracies that a target may name, and whether more is better.
 METRICS: Final = {"gsr": True, "epsilon": True, "pd_mm": False}
 
 _TARGET: Final = re.compile(r"\s*(gsr|epsilon|pd_mm)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
-
-
-def publish(store: Store, chart: Mapping[str, Any]) -> str:
-    """Put a chart beside the earlier ones; its key."""
-    key = f"{PREFIX}/{re.sub(r'[^0-9A-Za-z]', '', str(chart['created']))}.json"
-    store.put(key, json.dumps(chart, allow_nan=False).encode())
-    return key
-
-
-def latest(store: Store) -> dict[str, Any] | None:
-    """The chart that was published last; None where there is none."""
-    keys = [entry.key for entry in store.list(PREFIX) if entry.key.endswith(".json")]
-    return dict(json.loads(store.get(max(keys)))) if keys else None
 
 
 def explicit(store: Store, request: JobRequest) -> JobRequest:
@@ -42,7 +25,7 @@ def explicit(store: Store, request: JobRequest) -> JobRequest:
     """
     if request.fidelity != AUTO:
         return request
-    chart = latest(store)
+    chart = latest(store, "charts")
     if chart is None:
         raise InputError("fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity")
     name = cheapest(chart, request.target, method=request.method, hand=request.hand, object_=request.object)

@@ -20,6 +20,7 @@ NAVIGATION: Final = (
     ("/grasps", "Grasps"),
     ("/workers", "Workers"),
     ("/chart", "Chart"),
+    ("/stability", "Stability"),
 )
 
 

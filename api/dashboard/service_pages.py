@@ -1,4 +1,4 @@
-"""The pages of the service as a whole: home, workers, the chart of speed against accuracy."""
+"""The pages of the service as a whole: home, workers, speed against accuracy, where it breaks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 
 from api.catalog import Catalog
-from api.dashboard import charts, tradeoff
+from api.dashboard import charts, stability, tradeoff
 from api.dashboard.rendering import render
 from api.dependencies import CatalogOf, may_read
 from api.models import STAGE_LABELS
@@ -23,8 +23,8 @@ PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
 _MINUTES: Final = 60
 _DATASETS: Final = 6
-#: A chart takes minutes to measure, and nothing tells when it is published.
-_CHART_S: Final = 10
+#: A study takes minutes, and nothing tells when it is published.
+_STUDY_S: Final = 10
 
 router = APIRouter(include_in_schema=False)
 
@@ -85,13 +85,27 @@ def chart_page(request: Request, catalog: CatalogOf, y: str = "gsr", hand: str =
         request,
         "chart.html",
         page="/chart",
-        poll_s=_CHART_S,
+        poll_s=_STUDY_S,
         measured=measured,
         chart=tradeoff.draw(measured, axis=axis, hand=hand, object=object) if measured else None,
         axes=tradeoff.AXES,
         axis=axis,
         hand=hand,
         object=object,
+    )
+
+
+@router.get("/stability", dependencies=[Depends(may_read)])
+def stability_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+    """Maps of where integrators and the planner fail, as `graspd stability` measured them last."""
+    measured = stability.load(catalog.store)
+    return render(
+        request,
+        "stability.html",
+        page="/stability",
+        poll_s=_STUDY_S,
+        measured=measured,
+        maps=[stability.draw(one) for one in measured.maps] if measured else [],
     )
 
 

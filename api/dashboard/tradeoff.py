@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
-from service import charts as published
+from service.published import latest
 from service.store import Store
 
 WIDTH: Final = 860
@@ -89,8 +89,8 @@ class Drawing:
 def load(store: Store) -> Measured | None:
     """The chart that was published last; None where there is none that can be read."""
     try:
-        latest = published.latest(store)
-        return None if latest is None else Measured.model_validate(latest)
+        found = latest(store, "charts")
+        return None if found is None else Measured.model_validate(found)
     except ValueError:
         return None
 

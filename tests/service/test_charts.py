@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 from service import pipeline
-from service.charts import cheapest, latest, parse_target, publish
+from service.charts import cheapest, parse_target
 from service.errors import InputError
 from service.parts import Parts
+from service.published import latest, publish
 from service.store import open_store
 from tests.fakes import request
 
@@ -69,15 +70,15 @@ def test_a_target_of_another_form_is_refused(text: str) -> None:
 
 def test_the_chart_published_last_is_the_latest(tmp_path: Path) -> None:
     store = open_store(tmp_path.as_uri())
-    assert latest(store) is None
-    publish(store, {**CHART, "created": "2026-11-21T11:00:00.000Z", "runs": []})
-    publish(store, CHART)
-    found = latest(store)
+    assert latest(store, "charts") is None
+    publish(store, "charts", {**CHART, "created": "2026-11-21T11:00:00.000Z", "runs": []})
+    publish(store, "charts", CHART)
+    found = latest(store, "charts")
     assert found is not None and found["created"] == "2026-11-21T11:00:00.000Z"
 
 
 def test_a_job_with_fidelity_auto_is_stored_with_the_one_the_chart_promises(parts: Parts) -> None:
-    publish(parts.store, CHART)
+    publish(parts.store, "charts", CHART)
     job, _ = pipeline.submit(parts, request(fidelity="auto", target="gsr>=0.75"))
     assert (job.request.fidelity, job.request.target) == ("standard", "")
     # It is the job that names the fidelity itself: a later chart does not change it.

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.charts import latest
 from service.domain import FIDELITIES
+from service.published import latest
 from service.store import open_store
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
@@ -65,7 +65,7 @@ def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> N
 
 def test_a_published_chart_is_the_latest_in_the_store(made: tuple[dict[str, Any], Path]) -> None:
     found, folder = made
-    stored = latest(open_store((folder / "data" / "store").as_uri()))
+    stored = latest(open_store((folder / "data" / "store").as_uri()), "charts")
     assert stored is not None
     assert stored["runs"] == found["runs"]
 

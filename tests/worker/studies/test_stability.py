@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
 
 from service.domain import FIDELITIES, JobRequest
 from service.errors import MeshError
+from service.published import latest
+from service.stability import Cell, Stability, StabilityMap, from_json, graded
+from service.store import open_store
 from worker import backend
 from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path
@@ -18,8 +24,8 @@ from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.simulation.simulation import HandState, LossOptions
-from worker.studies.stability import descents, gradients, integrators, shapes
-from worker.studies.stability.maps import Cell, StabilityMap, graded
+from worker.studies.stability import descents, gradients, integrators, report, shapes, studies
+from worker.studies.stability.commands import STUDIES, app
 from worker.studies.stability.report import markdown, write
 
 
@@ -106,11 +112,74 @@ def test_what_is_no_number_is_broken() -> None:
     ]  # fmt: skip
 
 
+def a_map(**changes: object) -> StabilityMap:
+    cells = [Cell("a", 1.0, 10.0, 0.1, "good", reached=True), Cell("a", 2.0, 10.0, math.inf, "broken", "why", "", True)]
+    cells.append(Cell("a", 3.0, 10.0, 5.0, "broken"))
+    one = StabilityMap("demo", "A demo", "x", "y", "m", "weak: 1", cells, "it flies", "g", "t", {"a": [(1.0, 10.0)]})
+    return replace(one, **changes)
+
+
+def a_record(*maps: StabilityMap) -> Stability:
+    return Stability("2026-11-21T12:00:00.000Z", "graspd stability", {"graspd": "0"}, list(maps or [a_map()]))
+
+
 def test_a_report_has_a_picture_and_a_table_for_each_map(tmp_path: Path) -> None:
-    cells = [Cell("a", 1.0, 10.0, 0.1, "good"), Cell("a", 2.0, 10.0, math.inf, "broken")]
-    one = StabilityMap("demo", "A demo", "x", "y", "m", "weak: 1", cells, "s", "g", "t", {"a": [(1.0, 10.0)]})
-    written = write([one], tmp_path, command="graspd stability", versions={"graspd": "0"})
+    written = write(a_record(), tmp_path)
     assert {path.name for path in written} == {"stability.json", "stability.md", "stability-demo.png"}
     assert json.loads(written[0].read_text())["maps"][0]["cells"][1]["value"] is None
-    assert "| a | 1 | 0 | 1 | 0 |" in markdown([one], command="c", versions={})
+    assert "| a | 1 | 0 | 2 | 0 |" in markdown(a_record())
     assert written[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_report_says_what_still_breaks_and_how_a_user_sees_it() -> None:
+    said = markdown(a_record())
+    assert "| A demo | 1 | 0 | 1 | 0 | a: 2 (10) | it flies |" in said
+    whole = [replace(cell, outcome="good") for cell in a_map().cells]
+    assert "| A demo | 2 | 0 | 0 | 0 | nothing | – |" in markdown(a_record(a_map(cells=whole)))
+
+
+@pytest.mark.parametrize("letters", ["9", "0.12", "123456789012345678901234567890"])
+def test_numbers_on_a_picture_stay_within_their_cells(letters: str) -> None:
+    figure = Figure(figsize=(4.4, 3.4))
+    axes = figure.subplots()
+    cells = [Cell("a", float(x), float(y), 1.0, "good", label=letters) for x in range(1, 10) for y in (1, 2)]
+    report._panel(axes, a_map(cells=cells, lines={}), "a")
+    report._fit(axes)
+    width = axes.get_window_extent().width / 9
+    assert all(not text.get_visible() or text.get_window_extent().width < width for text in axes.texts)
+    assert axes.texts[0].get_visible() is (len(letters) < 20)
+
+
+def command(*arguments: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, list(arguments))
+    return done.exit_code, done.output
+
+
+def test_without_a_choice_all_studies_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(studies, "run", lambda names, *_, **__: asked.extend(names) or [])
+    assert command("--json")[0] == 0
+    assert asked == list(STUDIES)
+    assert len(asked) == 8
+
+
+def test_published_maps_are_the_latest_in_the_store(tmp_path: Path) -> None:
+    write(a_record(), tmp_path)
+    code, said = command("--from", str(tmp_path / "stability.json"), "--publish", "--data-dir", str(tmp_path))
+    assert code == 0, said
+    stored = latest(open_store((tmp_path / "store").as_uri()), "stability")
+    assert stored is not None
+    assert from_json(stored).as_json() == a_record().as_json()
+
+
+@pytest.mark.parametrize("text", ["no json", "{}", '{"maps": 3}'])
+def test_a_file_that_holds_no_maps_is_the_callers_mistake(tmp_path: Path, text: str) -> None:
+    (tmp_path / "wrong.json").write_text(text)
+    code, said = command("--from", str(tmp_path / "wrong.json"))
+    assert code == 2
+    assert "no stability.json" in said
+
+
+@pytest.mark.parametrize("arguments", [["--only", "magic"], ["--from", "nowhere.json"]])
+def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
+    assert command(*arguments)[0] == 2

@@ -147,8 +147,8 @@ def _things(objects: Sequence[str]) -> list[Any]:
 
 
 def _publish(result: dict[str, Any], data_dir: Path | None) -> None:
-    from service.charts import publish
+    from service.published import publish
     from service.store import open_store
 
-    key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), result)
+    key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), "charts", result)
     _say(f"published as {key}")

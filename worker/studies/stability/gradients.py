@@ -9,11 +9,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.stability import Cell, StabilityMap, graded, reachable
 from worker.simulation import reference
 from worker.simulation.kernels import contact
 from worker.simulation.reference import Contacts, World
 from worker.simulation.simulation import initial_motions
-from worker.studies.stability.maps import Cell, StabilityMap, graded
 
 Floats = NDArray[np.float64]
 
@@ -83,11 +83,12 @@ def gradient_map(
     return StabilityMap(
         "gradient", "Gradient of the float32 kernels against float64 differences", "radius of the object [m]",
         "spread of the gaps over the step", "sine of the angle between the gradients, median of some contact sets",
-        f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}", cells,
+        f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}", reachable(cells, lambda cell: True),
         "the descent wanders: losses stay where they were however many iterations are run",
         "a descent that does not improve stops after `patience` iterations; of several starts the best is kept, judged "
         "by the balance of forces and not by the loss",
         "tests/worker/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
+        reach="all: `contact_solver` offers each, and objects have every size",
     )  # fmt: skip
 
 

@@ -14,9 +14,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.stability import Cell, StabilityMap, graded, reachable, short
 from worker.simulation import reference
 from worker.simulation.reference import Contacts, World
-from worker.studies.stability.maps import Cell, StabilityMap, graded
+from worker.simulation.simulation import LossOptions
 
 Floats = NDArray[np.float64]
 #: From contacts (of which the distances are the present ones), free motion and world to the motion that is allowed.
@@ -35,6 +36,9 @@ ENERGY: Final = (1.02, 2.0)
 #: Sliding friction of the cage, and the viscous coefficient of the force-based contact [N s/m].
 FRICTION: Final = 0.8
 VISCOUS: Final = 10.0
+
+#: On cells of balls stands the worse of the two.
+_BALL_MEASURE: Final = "× largest kinetic energy over the first (∞: it blew up), else how deep it sank [mm]"
 
 TIME_STEPS: Final = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 SPEEDS: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
@@ -161,6 +165,8 @@ SOLVERS: Final[dict[str, Solver]] = {
     "Jacobi, averaged": _averaged,
     "Jacobi, summed": summed_jacobi,
 }
+#: What `contact_solver` offers.
+_OFFERED: Final = tuple(SOLVERS)[:3]
 
 
 def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[float] = SPEEDS) -> StabilityMap:
@@ -172,29 +178,34 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
         for dt, speed in grid
     ]
     cells += [
-        _ball_cell(f"penalty force, k = {k:.0e} N/m", dt, speed, force_based(dt=dt, speed=speed, stiffness=k))
-        for k in (1e4, 1e6)
+        _ball_cell(f"penalty force, {name} N/m", dt, speed, force_based(dt=dt, speed=speed, stiffness=k))
+        for name, k in (("1e4", 1e4), ("1e6", 1e6))
         for dt, speed in grid
     ]
+    step = LossOptions().step
+    # The grid comes no nearer to the planner's step than a tenth of it.
+    cells = reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
     return StabilityMap(
         "time_step", "A ball of 1 kg in a cage of 24 points, 60 steps", "time step [s]", "speed [m/s]",
-        "largest kinetic energy over the first; inf: it blew up",
-        f"weak: energy {ENERGY[0]:g} or {SINK_M[0] * 1e3:g} mm deep; broken: energy {ENERGY[1]:g} or "
+        _BALL_MEASURE,
+        f"weak: energy × {ENERGY[0]:g} or {SINK_M[0] * 1e3:g} mm deep; broken: energy × {ENERGY[1]:g} or "
         f"{SINK_M[1] * 1e3:g} mm deep",
         cells,
         "an object that is thrown out of the hand, or hands that sink into it",
         "the planner takes one step of 1 mm (time step x speed), where its integrators are good; the referee steps "
         "MuJoCo's implicit solver",
         "tests/worker/studies/test_stability.py::test_the_planners_own_step_lies_where_its_integrators_are_good",
+        reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
     )  # fmt: skip
 
 
 def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -> Cell:
     energy, deep = found
     worst = max(graded(energy, *ENERGY), graded(deep, *SINK_M), key=("good", "weak", "broken").index)
-    said = f"{deep * 1e3:.2g} mm deep"
+    said = f"energy × {energy:.3g}, {deep * 1e3:.2g} mm deep"
     # What makes the cell bad is what stands on it.
-    label = f"x {energy:.2g}" if energy >= ENERGY[0] else f"{deep * 1e3:.2g} mm"
+    ratio = f"{energy:.2f}" if energy < 2 else short(energy)
+    label = f"×{ratio}" if energy >= ENERGY[0] else short(round(deep * 1e3, 2))
     return Cell(name, dt, speed, energy, worst, said, label)
 
 
@@ -221,13 +232,14 @@ def stiffness_map(
     ]
     return StabilityMap(
         "stiffness", "Penalty stiffness against the position-based step, 0.3 m/s", "contact stiffness [N/m]",
-        "time step [s]", "largest kinetic energy over the first; inf: it blew up",
+        "time step [s]", _BALL_MEASURE,
         "as in time_step; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
         cells,
         "soft contacts let the hand sink in, stiff ones throw the object; the band between them narrows with dt",
         "only `graspd2022` uses penalty forces, and only for a static balance without time steps",
         "tests/worker/studies/test_stability.py::test_a_penalty_force_blows_up_above_the_bound_of_theory",
         lines,
+        reach="none: no planner integrates penalty forces over time, and the planner's own stiffness is fixed",
     )  # fmt: skip
 
 
@@ -239,6 +251,7 @@ def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
         for count in counts
         for depth in (0.0, 1e-4, 1e-3)
     ]
+    cells = reachable(cells, lambda cell: cell.panel in _OFFERED)
     return StabilityMap(
         "contact_count", "A step of 1 mm into a wall of contact points", "contact points", "initial depth [m]",
         "motion left into or out of the wall, over the step", "weak: 0.25 of the step; broken: 1, more than came in",
@@ -246,6 +259,7 @@ def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
         "more points on the same finger push harder; losses and gradients grow with the sampling",
         "summed Jacobi is not offered; the direct solver weighs points by the area they stand for",
         "tests/worker/studies/test_stability.py::test_summed_jacobi_overshoots_with_the_number_of_contacts",
+        reach="the offered solvers, with any number of contacts: it is the number of hand points that touch",
     )  # fmt: skip
 
 

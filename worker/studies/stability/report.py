@@ -4,47 +4,72 @@ from __future__ import annotations
 
 import json
 import math
-from bisect import bisect_right
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from worker.studies.stability.maps import OUTCOMES, Cell, StabilityMap
+from service.stability import OUTCOMES, Cell, Stability, StabilityMap, between, counts, tick
 
-COLOURS: Final = {"good": "#3f9b82", "weak": "#e6b450", "broken": "#b3392f", "refused": "#9aa4b1"}
+#: Told apart by lightness alone too, from calm to alarming: (fill, text).
+COLOURS: Final = {
+    "good": ("#bfe0dc", "#14403a"),
+    "weak": ("#eeb544", "#3b2a00"),
+    "broken": ("#96261c", "#ffffff"),
+    "refused": ("#e7e9ec", "#4b565e"),
+}
 #: Widest row of panels.
 _COLUMNS: Final = 3
+#: Sizes of the numbers on cells [pt], largest first; where not even the last fits, the cell says nothing.
+_FONT_SIZES: Final = (7.0, 6.0, 5.0)
+#: Longer names of ticks are broken into lines.
+_TICK_LETTERS: Final = 20
 
 
-def write(maps: Sequence[StabilityMap], folder: Path, *, command: str, versions: dict[str, str]) -> list[Path]:
+def write(found: Stability, folder: Path) -> list[Path]:
     """`stability.json`, `stability.md` and a picture for each map."""
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / "stability.json", folder / "stability.md"]
-    record = {"command": command, "versions": versions, "maps": [one.as_json() for one in maps]}
-    written[0].write_text(json.dumps(_plain(record), indent=1) + "\n")
-    written[1].write_text(markdown(maps, command=command, versions=versions))
-    for one in maps:
+    written[0].write_text(json.dumps(found.as_json(), indent=1, allow_nan=False) + "\n")
+    written[1].write_text(markdown(found))
+    for one in found.maps:
         written.append(folder / f"stability-{one.name}.png")
         draw(one, written[-1])
     return written
 
 
-def markdown(maps: Sequence[StabilityMap], *, command: str, versions: dict[str, str]) -> str:
-    """What was driven where, where it broke, how that shows, and what guards against it."""
-    said = ", ".join(f"{name} {value}" for name, value in versions.items())
-    lines = ["# Where it breaks", "", f"`{command}`; {said}.", ""]
-    for one in maps:
+def markdown(found: Stability) -> str:
+    """What was driven where, where it broke, how that shows, what guards against it, and what still breaks."""
+    said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
+    lines = ["# Where it breaks", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
+    for one in found.maps:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
-        lines += [f"Measure: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
+        lines += [f"On the cells: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
         lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
-        for panel in one.panels:
-            counts = [sum(c.panel == panel and c.outcome == outcome for c in one.cells) for outcome in OUTCOMES]
-            lines.append(f"| {panel} | " + " | ".join(map(str, counts)) + " |")
+        lines += [f"| {panel} | {_row(one.of(panel))} |" for panel in one.panels]
         lines += ["", f"- shows as: {one.shows}", f"- guard: {one.guard}"]
         if one.guard_test:
             lines.append(f"- test of the guard: `{one.guard_test}`")
-        lines.append("")
+        lines += [f"- within reach of a job: {one.reach}", ""]
     return "\n".join(lines)
+
+
+def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
+    """The cells that a job can come to, and what of them is broken: what no guard keeps a user from."""
+    lines = ["## What still breaks", ""]
+    lines += ["Only the cells that a job can come to, whatever it asks for. The other cells of the maps need settings"]
+    lines += ["that no job has: there the guard is that they cannot be asked for.", ""]
+    lines += ["| map | good | weak | broken | refused | what still breaks | how a user sees it |"]
+    lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
+    for one in maps:
+        broken = one.still_breaks()
+        seen = one.shows if broken else "–"
+        lines.append(f"| {one.title} | {_row(one.reached())} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
+    return [*lines, ""]
+
+
+def _row(cells: Sequence[Cell]) -> str:
+    return " | ".join(str(number) for number in counts(cells).values())
 
 
 def draw(one: StabilityMap, path: Path) -> None:
@@ -55,33 +80,36 @@ def draw(one: StabilityMap, path: Path) -> None:
     panels = one.panels
     columns = min(_COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
-    figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.9), layout="constrained")
+    figure = Figure(figsize=(max(4.4 * columns, 7.0), 3.4 * rows + 0.9), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         _panel(axes, one, panel)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    present = [outcome for outcome in OUTCOMES if any(cell.outcome == outcome for cell in one.cells)]
-    figure.legend(
-        handles=[Patch(color=COLOURS[outcome], label=outcome) for outcome in present],
-        loc="outside lower center", ncols=len(present), frameon=False,
-    )  # fmt: skip
+    present = [outcome for outcome, number in counts(one.cells).items() if number]
+    handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
+    handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="within reach of a job"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
+    figure.draw_without_rendering()
+    for axes in grid.flat:
+        _fit(axes)
     figure.savefig(path, dpi=110)
 
 
 def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
-    cells = [cell for cell in one.cells if cell.panel == panel]
+    cells = one.of(panel)
     xs, ys = (list(dict.fromkeys(getattr(cell, axis) for cell in cells)) for axis in ("x", "y"))
     for cell in cells:
         at = xs.index(cell.x), ys.index(cell.y)
-        axes.add_patch(_square(at, cell))
-        if cell.label or math.isfinite(cell.value):
-            axes.text(*at, cell.label or f"{cell.value:.2g}", ha="center", va="center", fontsize=7, color="white")
+        fill, ink = COLOURS[cell.outcome]
+        axes.add_patch(_square(at, fill, framed=cell.reached and not all(cell.reached for cell in one.cells)))
+        axes.text(*at, cell.text, ha="center", va="center", color=ink)
+    names = [_wrapped(x) for x in xs]
     axes.set_xlim(-0.5, len(xs) - 0.5)
     axes.set_ylim(-0.5, len(ys) - 0.5)
-    axes.set_xticks(range(len(xs)), [_label(x) for x in xs], fontsize=8, rotation=30 if len(xs) > 5 else 0)
-    axes.set_yticks(range(len(ys)), [_label(y) for y in ys], fontsize=8)
+    axes.set_xticks(range(len(xs)), names, fontsize=8, rotation=20 if any("\n" in name for name in names) else 0)
+    axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
     axes.set_xlabel(one.x, fontsize=9)
     axes.set_ylabel(one.y, fontsize=9)
     axes.set_title(panel, loc="left", fontsize=10)
@@ -89,33 +117,29 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     axes.tick_params(length=0)
     if line := one.lines.get(panel):
         axes.plot(
-            [_between(xs, x) for x, _ in line], [_between(ys, y) for _, y in line], color="#1f2937", lw=1.6, ls="--"
+            [between(xs, x) for x, _ in line], [between(ys, y) for _, y in line], color="#1f2937", lw=1.6, ls="--"
         )
 
 
-def _square(at: tuple[int, int], cell: Cell) -> Any:
+def _fit(axes: Any) -> None:
+    """Make the numbers as small as their cells want them, or leave them out."""
+    left, right = axes.get_xlim()
+    room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
+    for text in axes.texts:
+        for size in _FONT_SIZES:
+            text.set_fontsize(size)
+            if text.get_window_extent().width <= room:
+                break
+        else:
+            text.set_visible(False)
+
+
+def _square(at: tuple[int, int], fill: str, *, framed: bool) -> Any:
     from matplotlib.patches import Rectangle
 
-    return Rectangle((at[0] - 0.47, at[1] - 0.47), 0.94, 0.94, color=COLOURS[cell.outcome], lw=0)
+    edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
+    return Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge)
 
 
-def _between(ticks: Sequence[Any], value: float) -> float:
-    """Where a value lies among logarithmic ticks, beyond their ends too."""
-    logs, at = [math.log(tick) for tick in ticks], math.log(value)
-    if len(logs) < 2:
-        return 0.0
-    k = min(max(bisect_right(logs, at) - 1, 0), len(logs) - 2)
-    return k + (at - logs[k]) / (logs[k + 1] - logs[k])
-
-
-def _label(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
-
-
-def _plain(value: Any) -> Any:
-    """Without nan and infinity, which JSON does not know."""
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _wrapped(value: float | str) -> str:
+    return textwrap.fill(tick(value), _TICK_LETTERS, break_long_words=False)

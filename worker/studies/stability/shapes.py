@@ -11,11 +11,11 @@ import trimesh
 from service.digests import digest_files
 from service.domain import FIDELITIES, AssetKind, JobRequest
 from service.errors import GraspdError
+from service.stability import Cell, Outcome, StabilityMap, reachable
 from worker.certified import certified_grasps
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
-from worker.studies.stability.maps import Cell, Outcome, StabilityMap
 
 MILLIMETRES: Final = 1e-3
 
@@ -103,13 +103,15 @@ def shape_map(
             say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
             cells.append(cell)
     return StabilityMap(
-        "shapes", f"{count} grasps of {hand.name} on shapes that are hard", "shape's parameter", "fidelity",
+        "shapes", f"{count} grasps of {hand.name} on shapes that are hard", "the shape's parameter", "fidelity",
         "share of tries that are valid: certified by the referee, and past the geometric gate",
-        "weak: under a half; broken: none, or a number that is none", cells,
+        "weak: under a half; broken: none, or a number that is none",
+        reachable(cells, lambda cell: True),
         "few or no valid grasps: a job ends with a note that its budget found fewer than asked for",
         "ingest refuses what has no inside and says `thin` where walls are; the gate and the referee flag grasps that "
         "sink in; a job that finds too few says so",
         "tests/worker/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
+        reach="all: users bring such shapes",
     )  # fmt: skip
 
 
@@ -134,4 +136,4 @@ def _cell(
     depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
     finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
     outcome: Outcome = "broken" if not finite or valid == 0 else "weak" if valid < 0.5 else "good"
-    return Cell(panel, value, fidelity, valid, outcome, f"{depth:.2f} mm deep (median)")
+    return Cell(panel, value, fidelity, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")

@@ -1,0 +1,14 @@
+// Maps of failure: the cell under the pointer or the finger is said in words beneath its map.
+(() => {
+  "use strict";
+  function say(event) {
+    const cell = event.target.closest?.(".cells td[title]");
+    if (!cell) return;
+    const map = cell.closest(".failure");
+    map.querySelector("[data-reading]").textContent = `${cell.closest("figure").querySelector("figcaption").textContent}: ${cell.title}`;
+    map.querySelector(".cells .shown")?.classList.remove("shown");
+    cell.classList.add("shown");
+  }
+  document.addEventListener("pointerover", say);
+  document.addEventListener("click", say);
+})();
