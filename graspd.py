@@ -52,6 +52,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("hands", "check", "worker.hands.commands", "Say whether a hand can be used, and what was guessed about it."),
     ("objects", "check", "worker.objects.commands", "Say whether a mesh can be used, and what was repaired."),
+    ("datasets", "card", "worker.cards.commands", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
 #: What a room cannot work without, and the extra that brings it: an image has only the rooms it needs.

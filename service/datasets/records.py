@@ -16,6 +16,7 @@ from service import names
 from service.clock import timestamp
 from service.digests import digest_json
 from service.domain import Digest, JobOptions, JobRequest, Lane, Name
+from service.errors import NotFoundError
 from service.records import JobRecord, Record, put_record, read_record
 from service.store import Store
 
@@ -153,6 +154,16 @@ def add_dataset_event(store: Store, name: str, what: Literal["cancelled", "retri
 def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
     """A snapshot; NotFoundError if there is none."""
     return read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
+
+
+def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
+    """The newest snapshot of a dataset, or the one with a digest; NotFoundError if there is none."""
+    if digest is not None:
+        return load_snapshot(store, dataset, digest)
+    taken = [read_record(Snapshot, store, entry.key) for entry in store.list(names.dataset_snapshots(dataset))]
+    if not taken:
+        raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
+    return max(taken, key=lambda one: (one.created, one.digest))
 
 
 def object_set_of(name: str, objects: Iterable[str], *, after: str = "") -> ObjectSet:

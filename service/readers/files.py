@@ -10,7 +10,7 @@ from typing import Final
 import h5py
 
 from service import names
-from service.datasets.records import Snapshot
+from service.datasets.records import newest_snapshot
 from service.errors import InputError, NotFoundError
 from service.manifests import load_manifest, shard_exists
 from service.planning import plan
@@ -162,14 +162,7 @@ def _of_job(store: Store, job: str) -> Iterator[ShardFile]:
 
 
 def _of_snapshot(store: Store, dataset: str, digest: str | None) -> Iterator[ShardFile]:
-    if digest is not None:
-        taken = read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
-    else:
-        folder = names.dataset_snapshots(dataset)
-        every = [read_record(Snapshot, store, entry.key) for entry in store.list(folder)]
-        if not every:
-            raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
-        taken = max(every, key=lambda one: (one.created, one.digest))
+    taken = newest_snapshot(store, dataset, digest)
     for shard in taken.shards:
         yield ShardFile(shard.id, shard.kind, shard.hand, shard.object, shard.batch, key=shard.key, sha256=shard.sha256)
 

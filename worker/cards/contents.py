@@ -1,0 +1,196 @@
+"""What a card is made of: a dataset's snapshot in a store, or a folder of shards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+
+from service.assets import builtin_asset, builtin_names
+from service.datasets.records import DatasetRecord, Snapshot, job_of, load_dataset, newest_snapshot
+from service.domain import AssetKind
+from service.errors import InputError, NotFoundError
+from service.library import load_asset, load_asset_files, load_check
+from service.planning import plan
+from service.readers import Shards, open_shards
+from service.records import parse_record, task_attempts
+from service.store import Store
+from service.version import PACKAGE_VERSION
+
+Pair = tuple[str, str]
+_BUILTIN_LICENCE: Final = "Apache-2.0"
+
+
+@dataclass(frozen=True)
+class AssetFacts:
+    """A hand or an object as the store knows it; what it does not know is empty."""
+
+    name: str
+    digest: str = ""
+    licence: str = ""
+    source: str = ""
+    description: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """What its check measured, SI units."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Batches of a cell that the snapshot lacks, and why."""
+
+    tasks: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A dataset as a card sees it. `snapshot` and `record` are None where only files are there."""
+
+    name: str
+    shards: Shards
+    hands: Mapping[str, AssetFacts]
+    objects: Mapping[str, AssetFacts]
+    snapshot: Snapshot | None = None
+    record: DatasetRecord | None = None
+    gaps: Mapping[Pair, Gap] = field(default_factory=dict)
+    root: Path | None = None
+    """Folder of the shards, where they are files."""
+
+
+def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
+    """A snapshot of a dataset, by default the newest.
+
+    Raises:
+        NotFoundError: no such dataset or snapshot.
+        StoreUnavailable: the store does not answer.
+    """
+    taken = newest_snapshot(store, dataset, snapshot)
+    record = load_dataset(store, dataset)
+    return Contents(
+        dataset,
+        open_shards(store, dataset=dataset, snapshot=taken.digest, cache=cache),
+        {hand.name: _stored(store, AssetKind.HAND, hand.name, hand.digest) for hand in record.hands},
+        {obj.name: _stored(store, AssetKind.OBJECT, obj.name, obj.digest) for obj in record.objects},
+        taken,
+        record,
+        _gaps(store, record, taken),
+    )
+
+
+def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
+    """The shards of a folder, such as an export. Of hands and objects only those that come with graspd are known.
+
+    Raises:
+        NotFoundError: no shard in the folder.
+        InputError: a file is no shard, or `snapshot.json` is damaged.
+    """
+    shards = open_shards(folder)
+    listed = folder / "snapshot.json"
+    taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None
+    found = {kind: _digests(shards, kind) for kind in AssetKind}
+    hands, objects = (
+        {known: _builtin(kind, known, digest) for known, digest in sorted(found[kind].items())} for kind in AssetKind
+    )
+    known_as = name or (taken.dataset if taken else folder.resolve().name)
+    return Contents(known_as, shards, hands, objects, taken, root=folder)
+
+
+def with_provenance(contents: Contents, file: Path) -> Contents:
+    """The same with licences and sources from a JSON file, for hands and objects that were added without.
+
+    `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`; `*` stands for
+    all that are not named.
+
+    Raises:
+        InputError: no such JSON, or it names what the dataset does not hold.
+    """
+    try:
+        said = json.loads(file.read_text())
+        groups = {kind: {str(k): dict(v) for k, v in said.get(kind, {}).items()} for kind in ("hands", "objects")}
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}") from None
+    except (ValueError, AttributeError, TypeError):
+        raise InputError(f'{file} is not as {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
+    return replace(
+        contents,
+        hands=_informed(contents.hands, groups["hands"], file),
+        objects=_informed(contents.objects, groups["objects"], file),
+    )
+
+
+def _informed(
+    assets: Mapping[str, AssetFacts], said: Mapping[str, Mapping[str, Any]], file: Path
+) -> dict[str, AssetFacts]:
+    if unknown := set(said) - set(assets) - {"*"}:
+        raise InputError(f"{file} names {sorted(unknown)[0]!r}, which the dataset does not hold")
+    informed = {}
+    for name, asset in assets.items():
+        own = said.get(name, said.get("*", {}))
+        if wrong := set(own) - {"licence", "source", "description"}:
+            raise InputError(f"{file}: {name} has {sorted(wrong)[0]!r}; there are licence, source and description")
+        words = {key: str(own.get(key, getattr(asset, key))) for key in ("licence", "source", "description")}
+        informed[name] = replace(asset, **words)  # type: ignore[arg-type]
+    return informed
+
+
+def _stored(store: Store, kind: AssetKind, name: str, digest: str) -> AssetFacts:
+    try:
+        files = load_asset_files(store, kind, digest)
+        builtin = load_asset(store, kind, digest).builtin
+    except NotFoundError:
+        return AssetFacts(name, digest)
+    check = load_check(store, kind, digest) or {}
+    facts = check.get("facts") or (_checked(kind, name, files) if builtin else {})
+    return _described(name, digest, files, facts, builtin=builtin)
+
+
+def _builtin(kind: AssetKind, name: str, digest: str) -> AssetFacts:
+    if name in builtin_names(kind):
+        asset, files = builtin_asset(kind, name)
+        if asset.digest == digest:
+            return _described(name, digest, files, _checked(kind, name, files), builtin=True)
+    return AssetFacts(name, digest)
+
+
+def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *, builtin: bool) -> AssetFacts:
+    stated = json.loads(files["asset.json"])
+    licence, source = str(stated.get("licence", "")), str(stated.get("source", ""))
+    if builtin:
+        licence, source = licence or _BUILTIN_LICENCE, source or f"built into graspd {PACKAGE_VERSION}"
+    return AssetFacts(name, digest, licence, source, str(stated.get("description", "")), dict(facts))
+
+
+def _checked(kind: AssetKind, name: str, files: Mapping[str, bytes]) -> dict[str, Any]:
+    """What the check says of an asset that comes with graspd, so that it may be read in this process."""
+    from worker.hands.check import check_hand
+    from worker.objects.check import check_object
+
+    check: Callable[..., dict[str, Any]] = check_hand if kind is AssetKind.HAND else check_object
+    return dict(check(files, name)["facts"])
+
+
+def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
+    """Names and digests, as the first shard of each says."""
+    found: dict[str, str] = {}
+    for file in shards:
+        name = file.hand if kind is AssetKind.HAND else file.object
+        if name not in found:
+            with h5py.File(shards.path(file), "r") as opened:
+                found[name] = str(opened.attrs.get(f"{kind.value}_digest", ""))
+    return found
+
+
+def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, Gap]:
+    """What the record plans and the snapshot does not hold."""
+    there = {shard.id for shard in taken.shards}
+    gaps: dict[Pair, Gap] = {}
+    for cell in record.cells():
+        missing = [task for task in plan(job_of(cell, record.options, record.revisions)) if task.output not in there]
+        if missing:
+            reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
+            gaps[cell.hand.name, cell.object.name] = Gap(len(missing), next(reasons, "not made yet, or cancelled"))
+    return gaps

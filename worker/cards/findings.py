@@ -1,0 +1,227 @@
+"""What stands out in a dataset's figures: biases, gaps and failures that somebody who trains on it must know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+Row = Mapping[str, Any]
+
+#: A cell yields little below this part of the median of its hand's cells.
+_LITTLE: Final = 0.5
+#: A joint that lies within this share of its range in 98 of 100 grasps hardly moves.
+_STILL: Final = 0.05
+#: A joint is worth a word where more than this share of the grasps has it at a limit.
+_AT_LIMIT: Final = 0.5
+#: Directions of an object are worth a word where more of them are empty.
+_EMPTY: Final = 0.25
+#: Valid grasps per hand or object differ worth a word from this ratio on.
+_UNEVEN: Final = 1.2
+_SHOWN: Final = 8
+
+
+def findings(card: Row) -> list[str]:
+    """Sentences in Markdown, each with the figures it rests on."""
+    told = [_snapshot(card), *_gaps(card), _yields(card), _balance(card), _audits(card), *_table(card)]
+    told += [_directions(card), *_joints(card), _qualities(card), _repeated(card), *_mixed(card), *_unknown(card)]
+    return [line for line in told if line]
+
+
+def _snapshot(card: Row) -> str:
+    taken = card["snapshot"]
+    return (
+        "**Not complete**: the snapshot was taken before every cell had succeeded."
+        if taken and not taken["complete"]
+        else ""
+    )
+
+
+def _gaps(card: Row) -> list[str]:
+    missing = [cell for cell in card["cells"] if cell["missing_tasks"]]
+    told = [
+        f"**{_pair(cell)} lacks {cell['missing_tasks']} of its shards**: {cell['missing_because']}."
+        for cell in missing[:_SHOWN]
+    ]
+    if len(missing) > _SHOWN:
+        told.append(f"{len(missing) - _SHOWN} more cells lack shards; `card.json` lists them.")
+    wanted = (card["making"]["options"] or {}).get("want") == "valid"
+    short = [c for c in card["cells"] if wanted and not c["missing_tasks"] and c["valid"] < c["asked"]]
+    if short:
+        short.sort(key=lambda cell: cell["valid"] / cell["asked"])
+        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['tried']} tries)" for c in short])
+        told.append(
+            f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before all valid grasps were found: "
+            f"{each}."
+        )
+    return told
+
+
+def _yields(card: Row) -> str:
+    rows = [cell for cell in card["cells"] if cell["of_tries"] is not None]
+    low: list[Row] = []
+    for hand in dict.fromkeys(cell["hand"] for cell in rows):
+        own = [cell for cell in rows if cell["hand"] == hand]
+        middle = sorted(cell["of_tries"] for cell in own)[len(own) // 2]
+        low += [cell for cell in own if cell["of_tries"] < _LITTLE * middle]
+    if not low:
+        return ""
+    low.sort(key=lambda cell: cell["of_tries"])
+    each = _listed([f"{_pair(cell)} ({_percent(cell['of_tries'])})" for cell in low])
+    return (
+        f"**Hard pairs**, where under half as many tries are valid as usual for the hand: {each}. What they hold is a "
+        "selection of what was easy."
+    )
+
+
+def _balance(card: Row) -> str:
+    said = []
+    for what in ("hands", "objects"):
+        counts = {asset["name"]: asset["valid"] for asset in card["composition"][what]}
+        if len(counts) < 2:
+            continue
+        least, most = min(counts, key=counts.__getitem__), max(counts, key=counts.__getitem__)
+        if counts[most] >= _UNEVEN * max(1, counts[least]):
+            said.append(f"{what[:-1]} {most} has {counts[most]:,} valid grasps and {least} {counts[least]:,}")
+    return f"**Uneven**: {'; '.join(said)}." if said else ""
+
+
+def _audits(card: Row) -> str:
+    found = card["validity"]
+    if not found["audited"]:
+        return (
+            "**No audits**: no verdict was checked by the letter of the protocol, so the share of false ones is not "
+            "known."
+        )
+    wrong = [
+        f"{_pair(cell)} ({cell['audit_dropped']} of {cell['audited']})"
+        for cell in card["cells"]
+        if cell["audit_dropped"]
+    ]
+    if not wrong:
+        return ""
+    rate = found["false_valid"]
+    return (
+        f"**Audits overturned {found['audit_dropped']} of {found['audited']:,} verdicts** "
+        f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): {_listed(wrong)}."
+    )
+
+
+def _table(card: Row) -> list[str]:
+    found = card["table"]
+    if not found["grasps"]:
+        return []
+    told = [
+        f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are in no scene clear of the table** "
+        f"({found['clear']:,} of {found['grasps']:,} are; {_percent(found['of_pairs']['share'])} of all pairs of grasp "
+        "and scene): grasps are planned around a free object, from all sides."
+    ]
+    rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
+    worst = sorted(rows, key=rows.__getitem__)[:3]
+    if len(rows) > 3:
+        told[0] += f" Fewest on {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
+    clear = [sum(column) for column in zip(*(sums["clear"] for sums in card["elevation"].values()), strict=True)]
+    if sum(clear):
+        # Elevations from -90 to 90 degrees: the upper quarter of them is 45 degrees and more.
+        above = sum(clear[3 * len(clear) // 4 :]) / sum(clear)
+        told.append(
+            f"Of the pairs that are clear of the table {_percent(above)} have the palm come from 45° or more above the "
+            "horizontal."
+        )
+    return told
+
+
+def _directions(card: Row) -> str:
+    rows = card["directions"]
+    some = {name: row for name, row in rows["by_object"].items() if row and row["grasps"] >= rows["enough"]}
+    empty = {name: row["empty"] for name, row in some.items() if row["empty"] > _EMPTY * rows["cells"]}
+    if not some:
+        return ""
+    if not empty:
+        most = max(some, key=lambda name: some[name]["empty"])
+        return (
+            f"Hands come from nearly everywhere: of {rows['cells']} directions of equal area no object lacks more than "
+            f"{some[most]['empty']} ({most})."
+        )
+    each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
+    return f"**Directions never used**, of {rows['cells']} of equal area in the object's frame: {each}."
+
+
+def _joints(card: Row) -> list[str]:
+    told = []
+    for hand, joints in card["joints"].items():
+        still = [f"`{name}` ({_percent(use['used'])})" for name, use in joints.items() if use["used"] < _STILL]
+        if still:
+            told.append(f"**{hand} hardly moves** {_listed(still)} (share of the range that 98 % of the grasps use).")
+        ends = [
+            f"`{name}` {end} ({_percent(use[key])})"
+            for name, use in joints.items()
+            for key, end in (("at_lower", "lower"), ("at_upper", "upper"))
+            if use[key] > _AT_LIMIT and use["used"] >= _STILL
+        ]
+        if ends:
+            told.append(f"**{hand} has joints at a limit** in more than half of its grasps: {_listed(ends)}.")
+    return told
+
+
+def _qualities(card: Row) -> str:
+    said = []
+    for hand, found in card["quality"].items():
+        parts = []
+        if (epsilon := found.get("epsilon")) and epsilon["zero"] > 0.01:
+            parts.append(f"{_percent(epsilon['zero'])} have ε = 0 (no force closure at this contact threshold)")
+        if (depth := found.get("penetration_depth_mm")) and depth["p95"] > 1:
+            parts.append(f"5 % penetrate deeper than {depth['p95']:.1f} mm")
+        if (robust := found.get("robustness")) and robust["median"] < 1:
+            parts.append(
+                f"half lose {_percent(1 - robust['median'])} of their verdicts or more to 1 mm and 1° of noise"
+            )
+        if parts:
+            said.append(f"{hand}: {'; '.join(parts)}")
+    return f"**Valid is not ideal.** {'. '.join(said)}." if said else ""
+
+
+def _repeated(card: Row) -> str:
+    count = card["repeated"]
+    return f"**{count:,} valid grasps equal another** of their cell to six digits." if count else ""
+
+
+def _mixed(card: Row) -> list[str]:
+    making = card["making"]
+    told = []
+    for key, what in (
+        ("methods", "methods"), ("levels", "levels of the referee"), ("friction", "friction coefficients"),
+        ("code_versions", "versions of graspd"), ("wants", "wishes (raw and valid)"), ("devices", "devices"),
+    ):  # fmt: skip
+        if len(making[key]) > 1:
+            told.append(
+                f"**Mixed {what}**: {', '.join(map(str, making[key]))}. Attributes of each shard tell them apart."
+            )
+    if len({str(knobs) for knobs in making["fidelities"]}) > 1:
+        told.append(f"**Mixed fidelities**: {', '.join(str(knobs.get('name')) for knobs in making['fidelities'])}.")
+    return told
+
+
+def _unknown(card: Row) -> list[str]:
+    told = []
+    for what in ("hands", "objects"):
+        nameless = [asset["name"] for asset in card["composition"][what] if not asset["licence"]]
+        if nameless:
+            told.append(
+                f"**Licence not recorded** for {len(nameless)} {what}: {_listed(nameless)}. Ask who made them "
+                "before you pass this on."
+            )
+    return told
+
+
+def _pair(cell: Row) -> str:
+    return f"{cell['hand']} on {cell['object']}"
+
+
+def _listed(words: Sequence[str]) -> str:
+    rest = f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else ""
+    return ", ".join(words[:_SHOWN]) + rest
+
+
+def _percent(value: float) -> str:
+    """A share with as many digits as it needs."""
+    return f"{100 * value:.0f} %" if value >= 0.095 or value == 0 else f"{100 * value:.1f} %"
