@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,20 +13,15 @@ import torch
 import typer
 
 from examples.train_grasp_predictor import evaluation
-from examples.train_grasp_predictor.evaluation import Score
+from examples.train_grasp_predictor.evaluation import Held
 from examples.train_grasp_predictor.samples import Example, examples
+from examples.train_grasp_predictor.table import Row, markdown
 from examples.train_grasp_predictor.training import train
-from service.readers import open_shards
+from service.readers import Shards, open_shards
 from worker import backend
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-
-_HEADINGS = {
-    "contact_area_cm2": "CA cm²", "intersection_volume_cm3": "IV cm³", "epsilon": "ε", "wrench_volume": "Vol",
-    "simulated_displacement_cm": "SD cm", "gsr": "GSR",
-}  # fmt: skip
 
 
 def main(
@@ -44,48 +39,42 @@ def main(
     """Train a grasp predictor on each source of data and compare what they propose for unseen objects."""
     torch.set_num_threads(threads)
     backend.start()
-    folders = dict(entry.split("=", 1) for entry in source)
     back = held_out.split(",")
-    data = {name: list(examples(open_shards(folder))) for name, folder in folders.items()}
-    shown = data[views_of or next(iter(data))]
+    sources = {name: open_shards(folder) for name, folder in (entry.split("=", 1) for entry in source)}
+    shown = list(examples(sources[views_of or next(iter(sources))].only(objects=back)))
     model = hand_from_path(hand)
-    tests = {name: (object_from_path(meshes / name / "clean.stl"), _of(shown, name)[:pictures]) for name in back}
-    rows: list[dict[str, Any]] = []
+    tests = [Held.of(name, object_from_path(meshes / name / "clean.stl"), _of(shown, name)[:pictures]) for name in back]
+    rows = [row for name, shards in sources.items() for row in _grasps_in(name, shards, back)]
     for seed in range(seeds):
-        for name, everything in data.items():
-            seen = [example for example in everything if example.object not in back]
-            network, final = train(seen, steps=steps, seed=seed)
-            for obj_name, (obj, views) in tests.items():
-                grasps = evaluation.carried_out(model, obj, *evaluation.proposals(network, views))
-                made = evaluation.score(model, obj, grasps)
-                rows.append({"source": name, "seed": seed, "object": obj_name, "loss": final, **asdict(made)})
-                typer.echo(json.dumps(rows[-1]))
+        for row in _grasps_out(model, sources, tests, back, steps=steps, seed=seed):
+            typer.echo(json.dumps(row))
+            rows.append(row)
             output.write_text(json.dumps(rows, indent=1) + "\n")
-        rows += _control(model, tests, seed)
-    output.write_text(json.dumps(rows, indent=1) + "\n")
-    typer.echo(table(rows, {name: _sizes(some, back) for name, some in data.items()}))
+    typer.echo(markdown(rows))
 
 
-def table(rows: list[dict[str, Any]], sizes: dict[str, str]) -> str:
-    """Markdown in the layout of the paper's Table 3: a line for each source, mean and spread over the seeds."""
-    lines = ["| trained on | pictures, grasps | " + " | ".join(_HEADINGS.values()) + " |", "| --- " * 8 + "|"]
-    for name in dict.fromkeys(row["source"] for row in rows):
-        seeds = sorted({row["seed"] for row in rows if row["source"] == name})
-        cells = []
-        for metric in _HEADINGS:
-            means = [fmean(r[metric] for r in rows if r["source"] == name and r["seed"] == seed) for seed in seeds]
-            cells.append(f"{fmean(means):.3g} ± {stdev(means):.2g}" if len(means) > 1 else f"{means[0]:.3g}")
-        lines.append(f"| {name} | {sizes.get(name, '')} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def _grasps_in(name: str, shards: Shards, back: list[str]) -> Iterator[Row]:
+    """What a source teaches: figures of its grasps on the objects trained on."""
+    for obj in sorted({file.object for file in shards.of("base")} - set(back)):
+        yield {"source": name, "side": "data", "object": obj, **asdict(evaluation.in_data(shards, obj))}
 
 
-def _control(hand: HandModel, tests: dict[str, tuple[ObjectModel, list[Example]]], seed: int) -> list[dict[str, Any]]:
-    rows = []
-    for name, (obj, views) in tests.items():
-        count = evaluation.TAKEN * len(views)
-        made = evaluation.score(hand, obj, evaluation.anywhere(hand, obj, count, seed))
-        rows.append({"source": "no network", "seed": seed, "object": name, **asdict(made)})
-    return rows
+def _grasps_out(
+    hand: HandModel, sources: dict[str, Shards], tests: list[Held], back: list[str], *, steps: int, seed: int
+) -> Iterator[Row]:
+    """What the networks propose for the held-back objects, and a control without a network."""
+    for name, shards in sources.items():
+        names = {file.object for file in shards.of("base")} - set(back)
+        seen = list(examples(shards.only(objects=names)))
+        network, final = train(seen, steps=steps, seed=seed)
+        facts: dict[str, Any] = {"source": name, "side": "network", "seed": seed, "loss": final, "pictures": len(seen)}
+        for held in tests:
+            grasps = evaluation.carried_out(hand, held.model, *evaluation.proposals(network, held.pictures))
+            yield facts | {"object": held.name, **asdict(evaluation.score(hand, held, grasps))}
+    for held in tests:
+        grasps = evaluation.anywhere(hand, held.model, evaluation.TAKEN * len(held.pictures), seed)
+        made = asdict(evaluation.score(hand, held, grasps))
+        yield {"source": "no network", "side": "network", "seed": seed, "object": held.name, **made}
 
 
 def _of(some: list[Example], name: str) -> list[Example]:
@@ -94,16 +83,6 @@ def _of(some: list[Example], name: str) -> list[Example]:
     order = np.random.default_rng(0).permutation(len(found))
     return [found[i] for i in order]
 
-
-def _sizes(some: list[Example], back: list[str]) -> str:
-    seen = [example for example in some if example.object not in back]
-    grasps = {
-        (example.object, tuple(example.grasps[k, -3:].tolist())) for example in seen for k in range(len(example.grasps))
-    }
-    return f"{len(seen)}, {len(grasps)}"
-
-
-assert {field.name for field in fields(Score)} >= set(_HEADINGS)
 
 if __name__ == "__main__":
     typer.run(main)

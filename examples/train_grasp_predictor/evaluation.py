@@ -7,9 +7,9 @@ and a control replaces the proposals by hands that look at the object from anywh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from examples.train_grasp_predictor.network import Predictor
 from examples.train_grasp_predictor.samples import Example
+from service.readers import Grasps, Shards
+from service.shards import read_shard
 from service.transforms import compose, invert, quat_from_matrix, quat_rotate
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -25,6 +27,7 @@ from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import Closer
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.ground import free_starts, grasp_set, ground_of
+from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
@@ -36,6 +39,9 @@ Floats = NDArray[np.float64]
 TAKEN: Final = 4
 #: Share of the way from the proposed joints to the pre-shape that the fingers open.
 OPENING: Final = 0.6
+#: Contact threshold of areas and wrench spaces [m]; how many grasps of an object count for them, best epsilon first.
+CONTACT_M: Final = 0.005
+BEST: Final = 10
 #: Distances the hand backs off, of which the first that is clear is taken [m].
 BACK_M: Final = tuple(0.01 * k for k in range(13))
 CLEAR_M: Final = 0.002
@@ -55,6 +61,20 @@ class Score:
     gsr: float
 
 
+@dataclass(frozen=True)
+class Held:
+    """A held-back object: its pictures, and its convex pieces for the referee."""
+
+    name: str
+    model: ObjectModel
+    pieces: ConvexPieces
+    pictures: Sequence[Example]
+
+    @classmethod
+    def of(cls, name: str, model: ObjectModel, pictures: Sequence[Example]) -> Held:
+        return cls(name, model, decompose(model), pictures)
+
+
 def proposals(network: Predictor, pictures: Sequence[Example]) -> tuple[Floats, Floats]:
     """Hand poses (N, 7) in the object's frame and joints (N, J) of the best proposals for each picture."""
     with torch.no_grad():
@@ -63,11 +83,15 @@ def proposals(network: Predictor, pictures: Sequence[Example]) -> tuple[Floats, 
     poses, joints = [], []
     for picture, rows, chosen in zip(pictures, grasps.numpy().astype(float), best.numpy(), strict=True):
         for row in rows[chosen]:
-            quaternion = quat_from_matrix(orthogonal(row[3:9]))
-            hand = np.concatenate([row[:3] + picture.anchor, quaternion])
-            poses.append(compose(invert(picture.object_pose), hand))
+            poses.append(in_object_frame(row, picture))
             joints.append(row[9:])
     return np.array(poses), np.array(joints)
+
+
+def in_object_frame(row: Floats, picture: Example) -> Floats:
+    """(7,) hand pose of an answer (9 + J,) of the network: the inverse of `samples.targets_of`."""
+    hand = np.concatenate([row[:3] + picture.anchor, quat_from_matrix(orthogonal(row[3:9]))])
+    return compose(invert(picture.object_pose), hand)
 
 
 def orthogonal(columns: Floats) -> Floats:
@@ -95,22 +119,35 @@ def anywhere(hand: HandModel, obj: ObjectModel, count: int, seed: int) -> GraspS
     return _executed(pair, free_starts(pair, seed=seed, batch=0, indices=range(count)))
 
 
-def score(hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, friction: float = 1.0) -> Score:
+def score(hand: HandModel, held: Held, grasps: GraspSet, *, friction: float = 1.0) -> Score:
     """Metrics at 5 mm as means of the ten best by epsilon; success over all."""
-    columns = measure(hand, obj, grasps, friction=friction)
-    at = int(np.argmin(np.abs(columns["quality/thresholds_m"] - 0.005)))
-    epsilon = np.asarray(columns["quality/epsilon"], float)[:, at]
-    top = np.argsort(-epsilon)[:10]
-    displaced = simulated_displacement_cm(hand, obj, grasps.take(top))
-    return Score(
-        len(grasps),
-        float(np.asarray(columns["quality/contact_area_cm2"], float)[top, at].mean()),
-        float(np.asarray(columns["quality/intersection_volume_cm3"], float)[top].mean()),
-        float(epsilon[top].mean()),
-        float(np.asarray(columns["quality/wrench_volume"], float)[top, at].mean()),
-        float(np.nanmean(displaced)),
-        float(judge(hand, obj, grasps, level="certificate").success.mean()),
-    )
+    obj, pieces = held.model, held.pieces
+    columns = dict(measure(hand, obj, grasps, friction=friction))
+    columns["quality/success"] = judge(hand, obj, grasps, level="certificate", pieces=pieces).success
+    columns["quality/simulated_displacement_cm"] = simulated_displacement_cm(hand, obj, grasps.grasp, pieces=pieces)
+    return _summary(columns)
+
+
+def in_data(shards: Shards, name: str) -> Score:
+    """What a source shows of an object, by the figures that stand in its shards."""
+    paths = [f"quality/{field}" for field in (*_SWEPT, *_SINGLE, "success")]
+    arrays = Grasps(shards.only(objects=[name]), paths, valid=False).arrays()
+    first = shards.only(objects=[name]).of("base")[0]
+    return _summary(arrays | {"quality/thresholds_m": read_shard(shards.path(first))["quality/thresholds_m"]})
+
+
+_SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
+_SINGLE: Final = ("intersection_volume_cm3", "simulated_displacement_cm")
+
+
+def _summary(columns: Mapping[str, Any]) -> Score:
+    at = int(np.argmin(np.abs(np.asarray(columns["quality/thresholds_m"]) - CONTACT_M)))
+    found = {name: np.asarray(columns[f"quality/{name}"], float)[:, at] for name in _SWEPT}
+    found |= {name: np.asarray(columns[f"quality/{name}"], float) for name in _SINGLE}
+    best = np.argsort(-found["epsilon"])[:BEST]
+    success = np.asarray(columns["quality/success"], float)
+    means = {name: float(np.nanmean(values[best])) for name, values in found.items()}
+    return Score(grasps=len(success), gsr=float(success.mean()), **means)
 
 
 def _executed(pair: Pair, state: HandState) -> GraspSet:

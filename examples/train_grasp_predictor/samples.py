@@ -35,10 +35,10 @@ class Example:
     """(5, SIZE, SIZE): colour in [0, 1], depth, mask."""
     grasps: torch.Tensor
     """(K, 3 + 6 + J): hand position from the anchor [m], first two columns of its rotation, joints [rad]."""
-    anchor: np.ndarray  # type: ignore[type-arg]
+    anchor: np.ndarray
     """(3,) in the camera's frame [m]."""
     object: str
-    object_pose: np.ndarray  # type: ignore[type-arg]
+    object_pose: np.ndarray
     """(7,) object in the camera's frame."""
 
 
@@ -52,7 +52,7 @@ def examples(shards: Shards) -> Iterator[Example]:
             yield Example(image, targets, anchor, sample["object"], np.asarray(sample["object/pose"]))
 
 
-def crop_of(sample: dict[str, Any]) -> tuple[torch.Tensor, np.ndarray] | None:  # type: ignore[type-arg]
+def crop_of(sample: dict[str, Any]) -> tuple[torch.Tensor, np.ndarray] | None:
     """The network's input and the anchor (3,) [m]; None where less than 30 pixels of the object are seen."""
     mask = sample["image/segmentation"] == _OBJECT
     if mask.sum() < 30:

@@ -30,9 +30,10 @@ def train(examples: Sequence[Example], *, steps: int, seed: int, rate: float = 1
         chosen = torch.randint(len(examples), (BATCH,)).tolist()
         images = torch.stack([_jittered(examples[i].image) for i in chosen])
         shown = torch.stack([_drawn(examples[i].grasps) for i in chosen])
-        value = loss(*network(images), shown)
+        proposed, logits = network(images)
+        value = loss(proposed, logits, shown)
         optimiser.zero_grad()
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         optimiser.step()
         schedule.step()
         if step >= 0.9 * steps:
