@@ -84,6 +84,11 @@ class StabilityMap:
         """Cells that a job can come to."""
         return [cell for cell in self.cells if cell.reached]
 
+    @property
+    def is_divided(self) -> bool:
+        """Whether some cells are within reach of a job and some are not."""
+        return 0 < len(self.reached()) < len(self.cells)
+
     def still_breaks(self) -> list[str]:
         """Broken cells that a job can come to, a line for each panel: no guard keeps jobs from there."""
         lines = []
@@ -96,7 +101,7 @@ class StabilityMap:
             for x, ys in by_x.items():
                 by_y.setdefault(", ".join(ys), []).append(tick(x))
             if by_y:
-                lines.append(f"{panel}: " + "; ".join(f"{', '.join(xs)} ({ys})" for ys, xs in by_y.items()))
+                lines.append(f"{panel} " + "; ".join(f"{', '.join(xs)} ({ys})" for ys, xs in by_y.items()))
         return lines
 
 

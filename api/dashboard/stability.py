@@ -65,8 +65,6 @@ class Drawn:
     counts: dict[Outcome, int]
     reached: list[Share]
     still_breaks: list[str]
-    has_rings: bool
-    """Whether some cells stand out as within reach of a job."""
 
 
 def load(store: Store) -> Stability | None:
@@ -80,21 +78,19 @@ def load(store: Store) -> Stability | None:
 
 def draw(one: StabilityMap) -> Drawn:
     """A map as panels and numbers."""
-    rings = 0 < len(one.reached()) < len(one.cells)
     return Drawn(
         map=one,
-        panels=[_panel(one, name, rings=rings) for name in one.panels],
+        panels=[_panel(one, name) for name in one.panels],
         counts={outcome: number for outcome, number in counts(one.cells).items() if number},
         reached=_shares(one.reached()),
         still_breaks=one.still_breaks(),
-        has_rings=rings,
     )
 
 
-def _panel(one: StabilityMap, name: str, *, rings: bool) -> Panel:
+def _panel(one: StabilityMap, name: str) -> Panel:
     cells = one.of(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
-    squares = {(cell.x, cell.y): _square(one, cell, ringed=rings and cell.reached) for cell in cells}
+    squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Words stand better before a row than under a narrow column.

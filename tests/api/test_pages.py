@@ -144,7 +144,9 @@ def test_the_buttons_cancel_and_retry_a_job(http: TestClient, parts: Parts) -> N
         assert http.get(f"/v1/jobs/{record.id}").json()["state"] == state
 
 
-@pytest.mark.parametrize("path", ["/", "/datasets", "/grasps", "/workers", "/chart", "/submit", "/problems"])
+@pytest.mark.parametrize(
+    "path", ["/", "/datasets", "/grasps", "/workers", "/chart", "/stability", "/submit", "/problems"]
+)
 def test_no_page_asks_for_anything_from_elsewhere_or_inline(http: TestClient, path: str) -> None:
     page = http.get(path).text
     addresses = re.findall(r'(?:src|href|action)="([^"]*)"', page)

@@ -13,7 +13,9 @@ from service.datasets import actions
 from service.datasets.spec import DatasetRequest
 from service.parts import Parts
 from service.planning import plan
+from service.published import publish
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+from tests.api.test_stability_page import a_record
 
 pytestmark = pytest.mark.browser
 
@@ -42,10 +44,11 @@ def places(parts: Parts) -> list[str]:
     wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug", "block"]})
     actions.create(parts, wanted)
     parts.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    publish(parts.store, "stability", a_record())
     return [
         "/", "/datasets", "/datasets/kitchen", "/datasets/kitchen?state=queued", f"/jobs/{record.id}",
         f"/jobs/{waiting.id}", "/grasps", "/grasps?view=table", "/grasps?min_epsilon=99", f"/grasps/{shard}/0",
-        "/workers", "/chart", "/submit", "/problems", "/login",
+        "/workers", "/chart", "/stability", "/submit", "/problems", "/login",
     ]  # fmt: skip
 
 
@@ -117,6 +120,29 @@ def test_a_chart_that_is_published_appears(page: Any, parts: Parts) -> None:
     page.wait_for_selector(".trade circle", timeout=2 * LIVE_MS)
 
 
+def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, parts: Parts) -> None:
+    page.goto("/stability")
+    page.wait_for_selector("text=Nothing is measured yet")
+    publish(parts.store, "stability", a_record())
+    page.wait_for_selector(".cells td.broken", timeout=2 * LIVE_MS)
+    page.locator("#stiffness .cells td.broken").first.hover()
+    assert "penalty: stiffness [N/m] 1e4, time step [s] 0.01: broken; note 4" in page.inner_text("#stiffness .reading")
+
+
+def test_the_bound_of_theory_lies_over_its_cells_at_every_width(page: Any, parts: Parts) -> None:
+    publish(parts.store, "stability", a_record())
+    for width in (390, 1440):
+        page.set_viewport_size({"width": width, "height": 800})
+        page.goto("/stability")
+        line, last = (
+            page.locator(f"#stiffness {part}").bounding_box()
+            for part in (".bound", "tbody tr:last-child td:last-child")
+        )
+        # Half of a cell's gap, rounded.
+        assert abs(line["x"] + line["width"] - (last["x"] + last["width"])) <= 2
+        assert abs(line["y"] + line["height"] - (last["y"] + last["height"])) <= 2
+
+
 def test_no_page_scrolls_sideways(page: Any, places: list[str]) -> None:
     for width in (390, 768, 1440):
         page.set_viewport_size({"width": width, "height": 800})
@@ -157,6 +183,7 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     assert "allegro × mug" in of("/grasps")
     assert "kitchen" in of("/datasets")
     assert "standard" in of("/chart")
+    assert "hands sink in" in of("/stability")
 
 
 def test_an_error_is_a_page_of_its_own(page: Any) -> None:

@@ -47,7 +47,7 @@ def test_what_still_breaks_are_the_broken_cells_that_a_job_can_come_to() -> None
         Cell("a", 9.0, "fine", 0.0, "broken", reached=True), Cell("a", 9.0, "draft", 0.9, "good", reached=True),
         Cell("b", 1.0, "draft", 0.0, "broken"), Cell("b", 2.0, "draft", 0.0, "refused", reached=True),
     )  # fmt: skip
-    assert one.still_breaks() == ["a: 1, 3 (draft, fine); 9 (fine)"]
+    assert one.still_breaks() == ["a 1, 3 (draft, fine); 9 (fine)"]
     assert counts(one.reached()) == {"good": 1, "weak": 0, "broken": 5, "refused": 1}
 
 

@@ -4,9 +4,10 @@
   function say(event) {
     const cell = event.target.closest?.(".cells td[title]");
     if (!cell) return;
-    const map = cell.closest(".failure");
-    map.querySelector("[data-reading]").textContent = `${cell.closest("figure").querySelector("figcaption").textContent}: ${cell.title}`;
-    map.querySelector(".cells .shown")?.classList.remove("shown");
+    const reading = cell.closest(".failure").querySelector("[data-reading]");
+    for (const other of document.querySelectorAll("[data-reading]")) if (other !== reading) other.textContent = "";
+    reading.textContent = `${cell.closest("figure").querySelector("figcaption").textContent}: ${cell.title}`;
+    document.querySelector(".cells .shown")?.classList.remove("shown");
     cell.classList.add("shown");
   }
   document.addEventListener("pointerover", say);

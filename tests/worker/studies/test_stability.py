@@ -133,7 +133,7 @@ def test_a_report_has_a_picture_and_a_table_for_each_map(tmp_path: Path) -> None
 
 def test_a_report_says_what_still_breaks_and_how_a_user_sees_it() -> None:
     said = markdown(a_record())
-    assert "| A demo | 1 | 0 | 1 | 0 | a: 2 (10) | it flies |" in said
+    assert "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
     whole = [replace(cell, outcome="good") for cell in a_map().cells]
     assert "| A demo | 2 | 0 | 0 | 0 | nothing | – |" in markdown(a_record(a_map(cells=whole)))
 

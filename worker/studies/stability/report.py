@@ -23,7 +23,7 @@ _COLUMNS: Final = 3
 #: Sizes of the numbers on cells [pt], largest first; where not even the last fits, the cell says nothing.
 _FONT_SIZES: Final = (7.0, 6.0, 5.0)
 #: Longer names of ticks are broken into lines.
-_TICK_LETTERS: Final = 20
+_TICK_LETTERS: Final = 14
 
 
 def write(found: Stability, folder: Path) -> list[Path]:
@@ -88,7 +88,8 @@ def draw(one: StabilityMap, path: Path) -> None:
         axes.set_visible(False)
     present = [outcome for outcome, number in counts(one.cells).items() if number]
     handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
-    handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="within reach of a job"))
+    if one.is_divided:
+        handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="within reach of a job"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     figure.draw_without_rendering()
@@ -103,12 +104,11 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     for cell in cells:
         at = xs.index(cell.x), ys.index(cell.y)
         fill, ink = COLOURS[cell.outcome]
-        axes.add_patch(_square(at, fill, framed=cell.reached and not all(cell.reached for cell in one.cells)))
+        axes.add_patch(_square(at, fill, framed=cell.reached and one.is_divided))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)
-    names = [_wrapped(x) for x in xs]
     axes.set_xlim(-0.5, len(xs) - 0.5)
     axes.set_ylim(-0.5, len(ys) - 0.5)
-    axes.set_xticks(range(len(xs)), names, fontsize=8, rotation=20 if any("\n" in name for name in names) else 0)
+    axes.set_xticks(range(len(xs)), [_wrapped(x) for x in xs], fontsize=8)
     axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
     axes.set_xlabel(one.x, fontsize=9)
     axes.set_ylabel(one.y, fontsize=9)
