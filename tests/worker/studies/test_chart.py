@@ -20,7 +20,8 @@ from worker.studies.chart.commands import app
 from worker.studies.chart.report import markdown
 from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed, wilson
-from worker.studies.chart.sweeps import Turn, _asking, _run, turns
+from worker.studies.chart.sweeps import Turn, _run, turns
+from worker.studies.chart.variants import asking_each
 
 RUN_KEYS = {
     "method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon", "pd_mm",
@@ -75,6 +76,7 @@ def test_a_published_chart_is_the_latest_in_the_store(made: tuple[dict[str, Any]
     [
         ["--methods", "magic"], ["--fidelities", "superb"], ["--batch", "many"], ["--hands", ","],
         ["--option", "steps=3"], ["--methods", "graspit", "--option", "graspit:steps=1"], ["--objects", "nowhere.stl"],
+        ["--sweep", "--knob", "volume"],
     ],
 )  # fmt: skip
 def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
@@ -157,12 +159,18 @@ def test_each_knob_has_the_default_among_its_values_once() -> None:
         assert sum(turn.default for turn in found if turn.knob == knob) == 1
 
 
+def test_one_knob_can_be_turned_alone() -> None:
+    assert [(turn.knob, turn.value) for turn in turns(knobs=["contact solve"])] == [
+        ("contact solve", "float32"), ("contact solve", "float64"),
+    ]  # fmt: skip
+
+
 def test_asking_for_distances_anew_changes_no_grasp() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
         _run(hand, obj, 2, 0, turn=Turn("queries", "", little, change), threads=1, device="cpu")
-        for change in (None, _asking)
+        for change in (None, asking_each)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)
     np.testing.assert_array_equal(shared.grasp.joint_positions, anew.grasp.joint_positions)

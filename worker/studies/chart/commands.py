@@ -41,6 +41,9 @@ def chart(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Little of everything: seconds instead of an hour.")] = False,
     sweep: Annotated[bool, typer.Option("--sweep", help="Also turn fast_graspd's knobs one at a time.")] = False,
+    knob: Annotated[
+        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solve'; several times.")
+    ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
@@ -57,7 +60,9 @@ def chart(
     from worker.studies.chart.report import markdown, write
     from worker.studies.chart.settings import settings_of
     from worker.studies.chart.sweeps import sweep as turn
+    from worker.studies.chart.sweeps import turns
 
+    turns(knobs=knob or ())  # a wrong name is told before an hour of work
     resolved = Device(device).resolve()
     batches = [_number(part) for part in _parts(batch)]
     if quick:
@@ -78,7 +83,7 @@ def chart(
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, threads=threads,
-            device=resolved, say=_say,
+            device=resolved, knobs=knob or (), say=_say,
         )  # fmt: skip
     if out is not None:
         write(result, out)

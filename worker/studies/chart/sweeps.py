@@ -1,8 +1,8 @@
 """fast_graspd's knobs turned one at a time: what each costs in accuracy and gains in speed.
 
-Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
-simulations share one closest-point query per hand point (as they do) or ask M times (as the paper's code does). There
-is no float64 path to compare float32 with: tests hold the kernels against float64 references instead.
+Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, whether the M simulations
+share one closest-point query per hand point (as they do) or ask M times (as the paper's code does), and the precision
+of the contact solve. Queries, kinematics and penalties stay float32 in both: Warp's queries know nothing else.
 """
 
 from __future__ import annotations
@@ -16,41 +16,23 @@ from typing import Any, Final
 import warp as wp
 
 from service.domain import FIDELITIES, Fidelity
+from service.errors import InputError
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.pairs import Pair, Side, pair_of
+from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
 from worker.quality.referee.decomposition import decompose
-from worker.simulation.simulation import LossOptions, Simulation
-from worker.studies.chart import kernels
+from worker.simulation.simulation import LossOptions
 from worker.studies.chart.cells import Cell, Setting
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import figures, plain
+from worker.studies.chart.variants import MODULES, asking_each, solving_in_64
 
 Say = Callable[[str], None]
 Change = Callable[[Pair], Pair]
 
 DEFAULT: Final = FIDELITIES["standard"]
-
-
-class AskingEach(Simulation):
-    """Every simulated velocity asks for the distances anew; the answers are the same."""
-
-    def _record_kinematics(self) -> None:
-        super()._record_kinematics()
-        gather = self._commands[-1]
-        for _ in range(self.options.velocities - 1):
-            self._launch(kernels.forget, self.capacity, [self.active, self.contacts])
-            self._commands.append(gather)
-
-
-@dataclass(frozen=True)
-class AskingPair(Pair):
-    """A pair whose simulations share no queries."""
-
-    def simulation(self, side: Side, capacity: int) -> Simulation:
-        return AskingEach(self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options)
 
 
 @dataclass(frozen=True)
@@ -78,12 +60,12 @@ def _options(**changes: Any) -> Change:
     return change
 
 
-def _asking(pair: Pair) -> Pair:
-    return AskingPair(pair.coarse, pair.fine, pair.options, pair.hand)
+def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
+    """All knobs, few of them, or the named ones; each has the default among its values.
 
-
-def turns(quick: bool = False) -> list[Turn]:
-    """All knobs; each has the default among its values."""
+    Raises:
+        InputError: a name that is no knob's.
+    """
 
     def knob(name: str, values: Sequence[tuple[str, dict[str, Any]]]) -> list[Turn]:
         return [Turn(name, text, DEFAULT.model_copy(update=change)) for text, change in values]
@@ -106,30 +88,37 @@ def turns(quick: bool = False) -> list[Turn]:
     ]
     passes = LossOptions().passes
     found += [Turn("solver passes", str(n), change=None if n == passes else _options(passes=n)) for n in (1, 2, 4, 8)]
-    found += [Turn("queries", "shared"), Turn("queries", "one per velocity", change=_asking)]
+    found += [Turn("queries", "shared"), Turn("queries", "one per velocity", change=asking_each)]
     found += [
         Turn("culling", "grid and band"),
         Turn("culling", "band", change=_options(exact_below=1.0)),
         Turn("culling", "none", change=_options(exact_below=1.0, band=0.3)),
     ]
-    return found[:2] + found[-5:-3] if quick else found
+    found += [Turn("contact solve", "float32"), Turn("contact solve", "float64", change=solving_in_64)]
+    known = list(dict.fromkeys(turn.knob for turn in found))
+    if unknown := [name for name in knobs if name not in known]:
+        raise InputError(f"there is no knob {unknown[0]!r}; choose of {', '.join(map(repr, known))}")
+    if knobs:
+        return [turn for turn in found if turn.knob in knobs]
+    return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found
 
 
 def sweep(
     hand: HandModel, thing: Thing, *, batch: int, repeats: int, quick: bool, threads: int, device: str,
-    say: Say = lambda line: None,
+    knobs: Sequence[str] = (), say: Say = lambda line: None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
 
     Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
     processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
     """
-    wp.load_module(module=kernels, device=device)
+    for module in MODULES:
+        wp.load_module(module=module, device=device)
     default = Turn("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
     cells: dict[tuple[str, str], Cell] = {}
-    for turn in [default, *turns(quick)]:
+    for turn in [default, *turns(quick, knobs)]:
         if turn is default or not turn.default:
             cells[turn.knob, turn.value] = Cell(
                 _setting(turn, batch, threads, device), hand, thing.load(turn.fidelity.face_error_m), true, pieces
@@ -141,7 +130,7 @@ def sweep(
             cell.repeat()
     base = figures(cells[default.knob, default.value])
     rows = []
-    for turn in turns(quick):
+    for turn in turns(quick, knobs):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
         faster = _cost(base, device) / _cost(found, device)
         rows.append(
