@@ -13,7 +13,7 @@ from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.errors import InputError
 from service.store import open_store
 
-app = typer.Typer(no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True, add_completion=False)
 
 
 @app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")

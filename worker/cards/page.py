@@ -37,7 +37,7 @@ _NOT_MODELLED: Final = """\
 - Objects and pads are rigid. Pads that give 2 mm change some verdicts, to either side.
 - There is no arm: whether one reaches a grasp, or stands in the table while it does, is not known. "Clear of the
   table" means the hand alone, at contact and on its way from the pregrasp.
-- Scenes hold one object that was dropped onto a plane; a fall takes its convex hull.
+- Scenes hold one object, dropped onto a plane as its convex hull.
 - Pictures have procedural materials and no textures, sensor noise, lens distortion or motion blur. They were counted
   here, not looked at.
 - ε and contact area depend on the contact threshold more than on anything else: compare only at the same one."""

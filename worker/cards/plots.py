@@ -107,7 +107,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
         return None
     lines = -(-len(shown) // 3)
     figure = _figure(10, 2.7 * lines + 0.4)
-    panels = figure.subplots(lines, 3, squeeze=False).flat
+    panels = list(figure.subplots(lines, 3, squeeze=False).flat)
     for axes, (title, name, cut) in zip(panels, shown, strict=False):
         columns = {
             hand: np.concatenate([np.empty(0, np.float32), *(cell.column(name) for cell in tally.of_hand(hand))])
@@ -125,7 +125,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
         axes.set_xlabel(f"{title} (last bin: all above)" if cut else title, fontsize=9)
         axes.tick_params(labelsize=8)
         _plain(axes)
-    for axes in panels:
+    for axes in panels[len(shown) :]:
         axes.set_visible(False)
     figure.supylabel("% of the hand's valid grasps", fontsize=9)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
@@ -175,7 +175,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
     _plain(axes)
     if first:
         axes.set_ylabel("pairs of grasp and scene", fontsize=9)
-        axes.legend(frameon=False, fontsize=8)
+        axes.figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8)
 
 
 def _table(card: Row, tally: Tally) -> Any:
@@ -193,7 +193,7 @@ def _table(card: Row, tally: Tally) -> Any:
         colour = COLOURS[number % len(COLOURS)]
         axes.scatter([100 * cell["clear_of_table"] for cell in own], places, s=28, color=colour, label=hand, zorder=3)
     axes.set_yticks(range(len(order)) if named else [], order if named else [], fontsize=8)
-    axes.set_xlim(0, None)
+    axes.set_xlim(-0.02 * axes.get_xlim()[1], None)
     axes.set_xlabel("% of the valid grasps that are clear in one scene at least", fontsize=9)
     _plain(axes)
     figure.legend(loc="outside upper right", ncols=8, frameon=False)

@@ -16,6 +16,7 @@ from service import names
 from service.errors import NotFoundError
 from service.manifests import ShardManifest, load_manifest
 from service.readers import ShardFile
+from service.shards import json_attribute
 from worker.cards.contents import Contents
 
 #: Columns of which a card is made; those that a shard lacks are left out.
@@ -90,7 +91,7 @@ def _unopened(file: ShardFile, manifest: ShardManifest) -> Piece:
     said: dict[str, Any] = {
         "seconds": manifest.seconds, "device": manifest.device, "worker": manifest.worker, "seed": manifest.seed,
         "created": manifest.created, "code_version": manifest.code_version, "method": manifest.request.method,
-        "fidelity": manifest.request.knobs.model_dump_json(), "want": manifest.request.want,
+        "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")), "want": manifest.request.want,
     }  # fmt: skip
     if file.kind == "base":
         said["tried"] = manifest.tried

@@ -135,7 +135,7 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
     """In words: what the tries came to that are not kept."""
     words = {"dropped": "dropped by the referee", "gate": "failed the gate", "diverged": "diverged"}
     parts = [f"{count:,} {words.get(why, why)}" for why, count in (rejected or {}).items() if count]
-    return ", ".join(parts) or "-"
+    return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
 
 
 def _fixed(value: float | None, digits: int) -> str:

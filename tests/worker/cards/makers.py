@@ -1,0 +1,195 @@
+"""A dataset with known contents: built-in hands and objects, true shards, grasps drawn at random or as a test wants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service import names
+from service.clock import timestamp
+from service.datasets import actions
+from service.datasets.planner import Planner
+from service.datasets.records import Snapshot
+from service.datasets.spec import DatasetRequest
+from service.domain import Stage
+from service.index.index import Index
+from service.manifests import publish_shard
+from service.parts import Parts
+from service.planning import message_of, plan
+from service.queue.memory import MemoryQueue
+from service.records import AttemptRecord, JobRecord, put_record, read_record
+from service.settings import Settings
+from service.store import open_store
+from tests.api.factories import add_builtins
+from worker.stages.output import Output, shard_of
+
+HANDS = ("allegro", "barrett")
+OBJECTS = ("block", "mug")
+NAME = "kitchen"
+#: Of the last joint of this hand the card must say that it never moves.
+STILL_HAND, STILL_JOINT = "barrett", "finger_1_spread"
+BARRETT = (
+    "finger_1_spread", "finger_1_medial", "finger_1_distal", "finger_2_spread", "finger_2_medial", "finger_2_distal",
+    "finger_3_medial", "finger_3_distal",
+)  # fmt: skip
+SECONDS = {Stage.SYNTHESIZE: 2.0, Stage.SCENE: 0.5, Stage.RENDER: 1.5}
+Array = NDArray[Any]
+
+
+@dataclass
+class Made:
+    """The service's parts, the dataset's snapshot, and where its store is."""
+
+    parts: Parts
+    snapshot: Snapshot
+    url: str
+
+
+def dataset(
+    folder: Path,
+    url: str,
+    *,
+    change: Callable[[str, str, dict[str, Array]], None] = lambda hand, obj, columns: None,
+    fails: tuple[str, str] | None = None,
+    grasps: int = 40,
+    **options: Any,
+) -> Made:
+    """Two hands x two objects, two batches each, with scenes and pictures.
+
+    Args:
+        folder: of the index.
+        url: of the store.
+        change: may change a base shard's columns before it is written.
+        fails: a cell whose first task fails for good.
+        grasps: wanted of each cell.
+        options: of the jobs.
+    """
+    index = f"sqlite:///{folder / 'index.sqlite'}"
+    parts = Parts(Settings(data_dir=folder), open_store(url), Index(index), MemoryQueue())
+    add_builtins(parts)
+    given = {"scenes": 2, "views": 1, "width": 24, "height": 16, **options}
+    wanted = DatasetRequest.model_validate(
+        {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}
+    )
+    actions.create(parts, wanted)
+    planner = Planner(parts)
+    while planner.advance(5.0):
+        pass
+    for cell in parts.index.dataset_cells(NAME, limit=200).items:
+        record = read_record(JobRecord, parts.store, names.job_record(cell.job_id))
+        if (cell.hand, cell.object) == fails:
+            _fail(parts, record)
+        else:
+            _finish(parts, record, change)
+    return Made(parts, actions.snapshot(parts, NAME)[0], url)
+
+
+def _fail(parts: Parts, record: JobRecord) -> None:
+    task = next(plan(record))
+    attempt = AttemptRecord(
+        task_id=task.id, job_id=record.id, stage=task.stage, number=1, kind="MeshError", reason="the mesh is torn",
+        worker="w", ended=timestamp(), last=True,
+    )  # fmt: skip
+    put_record(parts.store, names.attempt(task.id, 1), attempt)
+    parts.index.add_attempt(attempt)
+
+
+def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[str, Array]], None]) -> None:
+    base: dict[str, Array] = {}
+    for task in plan(record):
+        rng = np.random.default_rng([task.batch, *map(ord, record.request.hand + record.request.object)])
+        message = message_of(record, task, attempt=1, max_attempt=3)
+        scenes = record.request.scenes
+        if task.stage is Stage.SYNTHESIZE:
+            base = _base(rng, record.request.hand, task.count, task.batch)
+            change(record.request.hand, record.request.object, base)
+            made = len(base["quality/valid"])
+            rejected = {"diverged": 0, "dropped": made // 4, "gate": 1}
+            tried = made + made // 4 + 1
+            joints = BARRETT if record.request.hand == "barrett" else _ALLEGRO
+            attributes: dict[str, Any] = {
+                "joint_names": list(joints), "mu": 1.0, "want": "valid", "tried": tried,
+                "verdict_level": "certificate", "verdict_key": "k",
+            }  # fmt: skip
+            output = Output(base, attributes, {"planner_seconds": 1.0, "rejected": rejected})
+        elif task.stage is Stage.SCENE:
+            output = Output(_scene(rng, len(base["quality/valid"]), scenes), {"base_shard": task.inputs[0]})
+        else:
+            output = Output(_views(scenes * record.request.views), {"scene_shard": task.inputs[0]})
+        manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
+        publish_shard(parts.store, manifest, data)
+        parts.index.add_manifest(manifest)
+
+
+_ALLEGRO = tuple(
+    f"{finger}_{joint}"
+    for finger, first in (("index", "abduction"), ("middle", "abduction"), ("ring", "abduction"), ("thumb", "rotation"))
+    for joint in (first, "proximal", "middle", "distal")
+)
+
+
+def poses(rng: np.random.Generator, count: int) -> Array:
+    """Hand poses around the origin, turned at random."""
+    turn = rng.normal(size=(count, 4))
+    return np.concatenate([rng.normal(0, 0.1, (count, 3)), turn / np.linalg.norm(turn, axis=1, keepdims=True)], axis=1)
+
+
+def _base(rng: np.random.Generator, hand: str, count: int, batch: int) -> dict[str, Array]:
+    joints = len(BARRETT if hand == "barrett" else _ALLEGRO)
+    thresholds = np.array([0.001, 0.005])
+    columns: dict[str, Array] = {"quality/thresholds_m": thresholds}
+    for posture in ("grasp", "pregrasp", "squeeze"):
+        columns[f"{posture}/hand_pose"] = poses(rng, count)
+        columns[f"{posture}/joint_positions"] = rng.uniform(0.0, 0.5, (count, joints))
+    if hand == STILL_HAND:
+        columns["grasp/joint_positions"][:, BARRETT.index(STILL_JOINT)] = -1.0
+    for name, scale in (("contact_area_cm2", 40.0), ("epsilon", 0.3), ("wrench_volume", 3.0)):
+        columns[f"quality/{name}"] = rng.gamma(9.0, scale / 9, (count, 2))
+    for name, scale in (
+        ("intersection_volume_cm3", 0.01), ("penetration_depth_mm", 0.3), ("self_penetration_depth_mm", 0.01),
+        ("simulated_displacement_cm", 0.05), ("stability_loss", 0.05),
+    ):  # fmt: skip
+        columns[f"quality/{name}"] = rng.gamma(2.0, scale / 2, count)
+    columns["quality/contact_links"] = rng.integers(2, 9, count).astype(np.int32)
+    columns["quality/valid"] = np.ones(count, np.uint8)
+    if batch == 0:
+        columns["quality/audit"] = np.where(np.arange(count) < 8, 1, -1).astype(np.int8)
+    return columns
+
+
+def _scene(rng: np.random.Generator, count: int, scenes: int) -> dict[str, Array]:
+    rows = count * scenes
+    clear = (rng.random(rows) < 0.1).astype(np.uint8)
+    return {
+        "scene/object_pose": poses(rng, scenes),
+        "scene/rest_probability": np.full(scenes, 1 / scenes),
+        "scene/drop_seconds": np.full(scenes, 0.8),
+        "grasp/base_index": np.tile(np.arange(count, dtype=np.int32), scenes),
+        "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), count),
+        "grasp/hand_pose": poses(rng, rows),
+        "grasp/table_clearance_m": rng.normal(0.01, 0.01, rows),
+        "grasp/valid": clear,
+        "grasp/rejection": (1 - clear).astype(np.uint8),
+    }
+
+
+def _views(count: int) -> dict[str, Array]:
+    height, width = 16, 24
+    return {
+        "camera/intrinsics": np.tile(np.eye(3), (count, 1, 1)),
+        "camera/extrinsics": np.tile(np.eye(4), (count, 1, 1)),
+        "camera/scene_index": np.arange(count, dtype=np.int32) % 2,
+        "camera/eye": np.zeros(count, np.uint8),
+        "camera/stereo_baseline_m": np.zeros(count),
+        "image/rgb": np.full((count, height, width, 3), 120, np.uint8),
+        "image/depth": np.ones((count, height, width), np.float32),
+        "image/segmentation": np.ones((count, height, width), np.uint8),
+        "box/bounding_box_2d_tight": np.zeros((count, 4), np.float32),
+        "box/bounding_box_2d_loose": np.zeros((count, 4), np.float32),
+        "box/bounding_box_3d": np.zeros((count, 8, 3), np.float32),
+    }
