@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
 import h5py
+import numpy as np
 
-from service.assets import builtin_asset, builtin_names
+from service.assets import builtin_asset, builtin_files, builtin_names
 from service.datasets.records import DatasetRecord, Snapshot, job_of, load_dataset, newest_snapshot
 from service.domain import AssetKind
 from service.errors import InputError, NotFoundError
@@ -144,7 +146,7 @@ def _stored(store: Store, kind: AssetKind, name: str, digest: str) -> AssetFacts
     except NotFoundError:
         return AssetFacts(name, digest)
     check = load_check(store, kind, digest) or {}
-    facts = check.get("facts") or (_checked(kind, name, files) if builtin else {})
+    facts = check.get("facts") or (_checked(kind, name) if builtin else {})
     return _described(name, digest, files, facts, builtin=builtin)
 
 
@@ -152,7 +154,7 @@ def _builtin(kind: AssetKind, name: str, digest: str) -> AssetFacts:
     if name in builtin_names(kind):
         asset, files = builtin_asset(kind, name)
         if asset.digest == digest:
-            return _described(name, digest, files, _checked(kind, name, files), builtin=True)
+            return _described(name, digest, files, _checked(kind, name), builtin=True)
     return AssetFacts(name, digest)
 
 
@@ -164,13 +166,20 @@ def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *
     return AssetFacts(name, digest, licence, source, str(stated.get("description", "")), dict(facts))
 
 
-def _checked(kind: AssetKind, name: str, files: Mapping[str, bytes]) -> dict[str, Any]:
-    """What the check says of an asset that comes with graspd, so that it may be read in this process."""
-    from worker.hands.check import check_hand
-    from worker.objects.check import check_object
+@lru_cache
+def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
+    """What is to be known of an asset that comes with graspd; it may be read in this process."""
+    files = builtin_files(kind, name)
+    if kind is AssetKind.HAND:
+        from worker.hands.check import check_hand
 
-    check: Callable[..., dict[str, Any]] = check_hand if kind is AssetKind.HAND else check_object
-    return dict(check(files, name)["facts"])
+        return dict(check_hand(files, name)["facts"])
+    from worker.objects.formats import read_mesh
+    from worker.objects.options import UNITS, parse_options
+
+    options = parse_options(files)
+    vertices = read_mesh(options.file, files[options.file]).vertices * UNITS[options.units]
+    return {"extents_m": [float(extent) for extent in np.ptp(vertices, axis=0)]}
 
 
 def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:

@@ -13,6 +13,10 @@ from service.datasets.export import export_shards
 from tests.worker.cards.makers import Made, dataset
 from worker.cards.card import write_card
 from worker.cards.contents import Contents, contents_of_store
+from worker.cards.numbers import numbers
+from worker.cards.page import page
+from worker.cards.reading import pieces
+from worker.cards.tally import tally_of
 
 
 @dataclass
@@ -29,11 +33,16 @@ class Case:
         return (self.folder / "README.md").read_text()
 
 
-def case(folder: Path, **options: Any) -> Case:
-    """The card of a dataset; options as of `makers.dataset`."""
+def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
+    """The card of a dataset, with its plots or without; options as of `makers.dataset`."""
     made = dataset(folder, (folder / "store").as_uri(), **options)
     contents = contents_of_store(made.parts.store, "kitchen", cache=folder / "cache")
-    card = write_card(contents, folder / "card", licence="CC-BY-4.0")
+    if drawn:
+        card = write_card(contents, folder / "card", licence="CC-BY-4.0")
+    else:
+        card = numbers(contents, tally_of(contents, pieces(contents)))
+        (folder / "card").mkdir()
+        (folder / "card" / "README.md").write_text(page(card, {}))
     return Case(made, contents, folder / "card", card)
 
 

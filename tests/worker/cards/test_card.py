@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
 from service.errors import InputError, NotFoundError
 from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import HANDS, OBJECTS, dataset
 from worker.cards.card import write_card
+from worker.cards.commands import app
 from worker.cards.contents import contents_of_folder, contents_of_store, with_provenance
 
 
@@ -138,7 +140,7 @@ def test_a_file_of_licences_that_cannot_be_used_is_told(kitchen: Case, tmp_path:
 
 
 def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
-    found = case(tmp_path, fails=("barrett", "mug"))
+    found = case(tmp_path, drawn=False, fails=("barrett", "mug"))
     found.made.parts.close()
     assert "**barrett on mug lacks 6 of its shards**: the mesh is torn." in found.page
     assert "**Not complete**" in found.page
@@ -178,10 +180,11 @@ def test_the_command_writes_the_card_of_a_dataset(kitchen: Case, tmp_path: Path)
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(
-    kitchen: Case, tmp_path: Path, arguments: tuple[str, ...], words: str
+    kitchen: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
 ) -> None:
-    done = graspd(*arguments, "-o", str(tmp_path / "out"), folder=kitchen.folder.parent)
-    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1
+    monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
+    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "out")])
+    assert done.exit_code == 2 and len(done.stderr.strip().splitlines()) == 1
     assert words in done.stderr and not (tmp_path / "out").exists()
 
 

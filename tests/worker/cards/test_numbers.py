@@ -22,7 +22,7 @@ from worker.cards.numbers import share
 
 
 def changed(tmp_path: Path, change: Any, **options: Any) -> Case:
-    found = case(tmp_path, change=change, **options)
+    found = case(tmp_path, drawn=False, change=change, **options)
     found.made.parts.close()
     return found
 
