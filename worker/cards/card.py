@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from service.datasets.export import path_of
 from service.errors import InputError
@@ -15,8 +15,11 @@ from worker.cards.numbers import numbers
 from worker.cards.page import page
 from worker.cards.plots import draw
 from worker.cards.reading import Piece, pieces
+from worker.cards.samples import write_samples
 from worker.cards.tally import tally_of
 
+#: Pictures out of the dataset.
+SHEET: Final = "samples.jpg"
 #: Told after each shard: how many are done, of how many.
 Progress = Callable[[int, int], None]
 
@@ -47,6 +50,8 @@ def write_card(
     tally = tally_of(contents, _counted(pieces(contents), len(contents.shards), progress))
     card = numbers(contents, tally, licence=licence, source=source)
     plots = draw(card, tally, folder)
+    if write_samples(contents.shards, folder / SHEET):
+        plots[SHEET] = "Some of the pictures"
     card["plots"] = list(plots)
     (folder / "checksums.sha256").write_text("".join(checksums(contents)))
     (folder / "card.json").write_text(json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")

@@ -60,14 +60,14 @@ def front_matter(card: Row) -> str:
 def page(card: Row, plots: Mapping[str, str]) -> str:
     """The whole page; `plots` are file names and what they show."""
     sections = (
-        front_matter(card), f"# {card['name']}", _summary(card), _composition(card), _making(card),
+        front_matter(card), f"# {card['name']}", _summary(card, plots), _composition(card), _making(card),
         _validity(card, plots), _quality(card, plots), _coverage(card, plots), _biases(card), _licence(card),
         _opening(card), _citing(card), _files(card, plots),
     )  # fmt: skip
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def _summary(card: Row) -> str:
+def _summary(card: Row, plots: Mapping[str, str]) -> str:
     made, making = card["composition"], card["making"]
     with_pictures = f", {made['pictures']:,} pictures of {made['scenes']:,} scenes" if made["pictures"] else ""
     by = " and ".join(making["methods"]) or "an unknown method"
@@ -84,7 +84,7 @@ def _summary(card: Row) -> str:
     if card["source"]:
         lines.append(card["source"])
     lines.append("Every figure on this page was computed from the shards; `card.json` has all of them.")
-    return "\n".join(lines)
+    return "\n".join(lines) + _plot("samples.jpg", plots)
 
 
 def _composition(card: Row) -> str:
