@@ -14,6 +14,7 @@ from api.add_commands import add_hand, add_object
 from api.client import Client
 from api.dashboard.filters import count, percent, size
 from api.dataset_client import DatasetClient
+from api.job_options import pairs
 from api.models import Job
 from api.reports import UrlOption, job_request, open_client, show_asset, show_job, watch
 from api.uploads import MAIN_SUFFIXES, name_of_upload
@@ -71,7 +72,7 @@ def submit(
                 "audits": audits,
                 "robustness": robustness,
                 "method": method,
-                "options": dict(_pair(text) for text in option or []),
+                "options": pairs(option or []),
                 "fidelity": fidelity,
                 "target": target,
                 "seed": seed,
@@ -88,13 +89,6 @@ def submit(
         if wait:
             job = watch(client, job.id)
         show_job(job, json=json, url=client.url)
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise InputError(f"--option {text!r}: write it as name=value, for example steps=20000")
-    return name, value
 
 
 @app.command(epilog="graspd jobs --state running")

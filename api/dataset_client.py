@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from typing import Final
+from typing import Any, Final
 
 from pydantic import TypeAdapter
 
@@ -31,11 +31,11 @@ class DatasetClient:
         return self._client.url
 
     def create(self, request: DatasetRequest) -> DatasetView:
-        answer = self._client.send("POST", "/v1/datasets", json=request.model_dump(mode="json"))
+        answer = self._client.send("POST", "/v1/datasets", json=_asked(request))
         return DatasetView.model_validate_json(answer.content)
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        body = {name: value for name, value in matrix.model_dump(mode="json").items() if name in Matrix.model_fields}
+        body = {name: value for name, value in _asked(matrix).items() if name in Matrix.model_fields}
         return Estimate.model_validate_json(self._client.send("POST", "/v1/datasets/estimate", json=body).content)
 
     def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
@@ -97,3 +97,8 @@ class DatasetClient:
             if dataset.state.is_final:
                 return
             time.sleep(_POLL_S)
+
+
+def _asked(matrix: Matrix) -> dict[str, Any]:
+    """The body of a request; what is empty is left out, as an older service does not know all of it."""
+    return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}

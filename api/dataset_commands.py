@@ -16,7 +16,7 @@ from api.client import Client
 from api.dashboard.filters import count, percent, size
 from api.dataset_client import DatasetClient
 from api.dataset_reports import print_cells, print_dataset, print_estimate, watch_dataset
-from api.job_options import validated, with_job_options
+from api.job_options import pairs, validated, with_job_options
 from api.reports import UrlOption, open_client
 from service.cli import JsonFlag, emit, reporting_errors
 from service.datasets.cost import Estimate
@@ -215,6 +215,8 @@ def export(
 
 def _matrix(client: Client, hands: str, objects: str, options: dict[str, Any]) -> tuple[Objects | None, dict[str, Any]]:
     """Files of a set that is still to be uploaded, and the matrix that was asked for."""
+    if "options" in options:
+        options = options | {"options": pairs(options["options"])}
     names = [word.strip() for word in objects.split(",") if word.strip()]
     wanted: dict[str, Any] = {"hands": [word.strip() for word in hands.split(",") if word.strip()], **options}
     path = Path(objects)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final, Literal, get_origin
 
 import typer
@@ -16,11 +16,14 @@ from service.errors import InputError
 
 _HELP: Final = {
     "grasps": "Grasps for each hand and object.",
-    "fidelity": f"{', '.join(OFFERED[:-1])} or {OFFERED[-1]}.",
+    "fidelity": f"{', '.join(OFFERED)}, or auto with --target.",
+    "options": "An option of the planner, such as steps=20000; several times.",
+    "target": "With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; for each cell the cheapest that meets it is taken.",
     "method": "Planner.",
     "seed": "The same seed gives the same grasps.",
 }
 _SHORT: Final = {"grasps": "-n"}
+_FLAGS: Final = {"options": "--option"}
 
 
 def with_job_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -40,6 +43,15 @@ def with_job_options(command: Callable[..., None]) -> Callable[..., None]:
     return wrapper
 
 
+def pairs(texts: Iterable[str]) -> dict[str, str]:
+    """`name=value` of each `--option`; InputError for another form."""
+    split = [text.partition("=") for text in texts]
+    for name, equals, value in split:
+        if not equals:
+            raise InputError(f"--option {name + value!r}: write it as name=value, for example steps=20000")
+    return {name: value for name, _, value in split}
+
+
 def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
     """A model of what was given; InputError names the first option that cannot be used."""
     try:
@@ -56,18 +68,18 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     words = words.replace("[", "(").replace("]", ")")  # the terminal takes brackets for markup
     if get_origin(field.annotation) is tuple:
         words += " Several times."
-    flags = [f"--{name.replace('_', '-')}", *([_SHORT[name]] if name in _SHORT else [])]
+    flags = [_FLAGS.get(name, f"--{name.replace('_', '-')}"), *([_SHORT[name]] if name in _SHORT else [])]
     if field.annotation is bool:
         option = Annotated[bool, typer.Option(flags[0], help=words)]
         return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
-    default = "" if field.default in ((), None) else f" Default: {field.default}."
+    default = "" if field.default in ((), None, "") or name in _FLAGS else f" Default: {field.default}."
     annotation: Any = Annotated[_type_of(field) | None, typer.Option(*flags, help=words + default, show_default=False)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
 def _type_of(field: FieldInfo) -> Any:
-    """The type that the command line reads: several choices for a tuple, a name where knobs could stand."""
+    """The type that the command line reads: several choices for a tuple or pairs, a name where knobs could stand."""
     kind = field.annotation
-    if get_origin(kind) is tuple:
+    if get_origin(kind) in (tuple, dict):
         return list[str]
     return kind if kind in (int, float) or get_origin(kind) is Literal else str

@@ -23,13 +23,40 @@ def explicit(store: Store, request: JobRequest) -> JobRequest:
     Raises:
         InputError: no chart was published, or nothing in it meets the target.
     """
-    if request.fidelity != AUTO:
-        return request
-    chart = latest(store, "charts")
-    if chart is None:
-        raise InputError("fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity")
-    name = cheapest(chart, request.target, method=request.method, hand=request.hand, object_=request.object)
-    return request.model_copy(update={"fidelity": name, "target": ""})
+    return Resolver(store)(request)
+
+
+class Resolver:
+    """`explicit` for many requests: the chart is read once, when the first of them needs it."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._chart: dict[str, Any] | None = None
+        self._hands: set[str] = set()
+        self._pairs: set[tuple[str, str]] = set()
+        self._found: dict[tuple[str, str, str, str], str] = {}
+
+    def __call__(self, request: JobRequest) -> JobRequest:
+        """The request with a fidelity in the place of `auto`; see `explicit`."""
+        if request.fidelity != AUTO:
+            return request
+        if self._chart is None:
+            self._read()
+        pair = (request.hand, request.object)
+        # What the chart does not know is alike to it.
+        hand = request.hand if request.hand in self._hands else ""
+        key = (request.method, request.target, *(pair if pair in self._pairs else (hand, "")))
+        if key not in self._found:
+            method, target, hand, object_ = key
+            self._found[key] = cheapest(self._chart or {}, target, method=method, hand=hand, object_=object_)
+        return request.model_copy(update={"fidelity": self._found[key], "target": ""})
+
+    def _read(self) -> None:
+        self._chart = latest(self._store, "charts")
+        if self._chart is None:
+            raise InputError("fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity")
+        self._pairs = {(run["hand"], run["object"]) for run in self._chart["runs"]}
+        self._hands = {hand for hand, _ in self._pairs}
 
 
 def parse_target(text: str) -> tuple[str, float]:

@@ -146,48 +146,6 @@ class JobOptions(Model):
     )
     audits: int = Field(8, ge=0, le=10_000, description="valid grasps of the job that are judged again by the letter")
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
-
-    @field_validator("fidelity")
-    @classmethod
-    def _known(cls, value: str | Fidelity) -> str | Fidelity:
-        resolve_fidelity(value)
-        return value
-
-    @field_validator("channels")
-    @classmethod
-    def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        # The same wish in another order is the same job.
-        return tuple(name for name in EXTRA_CHANNELS if name in value)
-
-    @model_validator(mode="after")
-    def _views_need_scenes(self) -> Self:
-        if self.views and not self.scenes:
-            raise ValueError("views need scenes: ask for scenes >= 1")
-        return self
-
-    @model_validator(mode="after")
-    def _noise_needs_a_referee(self) -> Self:
-        if self.robustness and self.referee == "none":
-            raise ValueError("robustness counts verdicts: choose a referee")
-        return self
-
-    @property
-    def knobs(self) -> Fidelity:
-        return resolve_fidelity(self.fidelity)
-
-    def audits_of(self, batch: int) -> int:
-        """Grasps of a batch that are audited: the first batches share the job's audits, so that a longer job has the
-        same first batches as a shorter one."""
-        if self.referee in ("none", "letter"):
-            return 0
-        return min(BATCH_SIZE, max(0, self.audits - batch * BATCH_SIZE))
-
-
-class JobRequest(JobOptions):
-    """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
-
-    hand: Name = Field(description="name of a hand known to the service")
-    object: Name = Field(description="name of an object known to the service")
     options: dict[
         Annotated[str, Field(max_length=40)],
         int | Annotated[float, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=80)],
@@ -204,7 +162,15 @@ class JobRequest(JobOptions):
     @field_validator("fidelity")
     @classmethod
     def _known(cls, value: str | Fidelity) -> str | Fidelity:
-        return value if value == AUTO else super()._known(value)
+        if value != AUTO:
+            resolve_fidelity(value)
+        return value
+
+    @field_validator("channels")
+    @classmethod
+    def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        # The same wish in another order is the same job.
+        return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="after")
     def _auto_needs_a_target(self) -> Self:
@@ -213,6 +179,37 @@ class JobRequest(JobOptions):
         if self.target and self.fidelity != AUTO:
             raise ValueError("a target goes with fidelity auto")
         return self
+
+    @model_validator(mode="after")
+    def _views_need_scenes(self) -> Self:
+        if self.views and not self.scenes:
+            raise ValueError("views need scenes: ask for scenes >= 1")
+        return self
+
+    @model_validator(mode="after")
+    def _noise_needs_a_referee(self) -> Self:
+        if self.robustness and self.referee == "none":
+            raise ValueError("robustness counts verdicts: choose a referee")
+        return self
+
+    @property
+    def knobs(self) -> Fidelity:
+        """What the fidelity's name stands for; ValueError for `auto`, which a chart has to resolve first."""
+        return resolve_fidelity(self.fidelity)
+
+    def audits_of(self, batch: int) -> int:
+        """Grasps of a batch that are audited: the first batches share the job's audits, so that a longer job has the
+        same first batches as a shorter one."""
+        if self.referee in ("none", "letter"):
+            return 0
+        return min(BATCH_SIZE, max(0, self.audits - batch * BATCH_SIZE))
+
+
+class JobRequest(JobOptions):
+    """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
+
+    hand: Name = Field(description="name of a hand known to the service")
+    object: Name = Field(description="name of an object known to the service")
 
 
 class Asset(Model):

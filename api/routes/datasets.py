@@ -11,6 +11,7 @@ from api import dataset_quota
 from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
 from api.problems import responses
+from service.charts import Resolver
 from service.datasets import actions
 from service.datasets.cost import Estimate, estimate
 from service.datasets.records import Snapshot, load_snapshot
@@ -54,7 +55,7 @@ def create_dataset(body: DatasetRequest, response: Response, catalog: CatalogOf)
 @router.post("/estimate", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 404, 413, 422, 503))
 def estimate_dataset(body: Matrix, catalog: CatalogOf) -> Estimate:
     """What a dataset will cost: time for 1, 8 and 64 workers, storage, network. Nothing is recorded."""
-    return estimate(catalog.parts.index, body)
+    return estimate(catalog.parts.index, body, Resolver(catalog.parts.store))
 
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))

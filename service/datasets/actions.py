@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Literal
 
 from service import names
+from service.charts import Resolver
 from service.clock import timestamp
 from service.datasets.records import (
     DatasetRecord,
@@ -20,7 +21,7 @@ from service.datasets.records import (
 )
 from service.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.digests import digest_json
-from service.domain import AssetKind, State
+from service.domain import AssetKind, JobOptions, State
 from service.errors import ConflictError, InputError, LimitError, NotFoundError
 from service.index.dataset_views import DatasetView, ObjectSetView
 from service.parts import Parts
@@ -36,22 +37,25 @@ def create(parts: Parts, request: DatasetRequest) -> tuple[DatasetView, bool]:
 
     Raises:
         NotFoundError: unknown hand, object or set.
-        InputError: a hand or object was refused when it was checked.
+        InputError: a hand or object was refused when it was checked; no chart tells which fidelity meets the target.
         ConflictError: a check is still running, or the name stands for another dataset.
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
-    record = describe(request.name, *members(parts, request), request.options)
+    hands, objects = members(parts, request)
     parts.queue.ping()
-    new = put_record(parts.store, names.dataset_record(record.name), record)
+    key = names.dataset_record(request.name)
+    new = False
+    # One that is there stays what it is: a later chart changes none of its fidelities.
+    if not parts.store.exists(key):
+        found = describe(request.name, hands, objects, request.shared, Resolver(parts.store))
+        new = put_record(parts.store, key, found)
+    record = load_dataset(parts.store, request.name)
     if not new:
-        known = load_dataset(parts.store, record.name)
         # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
-        if (known.hands, known.objects, known.options) != (record.hands, record.objects, record.options):
-            raise ConflictError(
-                f"there is another dataset named {record.name!r} ({_difference(known, record)}); take another name"
-            )
-        record = known
+        other = _difference(record, hands, objects, request.shared)
+        if other:
+            raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
     parts.index.add_dataset(record)
     return parts.index.dataset(record.name), new
 
@@ -163,13 +167,13 @@ def _add_event(parts: Parts, name: str, what: Literal["cancelled", "retried"]) -
     return parts.index.dataset(name)
 
 
-def _difference(known: DatasetRecord, wanted: DatasetRecord) -> str:
-    """What another dataset of the same name has that this one has not, in a few words."""
+def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:
+    """What another dataset of the same name has that this one has not, in a few words; empty if it is the same."""
     words = []
-    for what, ours, theirs in (("hands", wanted.hands, known.hands), ("objects", wanted.objects, known.objects)):
-        if ours != theirs:
+    for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
+        if tuple(ours) != theirs:
             words.append(f"its {what} are {_named(theirs)}")
-    mine, other = wanted.options.model_dump(), known.options.model_dump()
+    mine, other = options.model_dump(), known.options.model_dump()
     words += [f"its {name} is {other[name]!r}" for name in mine if mine[name] != other[name]]
     return "; ".join(words)
 

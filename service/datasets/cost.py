@@ -12,15 +12,16 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from pydantic import Field
 
 from service.datasets.rates import Rate, Rates, StageRate, picture_rate, scene_rate
+from service.datasets.records import request_of
 from service.datasets.spec import MAX_CELLS, Matrix
-from service.domain import BATCH_SIZE, AssetKind, JobOptions, Stage
+from service.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
 from service.errors import LimitError
 from service.index.index import Index
 from service.index.views import View
@@ -84,11 +85,19 @@ class _Sums:
     cells: dict[tuple[str, Rate], int] = field(default_factory=lambda: defaultdict(int))
 
 
-def estimate(index: Index, matrix: Matrix) -> Estimate:
+def _explicit(request: JobRequest) -> JobRequest:
+    return request
+
+
+def estimate(index: Index, matrix: Matrix, resolve: Callable[[JobRequest], JobRequest] = _explicit) -> Estimate:
     """The cost of a matrix. Hands and objects need not be known yet.
+
+    Args:
+        resolve: puts a fidelity in the place of `auto`; not needed where there is none.
 
     Raises:
         NotFoundError: unknown set.
+        InputError: no chart tells which fidelity meets the target.
         LimitError: more than `MAX_CELLS` cells.
     """
     objects = list(matrix.objects)
@@ -97,13 +106,17 @@ def estimate(index: Index, matrix: Matrix) -> Estimate:
     cells = len(matrix.hands) * len(objects)
     if cells > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
-    options = matrix.options
+    options = matrix.shared
     devices = {worker.device for worker in index.workers() if worker.state != "lost"}
-    rates = Rates(index.batch_costs(Stage.SYNTHESIZE), options, devices)
+    costs = index.batch_costs(Stage.SYNTHESIZE)
+    rates: dict[str, Rates] = {}
     sums = _Sums()
     for hand in matrix.hands:
         for obj in objects:
-            _add_cell(sums, hand, rates.of(hand, obj), options)
+            chosen = resolve(request_of(options, hand, obj))
+            if chosen.knobs.name not in rates:
+                rates[chosen.knobs.name] = Rates(costs, chosen, devices)
+            _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
     return _estimate(index, matrix.hands, objects, options, sums)
 
 

@@ -113,6 +113,7 @@ def recipe_of(options: JobOptions) -> Hashable:
     """What decides how long a grasp takes, besides hand, object and device."""
     return (
         options.method,
+        tuple(sorted((name, str(value)) for name, value in options.options.items())),
         options.knobs.model_dump_json(exclude={"name"}),
         options.want,
         options.referee,

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from service import names
 from service.clock import timestamp
 from service.digests import digest_json
-from service.domain import Digest, JobOptions, JobRequest, Lane, Name
+from service.domain import AUTO, Digest, JobOptions, JobRequest, Lane, Name
 from service.errors import NotFoundError
 from service.records import JobRecord, Record, put_record, read_record
 from service.store import Store
@@ -36,10 +36,13 @@ class Cell:
     hand: Member
     object: Member
     job_id: str
+    fidelity: str = ""
+    """What the chart promised for this cell, where the dataset's fidelity is `auto`."""
 
 
 class DatasetRecord(Record):
-    """`dataset.json`. `jobs` are those of the cells, hand by hand, and in each hand object by object."""
+    """`dataset.json`. `jobs` are those of the cells, hand by hand, and in each hand object by object; with fidelity
+    `auto`, `fidelities` are what the chart promised for them when the dataset was created."""
 
     version: Literal[1] = 1
     name: Name
@@ -49,19 +52,22 @@ class DatasetRecord(Record):
     options: JobOptions
     revisions: dict[str, int]
     jobs: tuple[Digest, ...]
+    fidelities: tuple[str, ...] = ()
     created: str
 
     @model_validator(mode="after")
     def _a_job_a_cell(self) -> DatasetRecord:
         if len(self.jobs) != len(self.hands) * len(self.objects):
             raise ValueError("a dataset has a job for each hand and object")
+        if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
+            raise ValueError("a dataset has a fidelity for each cell if its own is auto, and else none")
         return self
 
     def cells(self) -> Iterator[Cell]:
         """The cells in their order."""
         pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
         for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
-            yield Cell(position, hand, obj, job)
+            yield Cell(position, hand, obj, job, self.fidelities[position] if self.fidelities else "")
 
 
 class DatasetEvent(Record):
@@ -112,17 +118,17 @@ class ObjectSet(Record):
     created: str
 
 
-def request_of(options: JobOptions, hand: str, obj: str) -> JobRequest:
-    """The request of one cell."""
+def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
+    """The request of one cell; with a fidelity in the place of `auto`, if one is given."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
-    return JobRequest(hand=hand, object=obj, **shared)
+    return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
 def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int]) -> JobRecord:
     """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk."""
     return JobRecord(
         id=cell.job_id,
-        request=request_of(options, cell.hand.name, cell.object.name),
+        request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
         revisions=revisions,
         hand_digest=cell.hand.digest,
         object_digest=cell.object.digest,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Final, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from service.clock import timestamp
 from service.datasets.records import DatasetRecord, Member, request_of
 from service.digests import digest_json, job_id
-from service.domain import JobOptions, Name
+from service.domain import AUTO, JobOptions, JobRequest, Name
 from service.version import STAGE_REVISIONS
 
 #: Larger matrices are split by their user: the record of this many cells has 4 MB.
@@ -39,7 +39,7 @@ class Matrix(JobOptions):
         return self
 
     @property
-    def options(self) -> JobOptions:
+    def shared(self) -> JobOptions:
         """What all cells share."""
         return JobOptions(**{name: getattr(self, name) for name in JobOptions.model_fields})
 
@@ -50,14 +50,28 @@ class DatasetRequest(Matrix):
     name: Name = Field(description="name of the dataset")
 
 
-def describe(name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions) -> DatasetRecord:
-    """The record of a dataset. Equal hands, objects and options have the same digest, whatever the name."""
+def describe(
+    name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions,
+    resolve: Callable[[JobRequest], JobRequest],
+) -> DatasetRecord:  # fmt: skip
+    """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
+    name.
+
+    Args:
+        resolve: puts a fidelity in the place of `auto`.
+
+    Raises:
+        InputError: no fidelity meets the target on one of the cells.
+    """
+    cells = [(hand, obj, resolve(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
+    # A fidelity that is chosen has a name.
+    fidelities = tuple(str(request.fidelity) for _, _, request in cells) if options.fidelity == AUTO else ()
     content = {
         "hands": [[hand.name, hand.digest] for hand in hands],
         "objects": [[obj.name, obj.digest] for obj in objects],
-        "options": options.model_dump(mode="json"),
+        "options": options.model_dump(mode="json", exclude=_unused(options)),
+        **({"fidelities": fidelities} if fidelities else {}),
     }
-    pairs = ((hand, obj) for hand in hands for obj in objects)
     return DatasetRecord(
         name=name,
         digest=digest_json(content),
@@ -65,6 +79,12 @@ def describe(name: str, hands: Sequence[Member], objects: Sequence[Member], opti
         objects=tuple(objects),
         options=options,
         revisions=dict(STAGE_REVISIONS),
-        jobs=tuple(job_id(request_of(options, h.name, o.name), h.digest, o.digest) for h, o in pairs),
+        jobs=tuple(job_id(request, hand.digest, obj.digest) for hand, obj, request in cells),
+        fidelities=fidelities,
         created=timestamp(),
     )
+
+
+def _unused(options: JobOptions) -> set[str]:
+    """Options that came later: where they are not used, digests stay what they were."""
+    return {name for name in ("options", "target") if not getattr(options, name)}

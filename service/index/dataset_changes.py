@@ -54,6 +54,7 @@ class DatasetChanges(Database):
                 "hand_digest": cell.hand.digest,
                 "object_digest": cell.object.digest,
                 "job_id": cell.job_id,
+                "fidelity": cell.fidelity or None,
             }
             for cell in record.cells()
         ]
@@ -128,6 +129,7 @@ class DatasetChanges(Database):
                     Member(name=row["hand"], digest=row["hand_digest"]),
                     Member(name=row["object"], digest=row["object_digest"]),
                     row["job_id"],
+                    row["fidelity"] or "",
                 )
                 for row in connection.execute(query).mappings()
             ]

@@ -233,6 +233,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "reason")},
+                fidelity=row["fidelity"] or options.knobs.name,
                 asked=options.grasps,
                 **yields,
                 valid_yield=yields["valid"] / yields["tried"] if yields["tried"] else None,

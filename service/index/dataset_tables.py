@@ -36,6 +36,7 @@ dataset_cells: Final = Table(
     Column("hand_digest", String(32), nullable=False),
     Column("object_digest", String(32), nullable=False),
     Column("job_id", String(32), nullable=False),
+    Column("fidelity", String(64), nullable=True),
     Index("dataset_cells_by_job", "job_id"),
 )
 

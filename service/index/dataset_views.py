@@ -43,6 +43,7 @@ class CellView(View):
     hand: str
     object: str
     job_id: str
+    fidelity: str = Field("", description="its name; of a dataset with `auto`, what the chart promised for this cell")
     planned: bool = Field(description="whether the job exists yet")
     state: State
     asked: int = Field(description="grasps asked for")

@@ -10,8 +10,10 @@ from starlette.testclient import TestClient
 from service import names
 from service.datasets.planner import Planner
 from service.parts import Parts
+from service.published import publish
 from service.records import JobRecord, read_record
 from tests.api.factories import finish_all
+from tests.service.test_charts import CHART
 
 WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
 
@@ -51,6 +53,28 @@ def test_a_dataset_that_is_done_is_found_again_with_200(
     finish_cells(parts, http, 4)
     again = http.post("/v1/datasets", json=WANTED)
     assert again.status_code == 200 and again.json()["state"] == "succeeded"
+
+
+def test_options_of_the_method_reach_the_jobs_of_the_cells(http: TestClient, parts: Parts) -> None:
+    answer = http.post("/v1/datasets", json=WANTED | {"method": "graspit", "options": {"keep": 20}})
+    assert answer.json()["options"]["options"] == {"keep": 20}
+    carry_out(parts)
+    cell = http.get("/v1/datasets/kitchen/cells").json()["items"][0]
+    assert http.get(f"/v1/jobs/{cell['job_id']}").json()["request"]["options"] == {"keep": 20}
+    assert "graspit keep=20" in http.get("/datasets/kitchen").text
+
+
+def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, parts: Parts) -> None:
+    wanted = WANTED | {"fidelity": "auto", "target": "gsr>=0.6"}
+    for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", {**wanted, "name": None})):
+        body = {key: value for key, value in body.items() if value is not None}
+        answer = http.post(path, json=body)
+        assert answer.status_code == 422 and "graspd chart --publish" in answer.text
+    publish(parts.store, "charts", CHART)
+    assert http.post("/v1/datasets", json=wanted).status_code == 202
+    cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
+    assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}
+    assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
 
 
 def test_cells_come_in_pages_with_a_link_to_the_next(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:

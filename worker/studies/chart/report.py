@@ -156,7 +156,7 @@ def _sweep_head(sweeps: Sequence[Row]) -> str:
     first = sweeps[0]
     return (
         f"{first['hand']} on {first['object']}, {first['grasps']} grasps a value, standard with one knob turned; "
-        "speed is against the default, by processor seconds on a CPU. There is no float64 path to set against float32."
+        "speed is against the default, by processor seconds on a CPU."
     )
 
 
