@@ -14,7 +14,7 @@ import typer
 
 from examples.train_grasp_predictor import evaluation
 from examples.train_grasp_predictor.evaluation import Held
-from examples.train_grasp_predictor.samples import Example, examples
+from examples.train_grasp_predictor.samples import Example, examples, first_grasps
 from examples.train_grasp_predictor.table import Row, markdown
 from examples.train_grasp_predictor.training import train
 from service.readers import Shards, open_shards
@@ -30,6 +30,9 @@ def main(
     meshes: Annotated[Path, typer.Option(help="Folder with the held-back objects' meshes, OBJECT/clean.stl.")],
     hand: Annotated[str, typer.Option(help="URDF or built-in hand of the data.")] = "barrett",
     views_of: Annotated[str, typer.Option(help="Source whose pictures of the held-back objects are shown.")] = "",
+    grasps: Annotated[
+        int, typer.Option(help="Grasps of each object taken from each source, whole shards; 0: all.")
+    ] = 0,
     steps: Annotated[int, typer.Option(help="Training steps of each network.")] = 3000,
     seeds: Annotated[int, typer.Option(help="Networks trained on each source.")] = 3,
     pictures: Annotated[int, typer.Option(help="Pictures of each held-back object.")] = 16,
@@ -40,9 +43,12 @@ def main(
     torch.set_num_threads(threads)
     backend.start()
     back = held_out.split(",")
-    sources = {name: open_shards(folder) for name, folder in (entry.split("=", 1) for entry in source)}
-    shown = list(examples(sources[views_of or next(iter(sources))].only(objects=back)))
+    folders = dict(entry.split("=", 1) for entry in source)
+    sources = {name: first_grasps(open_shards(folder), grasps) for name, folder in folders.items()}
     model = hand_from_path(hand)
+    shown = list(
+        examples(open_shards(folders[views_of or next(iter(folders))]).only(objects=back), model.palm.approach)
+    )
     tests = [Held.of(name, object_from_path(meshes / name / "clean.stl"), _of(shown, name)[:pictures]) for name in back]
     rows = [row for name, shards in sources.items() for row in _grasps_in(name, shards, back)]
     for seed in range(seeds):
@@ -65,7 +71,7 @@ def _grasps_out(
     """What the networks propose for the held-back objects, and a control without a network."""
     for name, shards in sources.items():
         names = {file.object for file in shards.of("base")} - set(back)
-        seen = list(examples(shards.only(objects=names)))
+        seen = list(examples(shards.only(objects=names), hand.palm.approach))
         network, final = train(seen, steps=steps, seed=seed)
         facts: dict[str, Any] = {"source": name, "side": "network", "seed": seed, "loss": final, "pictures": len(seen)}
         for held in tests:

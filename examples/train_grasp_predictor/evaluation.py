@@ -1,8 +1,9 @@
 """What the proposals are worth on objects the network has not seen, by the same metrics and referee as datasets.
 
-A proposal says where the hand goes and how it is shaped; it is carried out as DDGC and others do: the fingers open,
-the hand backs off until it touches nothing, advances, and closes until contact. All sources of data are treated alike,
-and a control replaces the proposals by hands that look at the object from anywhere.
+A proposal says where the hand goes and how it is shaped. It is carried out with as little change as the object allows:
+the fingers open a part of the way, the hand backs off as far as it must to touch nothing, and the fingers close until
+contact. All sources of data are treated alike. The control needs no network: hands that look at the object from
+anywhere advance to it and close, which is the method `autograsp`.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ Floats = NDArray[np.float64]
 
 #: Proposals of a picture that are carried out: those of the highest scores.
 TAKEN: Final = 4
-#: Share of the way from the proposed joints to the pre-shape that the fingers open.
-OPENING: Final = 0.6
+#: Shares of the way from the proposed joints to the pre-shape that the fingers open; the first that is enough counts.
+OPENINGS: Final = (0.5, 1.0)
 #: Contact threshold of areas and wrench spaces [m]; how many grasps of an object count for them, best epsilon first.
 CONTACT_M: Final = 0.005
 BEST: Final = 10
 #: Distances the hand backs off, of which the first that is clear is taken [m].
-BACK_M: Final = tuple(0.01 * k for k in range(13))
-CLEAR_M: Final = 0.002
+BACK_M: Final = tuple(0.005 * k for k in range(41))
+CLEAR_M: Final = 0.001
 STANDOFF_M: Final = 0.005
 
 
@@ -103,20 +104,19 @@ def orthogonal(columns: Floats) -> Floats:
 
 
 def carried_out(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> GraspSet:
-    """Grasps from proposals: open, back off until clear, advance, close."""
+    """Grasps from proposals: open, back off until clear, close."""
     pair = ground_of(hand, obj, "cpu", kernels)
     q = np.clip(hand.reduce(joints), hand.lower, hand.upper)
-    closes = hand.closing != 0
-    q[:, closes] += OPENING * (np.broadcast_to(hand.preshape, q.shape)[:, closes] - q[:, closes])
     rotation = poses[:, 3:]
-    pivot = poses[:, :3] - obj.centre_of_mass + quat_rotate(rotation, _palm_centre(hand))
-    return _executed(pair, HandState(pivot, rotation, q))
+    pivot = poses[:, :3] - obj.centre_of_mass + quat_rotate(rotation, hand.palm.centre)
+    return _closed(pair, _clear(pair, HandState(pivot, rotation, q)))
 
 
 def anywhere(hand: HandModel, obj: ObjectModel, count: int, seed: int) -> GraspSet:
     """The control: hands that look at a random place of the object, carried out in the same way."""
     pair = ground_of(hand, obj, "cpu", kernels)
-    return _executed(pair, free_starts(pair, seed=seed, batch=0, indices=range(count)))
+    starts = free_starts(pair, seed=seed, batch=0, indices=range(count))
+    return _closed(pair, Closer(pair, count).approach(starts, STANDOFF_M))
 
 
 def score(hand: HandModel, held: Held, grasps: GraspSet, *, friction: float = 1.0) -> Score:
@@ -150,20 +150,20 @@ def _summary(columns: Mapping[str, Any]) -> Score:
     return Score(grasps=len(success), gsr=float(success.mean()), **means)
 
 
-def _executed(pair: Pair, state: HandState) -> GraspSet:
-    closer = Closer(pair, len(state.pivot))
-    hand = pair.hand.model
-    back = -quat_rotate(state.rotation, hand.palm.approach)
-    free = HandState(state.pivot.copy(), state.rotation, state.q)
-    settled = np.zeros(len(state.pivot), bool)
-    for distance in BACK_M:
-        moved = HandState(state.pivot + distance * back, state.rotation, state.q)
-        clear = closer.distances(moved).min(axis=1) > CLEAR_M
-        free.pivot[~settled] = moved.pivot[~settled]
-        settled |= clear
-    return grasp_set(pair, closer.close(closer.approach(free, STANDOFF_M)).state, 0.0, {})
+def _clear(pair: Pair, state: HandState) -> HandState:
+    """Each hand opened and backed off by the least that makes it clear of the object, else as far as may be."""
+    closer, hand = Closer(pair, len(state.pivot)), pair.hand.model
+    back, closes = -quat_rotate(state.rotation, hand.palm.approach), hand.closing != 0
+    opening = np.where(closes, hand.preshape - state.q, 0.0)
+    free, settled = state, np.zeros(len(state.pivot), bool)
+    for distance, share in ((distance, share) for distance in BACK_M for share in OPENINGS):
+        moved = HandState(state.pivot + distance * back, state.rotation, state.q + share * opening)
+        now = settled | (closer.distances(moved).min(axis=1) > CLEAR_M)
+        keep = settled[:, None]
+        pivot, q = np.where(keep, free.pivot, moved.pivot), np.where(keep, free.q, moved.q)
+        free, settled = HandState(pivot, state.rotation, q), now
+    return free
 
 
-def _palm_centre(hand: HandModel) -> Floats:
-    """Palm's centre in the frame of the root link."""
-    return hand.palm.centre
+def _closed(pair: Pair, state: HandState) -> GraspSet:
+    return grasp_set(pair, Closer(pair, len(state.pivot)).close(state).state, 0.0, {})

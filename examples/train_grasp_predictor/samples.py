@@ -13,16 +13,20 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 from service.readers import Pictures, Shards
-from service.transforms import quat_to_matrix
+from service.shards import read_shard
+from service.transforms import quat_rotate, quat_to_matrix
 
 #: Side of the crop [px], and how much larger than the object's box it is.
 SIZE: Final = 64
 MARGIN: Final = 1.3
 #: Depth that becomes 1 in the network's input [m].
 DEPTH_UNIT_M: Final = 0.1
+#: Least cosine between the palm's direction and the camera's: nobody can tell from a picture how a back is shaped.
+SEEN: Final = 0.5
 #: Label of the grasped object in segmentations.
 _OBJECT: Final = 2
 
@@ -42,13 +46,37 @@ class Example:
     """(7,) object in the camera's frame."""
 
 
-def examples(shards: Shards) -> Iterator[Example]:
-    """All pictures that show enough of their object and have grasps. Table clearance is no matter here."""
+def first_grasps(shards: Shards, count: int) -> Shards:
+    """The first batches that hold `count` grasps of each hand and object, with their scenes and views; 0: all."""
+    if not count:
+        return shards
+    held: dict[tuple[str, str], int] = {}
+    kept: set[tuple[str, str, int]] = set()
+    for file in sorted(shards.of("base"), key=lambda file: file.batch):
+        pair = file.hand, file.object
+        if held.get(pair, 0) < count:
+            kept.add((*pair, file.batch))
+            held[pair] = held.get(pair, 0) + len(read_shard(shards.path(file), kind="base")["quality/valid"])
+    chosen = (file for file in shards if (file.hand, file.object, file.batch) in kept)
+    return Shards(tuple(chosen), shards.store, shards.cache)
+
+
+def examples(shards: Shards, approach: NDArray[np.float64]) -> Iterator[Example]:
+    """All pictures that show enough of their object and have grasps from the side that the camera sees.
+
+    Clearance of the table is no matter here: too few grasps have it, and the object is judged without a table.
+
+    Args:
+        shards: base, scene and views shards.
+        approach: (3,) unit direction in which the palm looks, in the frame of the hand's root link.
+    """
     for sample in Pictures(shards, clear=False, with_grasps_only=True):
-        crop = crop_of(sample)
-        if crop is not None:
+        crop, pose = crop_of(sample), np.asarray(sample["grasp/hand_pose"])
+        towards = quat_rotate(pose[:, 3:], approach)[:, 2]
+        seen = np.flatnonzero(towards > SEEN)
+        if crop is not None and len(seen):
             image, anchor = crop
-            targets = targets_of(sample["grasp/hand_pose"], sample["grasp/joint_positions"], anchor)
+            targets = targets_of(pose[seen], np.asarray(sample["grasp/joint_positions"])[seen], anchor)
             yield Example(image, targets, anchor, sample["object"], np.asarray(sample["object/pose"]))
 
 
