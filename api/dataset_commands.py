@@ -16,7 +16,8 @@ from api.client import Client
 from api.dashboard.filters import count, percent, size
 from api.dataset_client import DatasetClient
 from api.dataset_reports import print_cells, print_dataset, print_estimate, watch_dataset
-from api.job_options import pairs, validated, with_job_options
+from api.dataset_specs import SpecOption, Wanted, wanted
+from api.job_options import validated, with_job_options
 from api.reports import UrlOption, open_client
 from service.cli import JsonFlag, emit, reporting_errors
 from service.datasets.cost import Estimate
@@ -31,9 +32,10 @@ group = typer.Typer(no_args_is_help=True, help="Hands x objects as one dataset: 
 app.add_typer(group, name="datasets")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
-HandsOption = Annotated[str, typer.Option("--hands", help="Names of hands: allegro,shadow.")]
+HandsOption = Annotated[str | None, typer.Option("--hands", help="Names of hands: allegro,shadow.")]
 ObjectsOption = Annotated[
-    str, typer.Option("--objects", help="Objects or sets by name: mug,ycb; or a folder or ZIP, which becomes a set.")
+    str | None,
+    typer.Option("--objects", help="Objects or sets by name: mug,ycb; or a folder or ZIP, which becomes a set."),
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the dataset ends.")]
 
@@ -42,10 +44,11 @@ WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until th
 @with_job_options
 @reporting_errors
 def create(
-    name: NameArgument,
-    hands: HandsOption,
-    objects: ObjectsOption,
     options: dict[str, Any],
+    name: Annotated[str | None, typer.Argument(help="Name of the dataset; a spec may say it.")] = None,
+    hands: HandsOption = None,
+    objects: ObjectsOption = None,
+    spec: SpecOption = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without asking.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what it would cost, and stop.")] = False,
     wait: WaitOption = False,
@@ -54,10 +57,13 @@ def create(
 ) -> None:
     """Make a dataset: a job for each hand and object. The same command again goes on where it was."""
     console = Console(stderr=json)
+    asked = wanted(spec, name=name, hands=hands, objects=objects, options=options)
+    if not asked.name:
+        raise InputError("say a name: graspd datasets create NAME, or name in the file of --spec")
     with open_client(url) as client:
         datasets = DatasetClient(client)
-        files, matrix = _matrix(client, hands, objects, options)
-        request = validated(DatasetRequest, {"name": name, **matrix})
+        files, matrix = _matrix(client, asked)
+        request = validated(DatasetRequest, {"name": asked.name, **matrix})
         found = _estimate(datasets, matrix, files)
         print_estimate(found, console)
         if dry_run:
@@ -67,17 +73,18 @@ def create(
             raise InputError("nothing was started")
         refused: list[str] = []
         if files is not None:
-            refused = _upload(client, files, name_of_set(Path(objects)), console)
-            request = validated(DatasetRequest, {"name": name, **matrix, "objects": []})
+            refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
+            matrix = asked.shared_out(matrix, len(files) - len(refused))
+            request = validated(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
         dataset = datasets.create(request)
         if wait:
-            dataset = watch_dataset(datasets, name, Console(stderr=True))
+            dataset = watch_dataset(datasets, asked.name, Console(stderr=True))
     _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
         if refused:
             console.print(f"left out, because refused: {', '.join(refused)}", markup=False, soft_wrap=True)
         print_dataset(dataset, console)
-        console.print(f"`graspd datasets status {name}` shows each cell", style="dim")
+        console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
     _must_succeed(dataset, asked=wait)
 
 
@@ -85,15 +92,17 @@ def create(
 @with_job_options
 @reporting_errors
 def estimate(
-    hands: HandsOption,
-    objects: ObjectsOption,
     options: dict[str, Any],
+    hands: HandsOption = None,
+    objects: ObjectsOption = None,
+    spec: SpecOption = None,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """What a dataset would cost: time for 1, 8 and 64 workers, storage, network."""
+    asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
-        files, matrix = _matrix(client, hands, objects, options)
+        files, matrix = _matrix(client, asked)
         found = _estimate(DatasetClient(client), matrix, files)
     if json:
         emit(found)
@@ -213,22 +222,24 @@ def export(
         typer.echo(f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}")
 
 
-def _matrix(client: Client, hands: str, objects: str, options: dict[str, Any]) -> tuple[Objects | None, dict[str, Any]]:
+def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, Any]]:
     """Files of a set that is still to be uploaded, and the matrix that was asked for."""
-    if "options" in options:
-        options = options | {"options": pairs(options["options"])}
+    objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
-    wanted: dict[str, Any] = {"hands": [word.strip() for word in hands.split(",") if word.strip()], **options}
+    matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
     path = Path(objects)
     if files := files_of_set(path):
-        return files, wanted | {"objects": sorted(files), "sets": [name_of_set(path)]}
+        matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
+        return files, asked.shared_out(matrix, len(files))
     if path.is_file():
         raise InputError(f"{objects} is one object; `graspd objects add {objects}`, then name it here")
     if "/" in objects:
         raise InputError(f"there is no folder {objects}; give one that exists, or names of objects and sets")
-    known = {found.name for found in DatasetClient(client).object_sets()}
-    sets = [name for name in names if name in known]
-    return None, wanted | {"objects": [name for name in names if name not in known], "sets": sets}
+    known = {found.name: found.objects for found in DatasetClient(client).object_sets()}
+    single = [name for name in names if name not in known]
+    matrix |= {"objects": single, "sets": [name for name in names if name in known]}
+    members = {*single, *(member for name in names for member in known.get(name, ()))}
+    return None, asked.shared_out(matrix, len(members))
 
 
 def _estimate(datasets: DatasetClient, matrix: dict[str, Any], files: Objects | None) -> Estimate:

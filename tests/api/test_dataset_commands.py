@@ -97,3 +97,19 @@ def test_a_snapshot_of_nothing_is_refused(graspd: Shell, tmp_path: Path) -> None
     assert "there is no format 'zip'" in said(
         graspd("datasets", "export", "empty", "-o", str(tmp_path), "--format", "zip")
     )
+
+
+def test_a_spec_in_a_file_is_what_the_options_would_say(graspd: Shell, tmp_path: Path) -> None:
+    spec = tmp_path / "kitchen.toml"
+    spec.write_text('name = "spec"\nhands = ["allegro", "barrett"]\nobjects = ["mug", "block"]\ntotal_grasps = 250\n')
+    dry = graspd.json("datasets", "create", "--spec", str(spec), "--dry-run")["estimate"]
+    assert (dry["cells"], dry["asked"]) == (4, 252)  # 63 each: a quarter of 250, rounded up
+    found = graspd.json("datasets", "estimate", "--spec", str(spec), "--objects", "mug", "--grasps", "10")
+    assert (found["cells"], found["asked"]) == (2, 20)
+    made = graspd.json("datasets", "create", "--spec", str(spec), "--yes")["dataset"]
+    assert (made["name"], made["asked"]) == ("spec", 252)
+
+
+def test_a_dataset_needs_a_name_from_somewhere(graspd: Shell) -> None:
+    done = graspd("datasets", "create", "--hands", "allegro", "--objects", "mug")
+    assert done.returncode == 2 and "say a name" in said(done)
