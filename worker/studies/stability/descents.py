@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.domain import FIDELITIES, Fidelity
-from service.stability import Cell, StabilityMap, graded, reachable
+from service.stability import Cell, StabilityMap, graded, reachable, short
 from service.transforms import quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -86,7 +86,7 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = l
         say(f"start moved by {move * 1e3:.0f} mm: {cells[-1].outcome}")
     return StabilityMap(
         "starts", f"{count} starts moved along the approach", "way towards the object [m]", "fidelity",
-        "median residual of balanced contact forces; 1: nothing holds", _BOUNDS,
+        _MEASURE, _BOUNDS,
         reachable(cells, lambda cell: cell.x == 0.0),
         "a hand that stays away has no contacts; one that begins inside stays tangled",
         "the planner's own starts are drawn back until nothing touches; the merit drops hands that hold nothing, the "
@@ -113,7 +113,7 @@ def rate_map(
             say(f"{optimizer} rate x {rate:g}: {[cell.outcome for cell in cells[-len(weights) :]]}")
     return StabilityMap(
         "rates", f"Rates and weights of the descent, draft, {hand.name} on {obj.name}", "factor on the rates",
-        "factor on the weights of penetration", "median residual of balanced contact forces; 1: nothing holds", _BOUNDS,
+        "factor on the weights of penetration", _MEASURE, _BOUNDS,
         reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
         "hands jump past the object or sink into it",
         "rates and weights are fixed by the schedule; hands that are no numbers are dropped, others judged",
@@ -138,7 +138,7 @@ def length_map(
         say(f"{length} iterations: {cell.outcome}, quaternions off by {drift:.1e}")
     return StabilityMap(
         "length", f"Long runs of the fine phase, {hand.name} on {obj.name}", "iterations", "measure",
-        "median residual of balanced contact forces, and the largest departure of a quaternion's length from 1",
+        _MEASURE + "; the largest departure of a quaternion's length from 1",
         _BOUNDS + "; drift: 1e-5, 1e-3", reachable(cells, lambda cell: True),
         "poses that are no rotations any more, hands that creep away",
         "quaternions are normalised in each step; a grasp that does not improve is frozen after `patience` iterations",
@@ -147,6 +147,10 @@ def length_map(
     )  # fmt: skip
 
 
+_ORDER: Final = ("good", "weak", "broken")
+_MEASURE: Final = (
+    "median residual of balanced contact forces (1: nothing holds), or how deep the hands are where that is worse"
+)
 _BOUNDS: Final = (
     f"weak: residual {RESIDUAL[0]:g} or {DEPTH_MM[0]:g} mm deep; "
     f"broken: {RESIDUAL[1]:g}, {DEPTH_MM[1]:g} mm, or no number"
@@ -169,8 +173,12 @@ def _cells(
         return [Cell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
     residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(losses)))))
     depth = float(np.median(depths)) * 1e3
-    worst = max(graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM), key=("good", "weak", "broken").index)
-    return [Cell(panel, x, y, residual, worst, f"residual {residual:.2g}, {depth:.2g} mm deep")]
+    held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)
+    is_deep = _ORDER.index(deep) > _ORDER.index(held)
+    # What makes the cell bad is what stands on it.
+    label = f"{short(depth)}mm" if is_deep else ""
+    said = f"residual {residual:.2g}, {depth:.2g} mm deep"
+    return [Cell(panel, x, y, residual, deep if is_deep else held, said, label)]
 
 
 def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:

@@ -80,7 +80,9 @@ def draw(one: StabilityMap, path: Path) -> None:
     panels = one.panels
     columns = min(_COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
-    figure = Figure(figsize=(max(4.4 * columns, 7.0), 3.4 * rows + 0.9), layout="constrained")
+    tallest = max(len({cell.y for cell in one.of(panel)}) for panel in panels)
+    height = min(3.4, 1.0 + 0.5 * tallest)
+    figure = Figure(figsize=(max(4.4 * columns, 7.0), height * rows + 0.9), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         _panel(axes, one, panel)
