@@ -18,14 +18,17 @@ from service.asset_options import (
     DropOption,
     FixOption,
     KeepLargestOption,
+    LicenceOption,
     MassOption,
     PalmOption,
     PreShapeOption,
     RootOption,
     ScaleSweepOption,
+    SourceOption,
     UnitsOption,
     hand_options,
     object_options,
+    provenance,
     sizes_of,
 )
 from service.cli import JsonFlag, reporting_errors
@@ -48,12 +51,15 @@ def add_hand(
     pre_shape: PreShapeOption = None,
     fix: FixOption = None,
     drop: DropOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Upload a hand, wait for its check, and say what was guessed."""
     options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    options |= provenance(licence, source)
     with upload_of(file) as upload:
         _add(AssetKind.HAND, upload, name, options, wait=wait, url=url, json=json)
 
@@ -68,6 +74,8 @@ def add_object(
     allow_open: AllowOpenOption = False,
     density: DensityOption = None,
     mass: MassOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -78,6 +86,7 @@ def add_object(
     options = object_options(
         units=units, scale_to=one_size, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
     )
+    options |= provenance(licence, source)
     if len(sizes) > 1:
         swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
         add_set(swept, name=name or name_of_set(file), prefix=None, options=options, wait=wait, url=url, json=json)

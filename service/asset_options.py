@@ -42,6 +42,15 @@ KeepLargestOption = Annotated[bool, typer.Option("--keep-largest", help="Of seve
 AllowOpenOption = Annotated[bool, typer.Option("--allow-open", help="Take a mesh that is not watertight.")]
 DensityOption = Annotated[float | None, typer.Option("--density", help="Density in kg/m3.")]
 MassOption = Annotated[float | None, typer.Option("--mass", help="Mass in kg.")]
+LicenceOption = Annotated[
+    str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
+]
+SourceOption = Annotated[str | None, typer.Option("--source", help="Where it comes from: an address or a citation.")]
+
+
+def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
+    """Keys of `asset.json` that say whose it is; those not given are left out."""
+    return {key: value for key, value in (("licence", licence), ("source", source)) if value}
 
 
 def hand_options(

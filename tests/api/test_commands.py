@@ -17,8 +17,10 @@ import pytest
 
 from api.models import JobDetail, MeanMetrics
 from api.reports import job_summary
-from service.domain import JobRequest, State
+from service.domain import AssetKind, JobRequest, State
+from service.library import load_asset_files
 from service.settings import Settings
+from service.store import open_store
 from service.supervisor import Supervisor
 
 STL = b"solid box\nendsolid box\n"
@@ -86,6 +88,15 @@ def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
 def test_an_object_can_be_added_from_a_file(graspd: Shell, tmp_path: Path) -> None:
     (tmp_path / "box.stl").write_bytes(STL)
     assert graspd.json("objects", "add", str(tmp_path / "box.stl"), "--no-wait")["name"] == "box"
+
+
+def test_the_licence_of_an_object_is_kept_with_its_files(graspd: Shell, tmp_path: Path) -> None:
+    (tmp_path / "crate.stl").write_bytes(STL + b" ")
+    said = ("--licence", "CC-BY-4.0", "--source", "https://example.org/crate")
+    made = graspd.json("objects", "add", str(tmp_path / "crate.stl"), *said, "--no-wait")
+    store = open_store((Path(graspd.environment["GRASPD_DATA_DIR"]) / "store").as_uri())
+    kept = json.loads(load_asset_files(store, AssetKind.OBJECT, made["digest"])["asset.json"])
+    assert (kept["licence"], kept["source"]) == ("CC-BY-4.0", "https://example.org/crate")
 
 
 @pytest.mark.parametrize(
