@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import typer
 
-from examples.train_grasp_predictor import evaluation
+from examples.train_grasp_predictor import evaluation, execution
 from examples.train_grasp_predictor.evaluation import Held
 from examples.train_grasp_predictor.samples import Example, examples, first_grasps
 from examples.train_grasp_predictor.table import Row, markdown
@@ -51,8 +51,9 @@ def main(
     )
     tests = [Held.of(name, object_from_path(meshes / name / "clean.stl"), _of(shown, name)[:pictures]) for name in back]
     rows = [row for name, shards in sources.items() for row in _grasps_in(name, shards, back)]
+    seen = {name: list(examples(_without(shards, back), model.palm.approach)) for name, shards in sources.items()}
     for seed in range(seeds):
-        for row in _grasps_out(model, sources, tests, back, steps=steps, seed=seed):
+        for row in _grasps_out(model, seen, tests, steps=steps, seed=seed):
             typer.echo(json.dumps(row))
             rows.append(row)
             output.write_text(json.dumps(rows, indent=1) + "\n")
@@ -61,26 +62,34 @@ def main(
 
 def _grasps_in(name: str, shards: Shards, back: list[str]) -> Iterator[Row]:
     """What a source teaches: figures of its grasps on the objects trained on."""
-    for obj in sorted({file.object for file in shards.of("base")} - set(back)):
+    for obj in _objects(_without(shards, back)):
         yield {"source": name, "side": "data", "object": obj, **asdict(evaluation.in_data(shards, obj))}
 
 
 def _grasps_out(
-    hand: HandModel, sources: dict[str, Shards], tests: list[Held], back: list[str], *, steps: int, seed: int
+    hand: HandModel, seen: dict[str, list[Example]], tests: list[Held], *, steps: int, seed: int
 ) -> Iterator[Row]:
     """What the networks propose for the held-back objects, and a control without a network."""
-    for name, shards in sources.items():
-        names = {file.object for file in shards.of("base")} - set(back)
-        seen = list(examples(shards.only(objects=names), hand.palm.approach))
-        network, final = train(seen, steps=steps, seed=seed)
-        facts: dict[str, Any] = {"source": name, "side": "network", "seed": seed, "loss": final, "pictures": len(seen)}
+    for name, shown in seen.items():
+        network, final = train(shown, steps=steps, seed=seed)
+        facts: dict[str, Any] = {"source": name, "seed": seed, "loss": final, "pictures": len(shown)}
         for held in tests:
-            grasps = evaluation.carried_out(hand, held.model, *evaluation.proposals(network, held.pictures))
-            yield facts | {"object": held.name, **asdict(evaluation.score(hand, held, grasps))}
+            proposals = execution.proposals(network, held.pictures)
+            for side, made in (("proposed", execution.as_proposed), ("carried out", execution.carried_out)):
+                result = evaluation.score(hand, held, made(hand, held.model, *proposals))
+                yield facts | {"side": side, "object": held.name, **asdict(result)}
     for held in tests:
-        grasps = evaluation.anywhere(hand, held.model, evaluation.TAKEN * len(held.pictures), seed)
-        made = asdict(evaluation.score(hand, held, grasps))
-        yield {"source": "no network", "side": "network", "seed": seed, "object": held.name, **made}
+        grasps = execution.anywhere(hand, held.model, execution.TAKEN * len(held.pictures), seed)
+        result = evaluation.score(hand, held, grasps)
+        yield {"source": "no network", "side": "carried out", "seed": seed, "object": held.name, **asdict(result)}
+
+
+def _objects(shards: Shards) -> list[str]:
+    return sorted({file.object for file in shards.of("base")})
+
+
+def _without(shards: Shards, names: list[str]) -> Shards:
+    return shards.only(objects=set(_objects(shards)) - set(names))
 
 
 def _of(some: list[Example], name: str) -> list[Example]:

@@ -1,10 +1,4 @@
-"""What the proposals are worth on objects the network has not seen, by the same metrics and referee as datasets.
-
-A proposal says where the hand goes and how it is shaped. It is carried out with as little change as the object allows:
-the fingers open a part of the way, the hand backs off as far as it must to touch nothing, and the fingers close until
-contact. All sources of data are treated alike. The control needs no network: hands that look at the object from
-anywhere advance to it and close, which is the method `autograsp`.
-"""
+"""What grasps of an object that a network has not seen are worth, by the metrics and referee of datasets."""
 
 from __future__ import annotations
 
@@ -13,40 +7,24 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from examples.train_grasp_predictor.network import Predictor
 from examples.train_grasp_predictor.samples import Example
 from service.readers import Grasps, Shards
 from service.shards import read_shard
-from service.transforms import compose, invert, quat_from_matrix, quat_rotate
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.autograsp import kernels
-from worker.planners.autograsp.closing import Closer
-from worker.planners.fast_graspd.pairs import Pair
-from worker.planners.ground import free_starts, grasp_set, ground_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
-from worker.simulation.simulation import HandState
 
 Floats = NDArray[np.float64]
 
-#: Proposals of a picture that are carried out: those of the highest scores.
-TAKEN: Final = 4
-#: Shares of the way from the proposed joints to the pre-shape that the fingers open; the first that is enough counts.
-OPENINGS: Final = (0.5, 1.0)
 #: Contact threshold of areas and wrench spaces [m]; how many grasps of an object count for them, best epsilon first.
 CONTACT_M: Final = 0.005
 BEST: Final = 10
-#: Distances the hand backs off, of which the first that is clear is taken [m].
-BACK_M: Final = tuple(0.005 * k for k in range(41))
-CLEAR_M: Final = 0.001
-STANDOFF_M: Final = 0.005
 
 
 @dataclass(frozen=True)
@@ -74,49 +52,6 @@ class Held:
     @classmethod
     def of(cls, name: str, model: ObjectModel, pictures: Sequence[Example]) -> Held:
         return cls(name, model, decompose(model), pictures)
-
-
-def proposals(network: Predictor, pictures: Sequence[Example]) -> tuple[Floats, Floats]:
-    """Hand poses (N, 7) in the object's frame and joints (N, J) of the best proposals for each picture."""
-    with torch.no_grad():
-        grasps, logits = network(torch.stack([picture.image for picture in pictures]))
-    best = logits.argsort(dim=1, descending=True)[:, :TAKEN]
-    poses, joints = [], []
-    for picture, rows, chosen in zip(pictures, grasps.numpy().astype(float), best.numpy(), strict=True):
-        for row in rows[chosen]:
-            poses.append(in_object_frame(row, picture))
-            joints.append(row[9:])
-    return np.array(poses), np.array(joints)
-
-
-def in_object_frame(row: Floats, picture: Example) -> Floats:
-    """(7,) hand pose of an answer (9 + J,) of the network: the inverse of `samples.targets_of`."""
-    hand = np.concatenate([row[:3] + picture.anchor, quat_from_matrix(orthogonal(row[3:9]))])
-    return compose(invert(picture.object_pose), hand)
-
-
-def orthogonal(columns: Floats) -> Floats:
-    """(3, 3) rotation from its first two columns (6,), the first one kept."""
-    x = columns[:3] / max(float(np.linalg.norm(columns[:3])), 1e-9)
-    y = columns[3:] - (columns[3:] @ x) * x
-    y = y / max(float(np.linalg.norm(y)), 1e-9)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
-
-
-def carried_out(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> GraspSet:
-    """Grasps from proposals: open, back off until clear, close."""
-    pair = ground_of(hand, obj, "cpu", kernels)
-    q = np.clip(hand.reduce(joints), hand.lower, hand.upper)
-    rotation = poses[:, 3:]
-    pivot = poses[:, :3] - obj.centre_of_mass + quat_rotate(rotation, hand.palm.centre)
-    return _closed(pair, _clear(pair, HandState(pivot, rotation, q)))
-
-
-def anywhere(hand: HandModel, obj: ObjectModel, count: int, seed: int) -> GraspSet:
-    """The control: hands that look at a random place of the object, carried out in the same way."""
-    pair = ground_of(hand, obj, "cpu", kernels)
-    starts = free_starts(pair, seed=seed, batch=0, indices=range(count))
-    return _closed(pair, Closer(pair, count).approach(starts, STANDOFF_M))
 
 
 def score(hand: HandModel, held: Held, grasps: GraspSet, *, friction: float = 1.0) -> Score:
@@ -148,22 +83,3 @@ def _summary(columns: Mapping[str, Any]) -> Score:
     success = np.asarray(columns["quality/success"], float)
     means = {name: float(np.nanmean(values[best])) for name, values in found.items()}
     return Score(grasps=len(success), gsr=float(success.mean()), **means)
-
-
-def _clear(pair: Pair, state: HandState) -> HandState:
-    """Each hand opened and backed off by the least that makes it clear of the object, else as far as may be."""
-    closer, hand = Closer(pair, len(state.pivot)), pair.hand.model
-    back, closes = -quat_rotate(state.rotation, hand.palm.approach), hand.closing != 0
-    opening = np.where(closes, hand.preshape - state.q, 0.0)
-    free, settled = state, np.zeros(len(state.pivot), bool)
-    for distance, share in ((distance, share) for distance in BACK_M for share in OPENINGS):
-        moved = HandState(state.pivot + distance * back, state.rotation, state.q + share * opening)
-        now = settled | (closer.distances(moved).min(axis=1) > CLEAR_M)
-        keep = settled[:, None]
-        pivot, q = np.where(keep, free.pivot, moved.pivot), np.where(keep, free.q, moved.q)
-        free, settled = HandState(pivot, state.rotation, q), now
-    return free
-
-
-def _closed(pair: Pair, state: HandState) -> GraspSet:
-    return grasp_set(pair, Closer(pair, len(state.pivot)).close(state).state, 0.0, {})

@@ -13,18 +13,25 @@ _HEADINGS: Final = {
     "simulated_displacement_cm": "SD cm", "gsr": "GSR",
 }  # fmt: skip
 
+_TABLES: Final = {"data": "data", "proposed": "trained on; as proposed", "carried out": "trained on; carried out"}
+
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Two tables: figures of each source's grasps, and of what networks trained on them propose for unseen objects.
+    """Three tables: the sources' own grasps; what networks trained on them propose for unseen objects; and what comes
+    of it when a hand carries it out.
 
-    Each cell of the second is the mean over the held-back objects and seeds, and the standard deviation over seeds.
+    Cells are means over the objects; with several seeds the mean over them and their standard deviation.
     """
-    return "\n".join([*_table(rows, "data", "data"), "", *_table(rows, "network", "trained on")])
+    parts = [_table(rows, side, title) for side, title in _TABLES.items() if any(row["side"] == side for row in rows)]
+    return "\n\n".join("\n".join(lines) for lines in parts)
 
 
 def _table(rows: Sequence[Row], side: str, title: str) -> list[str]:
     some = [row for row in rows if row["side"] == side]
-    lines = [f"| {title} | objects | grasps | " + " | ".join(_HEADINGS.values()) + " |", "| --- " + "| --: " * 8 + "|"]
+    lines = [
+        f"| {title} | objects | pictures | grasps | " + " | ".join(_HEADINGS.values()) + " |",
+        "| --- " + "| --: " * 9 + "|",
+    ]
     for name in dict.fromkeys(row["source"] for row in some):
         of_source = [row for row in some if row["source"] == name]
         seeds = {
@@ -32,7 +39,8 @@ def _table(rows: Sequence[Row], side: str, title: str) -> list[str]:
         }
         first = next(iter(seeds.values()))
         cells = [_cell([fmean(row[metric] for row in part) for part in seeds.values()]) for metric in _HEADINGS]
-        lines.append(f"| {name} | {len(first)} | {sum(row['grasps'] for row in first)} | " + " | ".join(cells) + " |")
+        counts = [len(first), first[0].get("pictures", "–"), sum(row["grasps"] for row in first)]
+        lines.append(f"| {name} | " + " | ".join([*map(str, counts), *cells]) + " |")
     return lines
 
 

@@ -12,7 +12,7 @@ from service.transforms import compose, invert, quat_to_matrix
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 
 from examples.train_grasp_predictor import table  # noqa: E402
-from examples.train_grasp_predictor.evaluation import in_object_frame, orthogonal  # noqa: E402
+from examples.train_grasp_predictor.execution import in_object_frame, orthogonal  # noqa: E402
 from examples.train_grasp_predictor.network import loss  # noqa: E402
 from examples.train_grasp_predictor.samples import SIZE, Example, crop_of, targets_of  # noqa: E402
 from examples.train_grasp_predictor.training import train  # noqa: E402
@@ -110,9 +110,9 @@ def test_spread_is_over_seeds_and_means_are_over_objects() -> None:
         ("contact_area_cm2", "intersection_volume_cm3", "epsilon", "wrench_volume", "simulated_displacement_cm"), 1.0
     )
     rows = [
-        {"source": "ours", "side": "network", "seed": seed, "object": name, "grasps": 8, "gsr": gsr, **metrics}
+        {"source": "ours", "side": "proposed", "seed": seed, "object": name, "grasps": 8, "gsr": gsr, **metrics}
         for seed, name, gsr in [(0, "mug", 0.2), (0, "box", 0.4), (1, "mug", 0.4), (1, "box", 0.6)]
     ]
     line = table.markdown(rows).splitlines()[-1]
-    assert line.startswith("| ours | 2 | 16 |")
+    assert line.startswith("| ours | 2 | – | 16 |")
     assert line.endswith("| 0.4 ± 0.14 |")  # 0.3 and 0.5
