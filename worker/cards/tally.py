@@ -36,6 +36,8 @@ QUALITIES: Final[dict[str, bool]] = {
 }
 #: Grasps of a cell on which its diversity is measured, the first ones.
 SAMPLED: Final = 512
+#: So many arrays of a cell are packed into one.
+_UNPACKED: Final = 16
 #: Grasps that agree in all numbers to so many digits (metres, radians) are counted as one.
 _DIGITS: Final = 6
 
@@ -68,6 +70,13 @@ class CellTally:
     """Unit vectors from the object to where the palm comes from, object frame."""
     prints: list[NDArray[np.int64]] = field(default_factory=list)
     sample: list[Posture] = field(default_factory=list)
+
+    def pack(self) -> None:
+        """Make one array of those of all shards: thousands of small ones take ten times the memory."""
+        every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
+        for parts in every:
+            if len(parts) > _UNPACKED:
+                parts[:] = [np.concatenate(parts)]
 
     def column(self, name: str) -> Floats32:
         """All values of a quality; empty if no shard has it."""
@@ -113,11 +122,11 @@ def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:
     """Add up all pieces; those of a batch must come in the order base, scene, views, as `pieces` gives them."""
     tally = Tally()
     valid: dict[str, Array] = {}
-    cell_now: Pair = ("", "")
+    batch_now: tuple[Pair, int] | None = None
     for piece in pieces:
         pair = (piece.file.hand, piece.file.object)
-        if pair != cell_now:
-            cell_now, valid = pair, {}
+        if (pair, piece.file.batch) != batch_now:
+            batch_now, valid = (pair, piece.file.batch), {}
         cell = tally.cells.setdefault(pair, CellTally())
         _note(tally, cell, piece)
         hand = contents.hands.get(piece.file.hand, AssetFacts(piece.file.hand))
@@ -169,6 +178,7 @@ def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> 
             kept = (values[:, at] if swept else values)[valid].astype(np.float32)
             cell.columns.setdefault(name, []).append(kept)
     _add_postures(tally, cell, piece, hand, valid)
+    cell.pack()
     return valid
 
 
