@@ -117,6 +117,9 @@ def _table(card: Row) -> list[str]:
     ]
     rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
     worst = sorted(rows, key=rows.__getitem__)[:3]
+    if found["too_near"]:
+        why = [f"{_percent(count / found['pairs'])} {what}" for what, count in found["too_near"].items()]
+        told[0] += f" Too near to: {', '.join(why)}."
     if len(rows) > 3:
         told[0] += f" Fewest on {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
     clear = [sum(column) for column in zip(*(sums["clear"] for sums in card["elevation"].values()), strict=True)]

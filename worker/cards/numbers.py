@@ -21,6 +21,13 @@ from worker.grasps import Posture
 from worker.quality.diversity import explained_variance
 
 Row = dict[str, Any]
+#: Codes of `grasp/rejection`: what the hand is too near to, and when.
+REJECTIONS: Final = {
+    1: "the table at contact",
+    2: "the table on the way in",
+    3: "a neighbour at contact",
+    4: "a neighbour on the way in",
+}
 _PERCENTILES: Final = {"p5": 5, "p25": 25, "median": 50, "p75": 75, "p95": 95}
 _KINDS: Final = ("base", "scene", "views")
 
@@ -170,6 +177,9 @@ def _table(cells: Iterable[CellTally]) -> Row:
     cells = list(cells)
     placed, clear = sum(cell.placed for cell in cells), sum(cell.clear for cell in cells)
     pairs, clear_pairs = sum(cell.pairs for cell in cells), sum(cell.clear_pairs for cell in cells)
+    refused: Counter[int] = Counter()
+    for cell in cells:
+        refused.update(cell.refused)
     return {
         "grasps": placed,
         "clear": clear,
@@ -177,6 +187,7 @@ def _table(cells: Iterable[CellTally]) -> Row:
         "pairs": pairs,
         "clear_pairs": clear_pairs,
         "of_pairs": share(clear_pairs, pairs),
+        "too_near": {REJECTIONS[code]: count for code, count in sorted(refused.items()) if code in REJECTIONS},
     }
 
 

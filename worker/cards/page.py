@@ -124,7 +124,7 @@ def _making(card: Row) -> str:
         ),
         "devices": ", ".join(making["devices"]),
         "workers": str(making["workers"] or ""),
-        "made": f"{making['first_shard']} to {making['last_shard']}" if making["first_shard"] else "",
+        "made": f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z" if making["first_shard"] else "",
         "worker seconds": ", ".join(f"{kind} {value:,.0f}" for kind, value in making["seconds"].items()),
         "of the base shards": ", ".join(f"{name} {value:,.0f}" for name, value in making["synthesis_parts"].items()),
         "per 1,000 valid grasps": _per_thousand(card) if total else "",

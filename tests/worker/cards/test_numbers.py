@@ -65,6 +65,7 @@ def test_clearance_is_that_of_the_scene_shards(kitchen: Case) -> None:
         clear += len(set(scene["grasp/base_index"][scene["grasp/valid"] == 1].tolist()))
     table = kitchen.card["table"]
     assert (table["clear"], table["clear_pairs"], table["grasps"], table["pairs"]) == (clear, pairs, 160, 320)
+    assert table["too_near"] == {"the table at contact": 320 - pairs}
 
 
 def test_only_valid_grasps_count(tmp_path: Path) -> None:
