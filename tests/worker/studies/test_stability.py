@@ -101,9 +101,9 @@ def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
 
 def test_a_long_run_does_not_drift(pair: Pair) -> None:
     state = descents.starts_of(pair, 2)
-    end, _, _ = descents.descend(pair, state, FIDELITIES["draft"], iterations=1500)
-    # float32: a normalised quaternion is off by a few units in the last place, 6e-8.
-    np.testing.assert_allclose(np.linalg.norm(end.rotation, axis=1), 1.0, atol=1e-6)
+    drift = descents.descend(pair, state, FIDELITIES["draft"], iterations=1500).drift
+    # float32: a normalised quaternion is off by a few units in the last place, 6e-8, and never by nothing at all.
+    assert 0 < drift < 1e-6
 
 
 def test_what_is_no_number_is_broken() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -39,10 +39,21 @@ DEPTH_MM: Final = (0.5, 2.0)
 RESIDUAL: Final = (0.35, 0.9)
 
 
+@dataclass(frozen=True)
+class Descent:
+    """What became of n hands."""
+
+    state: HandState
+    depths: Floats
+    """Deepest penetration before the projection (n,) [m]."""
+    drift: float
+    """Largest departure of a quaternion's length from 1 before the projection, which makes them whole again."""
+
+
 def descend(
     pair: Pair, state: HandState, fidelity: Fidelity, *, rates: float = 1.0, weights: float = 1.0,
     iterations: int | None = None, optimizer: str = "adam",
-) -> tuple[HandState, Floats, Floats]:  # fmt: skip
+) -> Descent:  # fmt: skip
     """Coarse and fine phase and projection from given hands.
 
     Args:
@@ -53,9 +64,6 @@ def descend(
         weights: factor on the weights of penetration.
         iterations: of the fine phase, whose last row is repeated; by default the fidelity's.
         optimizer: adam or gd.
-
-    Returns:
-        the hands, their losses (n,), and their deepest penetration before the projection (n,) [m].
     """
     n = len(state.pivot)
     for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
@@ -66,11 +74,12 @@ def descend(
         simulation.record_iteration(optimizer)
         simulation.run(len(schedule) if side is pair.coarse or iterations is None else iterations)
         state = simulation.state(n)
-        losses = simulation.loss.numpy()[:n].mean(axis=1).astype(float)
+    # The projection divides quaternions by their length: what the descent did to it is told before.
+    drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     # No steps: this only tells how deep each hand is.
     _, depths = Projection(simulation, ProjectionOptions()).run(state, 0)
     state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
-    return state, losses, depths
+    return Descent(state, depths, drift)
 
 
 def start_map(hand: HandModel, obj: ObjectModel, *, count: int = 8, say: Say = lambda line: None) -> StabilityMap:
@@ -131,11 +140,10 @@ def length_map(
     state = starts_of(pair, count)
     cells = []
     for length in lengths:
-        end, losses, depths = descend(pair, state, fidelity, iterations=length)
-        drift = float(np.abs(np.linalg.norm(end.rotation, axis=1) - 1.0).max())
-        (cell,) = _cells(pair, (end, losses, depths), "draft", length, "residual")
-        cells += [cell, Cell("draft", length, "quaternion drift", drift, graded(drift, 1e-5, 1e-3))]
-        say(f"{length} iterations: {cell.outcome}, quaternions off by {drift:.1e}")
+        found = descend(pair, state, fidelity, iterations=length)
+        (cell,) = _cells(pair, found, "draft", length, "residual")
+        cells += [cell, Cell("draft", length, "quaternion drift", found.drift, graded(found.drift, 1e-5, 1e-3))]
+        say(f"{length} iterations: {cell.outcome}, quaternions off by {found.drift:.1e}")
     return StabilityMap(
         "length", f"Long runs of the fine phase, {hand.name} on {obj.name}", "iterations", "measure",
         _MEASURE + "; the largest departure of a quaternion's length from 1",
@@ -149,7 +157,7 @@ def length_map(
 
 _ORDER: Final = ("good", "weak", "broken")
 _MEASURE: Final = (
-    "median residual of balanced contact forces (1: nothing holds), or how deep the hands are where that is worse"
+    "median residual of balanced contact forces (1: nothing holds); ↓ how deep the hands are [mm], where that is worse"
 )
 _BOUNDS: Final = (
     f"weak: residual {RESIDUAL[0]:g} or {DEPTH_MM[0]:g} mm deep; "
@@ -164,19 +172,17 @@ def starts_of(pair: Pair, count: int) -> HandState:
     return sample_starts(hand, obj, probe, seed=11, batch=0, indices=range(count), each=1)
 
 
-def _cells(
-    pair: Pair, found: tuple[HandState, Floats, Floats], panel: str, x: float | str, y: float | str
-) -> list[Cell]:
-    state, losses, depths = found
+def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | str) -> list[Cell]:
+    state = found.state
     finite = bool(np.isfinite(state.pivot).all() and np.isfinite(state.q).all() and np.isfinite(state.rotation).all())
     if not finite:
         return [Cell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
-    residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(losses)))))
-    depth = float(np.median(depths)) * 1e3
+    residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(found.depths)))))
+    depth = float(np.median(found.depths)) * 1e3
     held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)
     is_deep = _ORDER.index(deep) > _ORDER.index(held)
     # What makes the cell bad is what stands on it.
-    label = f"{short(depth)}mm" if is_deep else ""
+    label = f"↓{short(depth)}" if is_deep else ""
     said = f"residual {residual:.2g}, {depth:.2g} mm deep"
     return [Cell(panel, x, y, residual, deep if is_deep else held, said, label)]
 
