@@ -89,14 +89,14 @@ def _yields(card: Row, tally: Tally) -> Any:
     image = axes.imshow(shares, cmap="YlGnBu", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.set_xticks(range(len(hands)), hands)
     axes.set_yticks(range(len(objects)) if named else [], objects if named else [])
-    axes.set_title(card["name"], loc="left", fontsize=10)
+    axes.set_title(f"{card['name']}: valid of tried (grasps)", loc="left", fontsize=10)
     for (hand, obj), cell in rows.items() if named else ():
         x, y = hands.index(hand), objects.index(obj)
         text = f"{100 * cell['of_tries']:.0f} %  ({cell['valid']})"
         axes.text(x, y, text, ha="center", va="center", fontsize=8, color="white" if cell["of_tries"] > 0.6 else INK)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-    figure.colorbar(image, ax=axes, label="valid share of tries (valid grasps)", shrink=0.8)
+    figure.colorbar(image, ax=axes, label="valid of tried", shrink=0.8)
     return figure
 
 
