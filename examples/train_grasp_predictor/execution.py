@@ -1,9 +1,9 @@
 """From what the network answers to grasps: as proposed, carried out, and a control without a network.
 
-A proposal says where the hand goes and how it is shaped. It is carried out with as little change as the object allows:
-the fingers open a part of the way, the hand backs off as far as it must to touch nothing, and the fingers close until
-contact. All sources of data are treated alike. The control needs no network: hands that look at the object from
-anywhere advance to it and close, which is the method `autograsp`.
+A proposal says where the hand goes and how it is shaped. It is carried out as a robot with touch would: the fingers
+open, the hand backs off as far as it must to touch nothing, advances until it nearly touches, and the fingers close
+until contact. All sources of data are treated alike. The control needs no network: hands that look at the object from
+anywhere advance and close in the same way, which is the method `autograsp`.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ def as_proposed(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats
 
 
 def carried_out(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> GraspSet:
-    """Proposals after opening, backing off until clear, and closing."""
+    """Proposals after opening, backing off until clear, advancing and closing."""
     pair = ground_of(hand, obj, "cpu", kernels)
-    return _closed(pair, _clear(pair, _state(hand, obj, poses, joints)))
+    return _advanced(pair, _clear(pair, _state(hand, obj, poses, joints)))
 
 
 def _state(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> HandState:
@@ -87,8 +87,7 @@ def _state(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> 
 def anywhere(hand: HandModel, obj: ObjectModel, count: int, seed: int) -> GraspSet:
     """The control: hands that look at a random place of the object, carried out in the same way."""
     pair = ground_of(hand, obj, "cpu", kernels)
-    starts = free_starts(pair, seed=seed, batch=0, indices=range(count))
-    return _closed(pair, Closer(pair, count).approach(starts, STANDOFF_M))
+    return _advanced(pair, free_starts(pair, seed=seed, batch=0, indices=range(count)))
 
 
 def _clear(pair: Pair, state: HandState) -> HandState:
@@ -106,5 +105,6 @@ def _clear(pair: Pair, state: HandState) -> HandState:
     return free
 
 
-def _closed(pair: Pair, state: HandState) -> GraspSet:
-    return grasp_set(pair, Closer(pair, len(state.pivot)).close(state).state, 0.0, {})
+def _advanced(pair: Pair, state: HandState) -> GraspSet:
+    closer = Closer(pair, len(state.pivot))
+    return grasp_set(pair, closer.close(closer.approach(state, STANDOFF_M)).state, 0.0, {})

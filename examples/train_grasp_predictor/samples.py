@@ -23,8 +23,9 @@ from service.transforms import quat_rotate, quat_to_matrix
 #: Side of the crop [px], and how much larger than the object's box it is.
 SIZE: Final = 64
 MARGIN: Final = 1.3
-#: Depth that becomes 1 in the network's input [m].
+#: Depth that becomes 1 in the network's input [m], and the most of it that is told.
 DEPTH_UNIT_M: Final = 0.1
+FAR: Final = 3.0
 #: Least cosine between the palm's direction and the camera's: nobody can tell from a picture how a back is shaped.
 SEEN: Final = 0.5
 #: Label of the grasped object in segmentations.
@@ -89,7 +90,7 @@ def crop_of(sample: dict[str, Any]) -> tuple[torch.Tensor, np.ndarray] | None:
     depth = np.asarray(sample["image/depth"], float)
     middle = float(np.median(depth[mask]))
     centre, half = np.array([x0 + x1, y0 + y1]) / 2, MARGIN * max(x1 - x0, y1 - y0) / 2
-    near = np.where(np.isfinite(depth), (depth - middle) / DEPTH_UNIT_M, 3.0).clip(-3, 3)
+    near = np.where(np.isfinite(depth), (depth - middle) / DEPTH_UNIT_M, FAR).clip(-FAR, FAR)
     planes = np.concatenate([np.moveaxis(sample["image/rgb"] / 255.0, -1, 0), near[None], mask[None]])
     k = np.asarray(sample["camera/intrinsics"], float)
     anchor = np.array([*((centre - k[:2, 2]) / np.diag(k)[:2] * middle), middle])
@@ -110,7 +111,7 @@ def _resampled(planes: Any, centre: Any, half: float) -> torch.Tensor:
     x, y = (round(float(value)) - side // 2 for value in centre)
     height, width = planes.shape[1:]
     out = np.zeros((len(planes), side, side), np.float32)
-    out[3] = 3.0  # nothing there: far
+    out[3] = FAR  # nothing is there
     a, b = max(0, y), min(height, y + side)
     c, d = max(0, x), min(width, x + side)
     out[:, a - y : b - y, c - x : d - x] = planes[:, a:b, c:d]

@@ -13,7 +13,9 @@ _HEADINGS: Final = {
     "simulated_displacement_cm": "SD cm", "gsr": "GSR",
 }  # fmt: skip
 
-_TABLES: Final = {"data": "data", "proposed": "trained on; as proposed", "carried out": "trained on; carried out"}
+#: What a row tells of: a source's own grasps, a network's proposals, what comes of them.
+DATA, PROPOSED, CARRIED_OUT = "data", "proposed", "carried out"
+_TABLES: Final = {DATA: "data", PROPOSED: "trained on; as proposed", CARRIED_OUT: "trained on; carried out"}
 
 
 def markdown(rows: Sequence[Row]) -> str:

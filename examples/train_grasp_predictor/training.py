@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import torch
+from torch.nn.functional import affine_grid, grid_sample
 
 from examples.train_grasp_predictor.network import Predictor, loss
-from examples.train_grasp_predictor.samples import Example
+from examples.train_grasp_predictor.samples import FAR, Example
 
 BATCH: Final = 32
 #: Grasps of a picture shown at a time.
@@ -30,6 +31,7 @@ def train(examples: Sequence[Example], *, steps: int, seed: int, rate: float = 1
         chosen = torch.randint(len(examples), (BATCH,)).tolist()
         images = torch.stack([_jittered(examples[i].image) for i in chosen])
         shown = torch.stack([_drawn(examples[i].grasps) for i in chosen])
+        images, shown = turned(images, shown, 2 * torch.pi * torch.rand(BATCH))
         proposed, logits = network(images)
         value = loss(proposed, logits, shown)
         optimiser.zero_grad()
@@ -39,6 +41,26 @@ def train(examples: Sequence[Example], *, steps: int, seed: int, rate: float = 1
         if step >= 0.9 * steps:
             late.append(float(value.detach()))
     return network.eval(), sum(late) / max(1, len(late))
+
+
+def turned(images: torch.Tensor, shown: torch.Tensor, angles: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pictures (B, 5, H, H) and their grasps (B, G, 9 + J) as a camera turned about its axis sees them.
+
+    Pixel axes are the camera's x and y, so one rotation by `angles` (B,) [rad] turns both. The object stands near the
+    axis: what perspective changes is left out.
+    """
+    c, s = angles.cos(), angles.sin()
+    zero = torch.zeros_like(c)
+    inverse = torch.stack([torch.stack([c, s, zero], -1), torch.stack([-s, c, zero], -1)], 1)
+    grid = affine_grid(inverse, list(images.shape), align_corners=False)
+    empty = torch.zeros(images.shape[1])
+    empty[3] = FAR
+    shifted = grid_sample(images - empty[:, None, None], grid, mode="nearest", align_corners=False)
+    rotation = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], 1)
+    out = shown.clone()
+    for first in (0, 3, 6):
+        out[..., first : first + 2] = shown[..., first : first + 2] @ rotation.transpose(1, 2)
+    return shifted + empty[:, None, None], out
 
 
 def _drawn(grasps: torch.Tensor) -> torch.Tensor:

@@ -15,7 +15,7 @@ from examples.train_grasp_predictor import table  # noqa: E402
 from examples.train_grasp_predictor.execution import in_object_frame, orthogonal  # noqa: E402
 from examples.train_grasp_predictor.network import loss  # noqa: E402
 from examples.train_grasp_predictor.samples import SIZE, Example, crop_of, targets_of  # noqa: E402
-from examples.train_grasp_predictor.training import train  # noqa: E402
+from examples.train_grasp_predictor.training import train, turned  # noqa: E402
 
 JOINTS = 4
 FOCAL = 100.0
@@ -84,6 +84,19 @@ def test_the_crop_shows_the_object_in_its_middle_and_its_surroundings_farther_aw
 
 def test_an_object_that_is_hardly_seen_is_left_out() -> None:
     assert crop_of(picture(0.5, slice(50, 54), slice(10, 14))) is None
+
+
+def test_a_turned_picture_and_its_grasps_turn_together() -> None:
+    image = torch.zeros(1, 5, SIZE, SIZE)
+    image[0, 4, SIZE // 2 - 2 : SIZE // 2 + 2, SIZE - 8 : SIZE - 4] = 1.0  # seen at the right: along the camera's x
+    grasp = torch.zeros(1, 1, 9 + JOINTS)
+    grasp[..., 0], grasp[..., 3], grasp[..., 7] = 0.1, 1.0, 1.0  # at the right; its columns are x and y
+    images, shown = turned(image, grasp, torch.tensor([torch.pi / 2]))
+    rows, columns = torch.nonzero(images[0, 4] > 0.5, as_tuple=True)
+    assert rows.min() >= SIZE - 9
+    assert abs(columns.float().mean() - SIZE / 2) < 2  # now below: along y
+    expected = torch.tensor([0, 0.1, 0, 0, 1, 0, -1, 0, 0])
+    torch.testing.assert_close(shown[0, 0, :9], expected, atol=1e-6, rtol=0)
 
 
 def test_of_several_answers_only_the_nearest_needs_to_be_right() -> None:
