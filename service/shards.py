@@ -65,7 +65,12 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         ),
         "quality/wrench_volume": Column("N T", "f8", "1", "none", "volume of the L1 grasp wrench space"),
         "quality/simulated_displacement_cm": Column(
-            "N", "f8", "cm", "none", "object's way in the displacement test; nan: not tested", optional=True
+            "N",
+            "f8",
+            "cm",
+            "none",
+            "object's way in the displacement test; nan: not tested, or it blew up",
+            optional=True,
         ),
         "quality/penetration_depth_mm": Column("N", "f8", "mm", "none", "deepest hand-object penetration"),
         "quality/self_penetration_depth_mm": Column("N", "f8", "mm", "none", "deepest hand-hand penetration"),
@@ -88,7 +93,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "enum",
             "none",
             "of each push +x -x +y -y +z -z: 0 not tried, 1 held, 2 penetration, 3 lost while closing, 4 displaced, "
-            "5 rotated",
+            "5 rotated, 6 diverged",
             optional=True,
         ),
         "quality/verdict_margin": Column(

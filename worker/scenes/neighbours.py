@@ -18,6 +18,7 @@ from service.transforms import compose, quat_rotate
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.mujoco_warnings import void
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
 from worker.scenes.simulate import (
@@ -137,7 +138,7 @@ class _Heap:
             return None
         self.data.qpos[:] = start.ravel()
         seconds = self._run()
-        return None if seconds is None else self._at_rest(seconds)
+        return None if seconds is None or void(self.data) else self._at_rest(seconds)
 
     def _sample(self, rng: np.random.Generator) -> Floats | None:
         """(1 + M, 7) release poses whose bounding balls lie apart; None if the neighbours found no room."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from service.errors import InputError, MeshError
 from service.transforms import quat_rotate
+from worker.mujoco_warnings import void
 from worker.objects.model import Floats, ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
 
@@ -172,7 +173,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> Rest | None:
     mujoco.mj_resetData(table.model, data)
     data.qpos[:] = np.concatenate([position, quaternion])
     seconds = _run(table)
-    if seconds is None:
+    if seconds is None or void(data):
         return None
     quaternion = data.qpos[3:] / np.linalg.norm(data.qpos[3:])
     face, angle = settle(table.faces, quaternion)

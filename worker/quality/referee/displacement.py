@@ -6,6 +6,7 @@ The hand stands still in its grasp posture; the object of 1 kg, friction 3, fall
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.mujoco_warnings import ARENA, void
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import add_object, add_shape
@@ -33,7 +35,7 @@ STEPS: Final = 35
 def simulated_displacement_cm(
     hand: HandModel, obj: ObjectModel, grasp: Posture, *, pieces: ConvexPieces | None = None, threads: int = 0
 ) -> Floats:
-    """(N,) way of the object's centre of mass in the displacement test, for N grasp postures [cm].
+    """(N,) way of the object's centre of mass in the displacement test, for N grasp postures [cm]; nan: it blew up.
 
     Raises:
         MeshError: the object has no usable convex pieces.
@@ -47,7 +49,7 @@ def simulated_displacement_cm(
         data.mocap_pos[:] = poses[:, :3]
         data.mocap_quat[:] = poses[:, 3:]
         mujoco.mj_step(model, data, nstep=STEPS)
-        return float(np.linalg.norm(data.qpos[:3] - centre))
+        return math.nan if void(data) else float(np.linalg.norm(data.qpos[:3] - centre))
 
     with ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="displacement") as pool:
         return 100.0 * np.array(list(pool.map(work, bodies)), float)
@@ -56,6 +58,7 @@ def simulated_displacement_cm(
 def _build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
+    spec.memory = ARENA
     spec.option.timestep = TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

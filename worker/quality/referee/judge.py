@@ -151,7 +151,8 @@ class _Bench:
             trial = self._with(self._coarse, grasps, row)
             low, high = SCREEN_BAND
             # A penetration has no margin: it is a fact of geometry, the same in either physics.
-            if trial.outcomes[0] is Outcome.PENETRATION or not low < trial.margin < high:
+            clear = trial.outcomes[0] is Outcome.PENETRATION or not low < trial.margin < high
+            if clear and Outcome.DIVERGED not in trial.outcomes:
                 return trial
             second = self._with(self._full, grasps, row)
             second.steps += trial.steps

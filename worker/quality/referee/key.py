@@ -21,7 +21,7 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 Level = Literal["letter", "certificate", "screen"]
 
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
-REVISION: Final = 2
+REVISION: Final = 3
 
 
 def verdict_key(

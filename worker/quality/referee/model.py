@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from worker.grasps import Posture
 from worker.hands.model import ConvexPiece, HandModel, JointType
+from worker.mujoco_warnings import ARENA
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
 
@@ -104,6 +105,7 @@ def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Phys
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10.0
     option.noslip_iterations = physics.noslip_iterations
+    spec.memory = ARENA
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     friction = [*physics.friction, 1e-4]
     _add_hand(spec, hand, friction, physics.root)

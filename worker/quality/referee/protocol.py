@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.grasps import GraspSet
+from worker.mujoco_warnings import void
 from worker.quality.referee.model import OBJECT_MASS, Scene, blend
 
 Floats = NDArray[np.float64]
@@ -51,6 +52,7 @@ class Outcome(IntEnum):
     LOST_WHILE_CLOSING = 3
     DISPLACED = 4
     ROTATED = 5
+    DIVERGED = 6
 
 
 @dataclass
@@ -117,7 +119,7 @@ class Test:
             # A push must bring the object back inside the limits for this to be wrong: not seen in 690 grasps.
             trial.margin = max(trial.margin, self._excess())
             trial.steps = self._steps
-            return trial.fail(Outcome.LOST_WHILE_CLOSING)
+            return trial.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
         self._save()
         for direction in range(len(DIRECTIONS)):
             self._restore()
@@ -212,6 +214,8 @@ class Test:
         return max(moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
 
     def _judge(self, trial: Trial) -> Outcome:
+        if void(self.data):
+            return Outcome.DIVERGED
         moved, turned = self._motion()
         trial.margin = max(trial.margin, moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
         if not moved < MAX_DISPLACEMENT_M:
