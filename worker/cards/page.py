@@ -82,7 +82,7 @@ def _summary(card: Row, plots: Mapping[str, str]) -> str:
     ]
     if taken := card["snapshot"]:
         whole = "complete" if taken["complete"] else "**not complete**"
-        lines.append(f"Snapshot `{taken['digest']}` of {taken['created']}, {whole}.")
+        lines.append(f"Snapshot `{taken['digest']}` of {taken['created'][:19]}Z, {whole}.")
     if card["source"]:
         lines.append(card["source"])
     lines.append("Every figure on this page was computed from the shards; `card.json` has all of them.")
@@ -165,7 +165,12 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
 def _quality(card: Row, plots: Mapping[str, str]) -> str:
     at = _millimetres(card["contact_threshold_m"])
     text = f"Of the valid grasps: median (5th to 95th percentile). ε, Vol and contact area at a threshold of {at}."
-    fold = _details("Each hand on each object (medians)", cells_table(card))
+    note = (
+        "D is the share of variance that the first principal component of position, rotation and joints explains: lower is "
+        f"more diverse. Directions are {card['directions']['cells']} of equal area, from where the palm comes in the "
+        "object's frame."
+    )
+    fold = _details("Each hand on each object (medians)", f"{cells_table(card)}\n\n{note}")
     return f"## Quality\n\n{text}\n\n{quality_table(card)}{_plot('quality.png', plots)}\n\n{fold}"
 
 

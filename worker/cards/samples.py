@@ -42,15 +42,17 @@ def write_samples(shards: Shards, file: Path) -> bool:
 
 def choose(files: tuple[ShardFile, ...], most: int = MOST) -> list[ShardFile]:
     """At most so many shards: of each object in turn one of another hand, spread over all objects."""
-    cells: dict[tuple[str, str], ShardFile] = {}
+    cells: dict[tuple[str, str], list[ShardFile]] = {}
     for file in files:
-        cells.setdefault((file.hand, file.object), file)
+        cells.setdefault((file.hand, file.object), []).append(file)
     hands = list(dict.fromkeys(hand for hand, _ in cells))
     objects = list(dict.fromkeys(obj for _, obj in cells))
     ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
     some = ranked[: max(most, len(objects))]
     spread = some if len(some) <= most else [some[round(k)] for k in np.linspace(0, len(some) - 1, most)]
-    return [cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1]))]
+    # Another batch of each: those of one number have materials and lamps in common.
+    chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
+    return [batches[number % len(batches)] for number, batches in enumerate(chosen)]
 
 
 def _picture(path: Path) -> NDArray[np.uint8]:

@@ -93,8 +93,10 @@ def cells_table(card: Row) -> str:
              percent(1 - cell["directions"]["empty"] / card["directions"]["cells"]) if cell["directions"] else "-",
              cell["missing_because"] or ""]
         )  # fmt: skip
-    head = ("hand", "object", "asked", "tried", "valid", "of tries", *(QUALITY_NAMES[name][0] for name in _SHOWN),
-            "clear of table", "D", "directions used", "missing")  # fmt: skip
+    head = ["hand", "object", "asked", "tried", "valid", "of tries", *(QUALITY_NAMES[name][0] for name in _SHOWN),
+            "clear of table", "D", "directions used", "missing because"]  # fmt: skip
+    if not any(row[-1] for row in rows):
+        head, rows = head[:-1], [row[:-1] for row in rows]
     return markdown(head, rows, words=2)
 
 
