@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final, Literal, get_origin
 
@@ -43,13 +44,24 @@ def with_job_options(command: Callable[..., None]) -> Callable[..., None]:
     return wrapper
 
 
-def pairs(texts: Iterable[str]) -> dict[str, str]:
-    """`name=value` of each `--option`; InputError for another form."""
+def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
+    """`name=value` of each `--option`, numbers as numbers: the same job as by HTTP. InputError for another form."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:
         if not equals:
             raise InputError(f"--option {name + value!r}: write it as name=value, for example steps=20000")
-    return {name: value for name, _, value in split}
+    return {name: _number(value) for name, _, value in split}
+
+
+def _number(text: str) -> str | int | float:
+    for kind in (int, float):
+        try:
+            number = kind(text)
+        except ValueError:
+            continue
+        # Only what is written as a number is: 007 and nan stay what they are.
+        return number if str(number) == text and math.isfinite(number) else text
+    return text
 
 
 def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:

@@ -53,7 +53,7 @@ def test_the_matrix_is_a_table_of_objects_and_hands(graspd: Shell) -> None:
 def test_a_dataset_takes_options_of_its_method(graspd: Shell) -> None:
     method = ("--method", "graspit", "--option", "keep=20", "--option", "steps=40000")
     made = graspd.json("datasets", "create", "annealed", *CREATE[3:], *method, "--yes")
-    assert made["dataset"]["options"]["options"] == {"keep": "20", "steps": "40000"}
+    assert made["dataset"]["options"]["options"] == {"keep": 20, "steps": 40000}
     done = graspd("datasets", "create", "odd", *CREATE[3:], "--option", "keep")
     assert done.returncode == 2 and "write it as name=value" in said(done)
 

@@ -49,7 +49,7 @@ def test_json_says_the_same(tmp_path: Path) -> None:
 def test_an_option_goes_before_the_spec(tmp_path: Path) -> None:
     found = asked(spec(tmp_path, TOML), hands="shadow", fidelity="fine", grasps=5, options=["steps=3"])
     assert (found.hands, found.objects) == ("shadow", "mug,block")
-    assert found.options["fidelity"] == "fine" and found.options["options"] == {"steps": "3"}
+    assert found.options["fidelity"] == "fine" and found.options["options"] == {"steps": 3}
     assert found.total is None and found.options["grasps"] == 5
 
 
