@@ -14,7 +14,7 @@ CELLS: Final = BANDS * SECTORS
 #: Fewer grasps leave cells empty by chance: with this many uniform ones e^-5 of a cell, 0.3 of all 48.
 ENOUGH: Final = 5 * CELLS
 #: Elevations from -90 to 90 degrees.
-ELEVATION_BINS: Final = 18
+ELEVATION_BINS: Final = 36
 
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
+
 Row = Mapping[str, Any]
 
 #: A cell yields little below this part of the median of its hand's cells.
@@ -17,6 +19,8 @@ _AT_LIMIT: Final = 0.5
 _EMPTY: Final = 0.25
 #: Valid grasps per hand or object differ worth a word from this ratio on.
 _UNEVEN: Final = 1.2
+#: Directions are preferred where more palms come from there than so many times an even share.
+_PEAKED: Final = 1.25
 _SHOWN: Final = 8
 
 
@@ -122,10 +126,28 @@ def _table(card: Row) -> list[str]:
         told[0] += f" Too near to: {', '.join(why)}."
     if len(rows) > 3:
         told[0] += f" Fewest on {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
-    clear = [sum(column) for column in zip(*(sums["clear"] for sums in card["elevation"].values()), strict=True)]
-    if sum(clear):
-        # Elevations from -90 to 90 degrees: the upper quarter of them is 45 degrees and more.
-        above = sum(clear[3 * len(clear) // 4 :]) / sum(clear)
+    return [*told, *_elevations(card)]
+
+
+def _elevations(card: Row) -> list[str]:
+    """From how high the palms come over the table, against directions drawn evenly on the sphere."""
+    every, clear = (
+        np.sum([sums[name] for sums in card["elevation"].values()] or [[0]], axis=0) for name in ("all", "clear")
+    )
+    if not every.sum():
+        return []
+    edges = np.linspace(-90, 90, len(every) + 1)
+    middles = np.abs(edges[1:] + edges[:-1]) / 2
+    even = np.diff(np.sin(np.radians(edges))) / 2
+    told, said = [], []
+    for what, chosen in (("10° of the horizontal", middles < 10), ("20° of the vertical", middles > 70)):
+        found, expected = every[chosen].sum() / every.sum(), even[chosen].sum()
+        if found > _PEAKED * expected:
+            said.append(f"{_percent(found)} within {what} ({_percent(expected)} if they were even)")
+    if said:
+        told.append(f"**Preferred directions**: of all palms over the table, {' and '.join(said)}.")
+    if clear.sum():
+        above = clear[(edges[1:] + edges[:-1]) / 2 > 45].sum() / clear.sum()
         told.append(
             f"Of the pairs that are clear of the table {_percent(above)} have the palm come from 45° or more above the "
             "horizontal."
@@ -141,9 +163,11 @@ def _directions(card: Row) -> str:
         return ""
     if not empty:
         most = max(some, key=lambda name: some[name]["empty"])
+        low, high = (end(row["evenness"] for row in some.values()) for end in (min, max))
         return (
-            f"Hands come from nearly everywhere: of {rows['cells']} directions of equal area no object lacks more than "
-            f"{some[most]['empty']} ({most})."
+            f"Hands come from nearly everywhere, if not evenly: of {rows['cells']} directions of equal area no object "
+            f"lacks more than {some[most]['empty']} ({most}); they spread as widely as {_percent(low)} to "
+            f"{_percent(high)} of them used alike would, by object."
         )
     each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
     return f"**Directions never used**, of {rows['cells']} of equal area in the object's frame: {each}."

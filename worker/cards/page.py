@@ -166,9 +166,9 @@ def _quality(card: Row, plots: Mapping[str, str]) -> str:
     at = _millimetres(card["contact_threshold_m"])
     text = f"Of the valid grasps: median (5th to 95th percentile). ε, Vol and contact area at a threshold of {at}."
     note = (
-        "D is the share of variance that the first principal component of position, rotation and joints explains: lower is "
-        f"more diverse. Directions are {card['directions']['cells']} of equal area, from where the palm comes in the "
-        "object's frame."
+        "D is the share of variance that the first principal component of position, rotation and joints explains: "
+        f"lower is more diverse. Directions are {card['directions']['cells']} of equal area, from where the palm comes "
+        "in the object's frame."
     )
     fold = _details("Each hand on each object (medians)", f"{cells_table(card)}\n\n{note}")
     return f"## Quality\n\n{text}\n\n{quality_table(card)}{_plot('quality.png', plots)}\n\n{fold}"

@@ -130,6 +130,18 @@ def test_a_cell_that_ran_out_of_budget_is_told(tmp_path: Path) -> None:
     )
 
 
+def test_directions_that_are_preferred_are_told(tmp_path: Path) -> None:
+    found = case(tmp_path, drawn=False)
+    found.made.parts.close()
+    level = np.zeros(36, int)
+    level[17:19], level[30] = 80, 40
+    found.card["elevation"] = {"barrett": {"all": level.tolist(), "clear": level.tolist()}}
+    told = "\n".join(findings(found.card))
+    # two bins of 5 degrees hold 160 of 200; those within 10 degrees of the horizontal, sin(10 deg) of the sphere
+    assert "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % if" in told
+    assert "clear of the table 20 % have the palm come from 45° or more" in told and "vertical" not in told
+
+
 def test_a_joint_that_does_not_move_is_told(kitchen: Case) -> None:
     assert kitchen.card["joints"][STILL_HAND][STILL_JOINT]["used"] < 0.05
     assert f"**{STILL_HAND} hardly moves** `{STILL_JOINT}`" in kitchen.page
@@ -165,9 +177,9 @@ def test_evenness_of_one_direction_is_one_cell() -> None:
 
 
 def test_elevations_are_degrees_over_the_horizontal() -> None:
-    angles = np.radians([-85.0, 5.0, 85.0])
+    angles = np.radians([-88.0, 2.0, 88.0])
     vectors = np.stack([np.cos(angles), np.zeros(3), np.sin(angles)], axis=1)
-    assert np.flatnonzero(elevations(vectors)).tolist() == [0, 9, 17]
+    assert np.flatnonzero(elevations(vectors)).tolist() == [0, 18, 35]
 
 
 def test_the_use_of_a_joint_is_a_share_of_its_limits() -> None:
