@@ -1,6 +1,6 @@
 """Samples per second of the readers against plain HDF5: `python -m benchmarks.readers SHARDS [--json]`.
 
-SHARDS is a folder with base, scene and views shards, `demo-out/shards` say. One run, warm: all ways in turn, three
+SHARDS is a folder with base, scene and views shards, `demo-out/shards` say. One run, warm: all ways in turn, five
 times; of each the best pass counts. A ratio is to plain h5py that reads the same samples as many at a time.
 """
 
@@ -21,7 +21,7 @@ import typer
 from service.readers import Grasps, Pictures, Shards, open_shards
 from service.readers.grasps import DEFAULT_COLUMNS
 
-ROUNDS = 3
+ROUNDS = 5
 PICTURE = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
 
 
@@ -88,10 +88,12 @@ def ways(shards: Shards) -> dict[str, Way]:
 
 def loaders(shards: Shards) -> dict[str, Way]:
     """The same through PyTorch's DataLoader."""
+    import torch
     from torch.utils.data import DataLoader
 
     from service.readers.torch_data import Samples, ShuffledShards, collate
 
+    torch.set_num_threads(1)  # on a busy machine the threads of one copy wait for one another
     found = {}
     for processes in (0, 2):
         streams = [
