@@ -40,8 +40,6 @@ _NOT_MODELLED: Final = """\
 - Scenes hold one object, dropped onto a plane as its convex hull.
 - Pictures have procedural materials and no textures, sensor noise, lens distortion or motion blur. They were counted
   here, not looked at.
-- Materials, lamps and cameras are drawn by seed and number of the batch: batches of the same number look alike over all
-  pairs of hand and object.
 - ε and contact area depend on the contact threshold more than on anything else: compare only at the same one."""
 
 
