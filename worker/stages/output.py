@@ -69,8 +69,8 @@ def shard_of(
 def batch_seed(message: TaskMessage) -> int:
     """Seed of this stage of this batch.
 
-    Batches of a job, hands and objects must not repeat each other's materials, lamps and cameras. Methods do: that grasps
-    of two of them stand in the same pictures lets what a network learns of them be compared.
+    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods do: when grasps of two
+    of them stand in the same pictures, what a network learns of either can be compared.
     """
     pair = [message.hand_digest, message.object_digest]
     return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
