@@ -9,7 +9,6 @@ than wall time.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,10 @@ from typing import Any
 import numpy as np
 from cells import HANDS, cells, write_json
 
+from worker.intervals import wilson
+
 CORES = 2
 LEVELS = ("letter", "certificate", "screen")
-
-
-def wilson(good: int, total: int) -> tuple[float, float]:
-    """95 % interval of a rate."""
-    z, p = 1.96, good / total
-    middle, half = p + z * z / (2 * total), z * math.sqrt(p * (1 - p) / total + z * z / (4 * total * total))
-    return (middle - half) / (1 + z * z / total), (middle + half) / (1 + z * z / total)
 
 
 def row(found: list[dict[str, Any]], letter: np.ndarray) -> dict[str, Any]:

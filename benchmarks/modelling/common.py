@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest, rankdata
+from scipy.stats import rankdata
 
 from service.domain import FIDELITIES
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.intervals import wilson
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
@@ -87,8 +88,8 @@ def verdicts(scene: Scene, grasps: GraspSet) -> Bools:
 
 def share(good: int, total: int) -> Row:
     """A rate with its 95 % interval (Wilson)."""
-    bounds = binomtest(int(good), total).proportion_ci(method="wilson")
-    return {"value": good / total, "low": float(bounds.low), "high": float(bounds.high), "n": total}
+    low, high = wilson(int(good), total)
+    return {"value": good / total, "low": low, "high": high, "n": total}
 
 
 def mean(values: Floats) -> Row:

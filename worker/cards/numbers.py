@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
 from service.clock import timestamp
 from service.domain import AssetKind
@@ -18,6 +17,7 @@ from worker.cards.contents import AssetFacts, Contents
 from worker.cards.directions import CELLS, ELEVATION_BINS, ENOUGH, cell_counts, evenness
 from worker.cards.tally import QUALITIES, CellTally, Tally
 from worker.grasps import Posture
+from worker.intervals import wilson
 from worker.quality.diversity import explained_variance
 
 Row = dict[str, Any]
@@ -70,8 +70,8 @@ def share(part: int, whole: int) -> Row | None:
     """A share with its 95 % interval (Wilson 1927); None of nothing."""
     if not whole:
         return None
-    bounds = binomtest(part, whole).proportion_ci(method="wilson")
-    return {"share": part / whole, "low": float(bounds.low), "high": float(bounds.high)}
+    low, high = wilson(part, whole)
+    return {"share": part / whole, "low": low, "high": high}
 
 
 def _composition(contents: Contents, tally: Tally) -> Row:

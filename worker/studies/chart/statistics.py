@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.intervals import wilson
 from worker.studies.chart.cells import Cell
 
 Floats = NDArray[np.float64]
@@ -43,14 +44,6 @@ def figures(cell: Cell) -> dict[str, Any]:
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
     widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
     return {key: plain(value) for key, value in row.items()}
-
-
-def wilson(valid: int, grasps: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927): of none or all, where a bootstrap sees no spread, it is not empty."""
-    z2 = 1.959964**2
-    middle = (valid + z2 / 2) / (grasps + z2)
-    half = float(np.sqrt(z2 * (valid * (grasps - valid) / grasps + z2 / 4))) / (grasps + z2)
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
