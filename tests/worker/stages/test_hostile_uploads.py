@@ -199,14 +199,19 @@ def test_a_small_archive_of_ten_million_faces_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_mesh_that_takes_an_hour_to_repair_is_refused_within_the_bound() -> None:
+def test_a_tangle_of_balls_is_united_within_the_bound() -> None:
     """220 balls of 4000 faces in one another: each pair of faces that cross is work for the repair."""
     rng = np.random.default_rng(0)
-    tangle = join(*(sphere(0.04, 64, at=tuple(rng.uniform(-0.02, 0.02, 3))) for _ in range(220)))
+    centres = rng.uniform(-0.02, 0.02, (220, 3))
+    tangle = join(*(sphere(0.04, 64, at=tuple(centre)) for centre in centres))
     start = time.monotonic()
     found = upload(open_store("memory://"), AssetKind.OBJECT, "tangle.stl", stl(tangle)["m.stl"])
     assert time.monotonic() - start < BOUND_S
-    assert found["verdict"] == "refuse" and f"takes longer than {ingest.CPU_LIMIT_S} s" in found["message"]
+    assert found["verdict"] == "repair" and found["repairs"] == ["united 220 intersecting components"]
+    points = rng.uniform(-0.06, 0.06, (50_000, 3))
+    inside = (np.linalg.norm(points[:, None] - centres[None], axis=2) < 0.04).any(axis=1).mean()
+    # Standard error of the sample 0.3 %; balls of flat faces are 0.5 % smaller than round ones.
+    assert found["facts"]["volume_m3"] == pytest.approx(0.12**3 * inside, rel=0.02)
 
 
 def test_the_limits_of_a_check_keep_the_promised_bound() -> None:
