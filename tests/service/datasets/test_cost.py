@@ -89,6 +89,18 @@ def test_knobs_without_a_measurement_say_what_stands_in(parts: Parts) -> None:
     assert {rate.seconds_per_try for rate in found.rates} == {STORED["standard"][0]}
 
 
+def test_a_method_that_anneals_costs_more_than_one_that_descends(parts: Parts) -> None:
+    """As in docs/results/chart.md: a chain of GraspIt's takes about ten times as long as a grasp of fast_graspd."""
+    slow, fast = (estimate(parts.index, wanted(method=method)) for method in ("graspit", "fast_graspd"))
+    assert {rate.origin for rate in slow.rates} == {f"{ORIGIN}, graspit"}
+    assert slow.plans[0].seconds > 5 * fast.plans[0].seconds
+
+
+def test_a_method_nobody_measured_says_what_stands_in(parts: Parts) -> None:
+    found = estimate(parts.index, wanted(method="mine"))
+    assert {rate.origin for rate in found.rates} == {f"{ORIGIN}, of fast_graspd for want of mine"}
+
+
 def test_a_million_grasps_on_one_eight_and_sixty_four_workers(parts: Parts) -> None:
     found = estimate(parts.index, wanted(hands=("claw",), objects=("cube",), grasps=1_000_000, scenes=2, views=3))
     assert found.tasks == 3 * 31_250 and found.asked == 1_000_000
