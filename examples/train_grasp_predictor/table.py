@@ -35,10 +35,10 @@ def _table(rows: Sequence[Row], side: str, title: str) -> list[str]:
         "| --- " + "| --: " * 9 + "|",
     ]
     for name in dict.fromkeys(row["source"] for row in some):
-        of_source = [row for row in some if row["source"] == name]
-        seeds = {
-            row.get("seed", 0): [r for r in of_source if r.get("seed", 0) == row.get("seed", 0)] for row in of_source
-        }
+        seeds: dict[int, list[Row]] = {}
+        for row in some:
+            if row["source"] == name:
+                seeds.setdefault(row.get("seed", 0), []).append(row)
         first = next(iter(seeds.values()))
         cells = [_cell([fmean(row[metric] for row in part) for part in seeds.values()]) for metric in _HEADINGS]
         counts = [len(first), first[0].get("pictures", "–"), sum(row["grasps"] for row in first)]
