@@ -94,7 +94,8 @@ def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> Non
     parts.index.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
 
 
-def _poses(random: np.random.Generator, count: int) -> NDArray[np.float64]:
+def poses(random: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """(N, 7) hand poses around the origin, turned at random."""
     quaternions = random.normal(size=(count, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return np.concatenate([random.normal(0, 0.1, (count, 3)), quaternions], axis=1)
@@ -104,7 +105,7 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     thresholds = np.array([0.001, 0.005])
     arrays: Arrays = {"quality/thresholds_m": thresholds}
     for posture in ("grasp", "pregrasp", "squeeze"):
-        arrays[f"{posture}/hand_pose"] = _poses(random, count)
+        arrays[f"{posture}/hand_pose"] = poses(random, count)
         arrays[f"{posture}/joint_positions"] = random.normal(0.6, 0.3, (count, JOINTS))
     for name, scale in (("contact_area_cm2", 9.0), ("epsilon", 0.25), ("wrench_volume", 0.8)):
         arrays[f"quality/{name}"] = random.gamma(4.0, scale / 4, (count, len(thresholds)))
@@ -119,16 +120,21 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
 
 
 def _scene(random: np.random.Generator, count: int, request: JobRequest) -> Arrays:
-    scenes, rows = request.scenes, count * request.scenes
+    return scene_columns(random, count, request.scenes)
+
+
+def scene_columns(random: np.random.Generator, count: int, scenes: int, clear: float = 0.5) -> Arrays:
+    """Every grasp in every scene, clear of the table or not by chance."""
+    rows = count * scenes
     return {
-        "scene/object_pose": _poses(random, scenes),
+        "scene/object_pose": poses(random, scenes),
         "scene/rest_probability": np.full(scenes, 1 / scenes),
         "scene/drop_seconds": np.full(scenes, 0.8),
         "grasp/base_index": np.tile(np.arange(count, dtype=np.int32), scenes),
         "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), count),
-        "grasp/hand_pose": _poses(random, rows),
+        "grasp/hand_pose": poses(random, rows),
         "grasp/table_clearance_m": random.normal(0.01, 0.01, rows),
-        "grasp/valid": (random.random(rows) < 0.5).astype(np.uint8),
+        "grasp/valid": (random.random(rows) < clear).astype(np.uint8),
     }
 
 
@@ -139,7 +145,7 @@ def _views(random: np.random.Generator, count: int, request: JobRequest) -> Arra
     shade = np.linspace(40, 220, width, dtype=np.uint8)
     return {
         "camera/intrinsics": np.tile(np.eye(3), (views, 1, 1)),
-        "camera/extrinsics": pose_to_matrix(_poses(random, views)),
+        "camera/extrinsics": pose_to_matrix(poses(random, views)),
         "camera/scene_index": np.repeat(np.arange(request.scenes, dtype=np.int32), request.views * eyes),
         "camera/eye": np.resize(np.array([1, 2] if request.stereo else [0], np.uint8), views),
         "camera/stereo_baseline_m": np.full(views, 0.06),

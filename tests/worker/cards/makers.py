@@ -25,7 +25,7 @@ from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, put_record, read_record
 from service.settings import Settings
 from service.store import open_store
-from tests.api.factories import add_builtins
+from tests.api.factories import add_builtins, poses, scene_columns
 from worker.stages.output import Output, shard_of
 
 HANDS = ("allegro", "barrett")
@@ -133,12 +133,6 @@ _ALLEGRO = tuple(
 )
 
 
-def poses(rng: np.random.Generator, count: int) -> Array:
-    """Hand poses around the origin, turned at random."""
-    turn = rng.normal(size=(count, 4))
-    return np.concatenate([rng.normal(0, 0.1, (count, 3)), turn / np.linalg.norm(turn, axis=1, keepdims=True)], axis=1)
-
-
 def _base(rng: np.random.Generator, hand: str, count: int, batch: int) -> dict[str, Array]:
     joints = len(BARRETT if hand == "barrett" else _ALLEGRO)
     thresholds = np.array([0.001, 0.005])
@@ -163,19 +157,8 @@ def _base(rng: np.random.Generator, hand: str, count: int, batch: int) -> dict[s
 
 
 def _scene(rng: np.random.Generator, count: int, scenes: int) -> dict[str, Array]:
-    rows = count * scenes
-    clear = (rng.random(rows) < 0.1).astype(np.uint8)
-    return {
-        "scene/object_pose": poses(rng, scenes),
-        "scene/rest_probability": np.full(scenes, 1 / scenes),
-        "scene/drop_seconds": np.full(scenes, 0.8),
-        "grasp/base_index": np.tile(np.arange(count, dtype=np.int32), scenes),
-        "grasp/scene_index": np.repeat(np.arange(scenes, dtype=np.int32), count),
-        "grasp/hand_pose": poses(rng, rows),
-        "grasp/table_clearance_m": rng.normal(0.01, 0.01, rows),
-        "grasp/valid": clear,
-        "grasp/rejection": (1 - clear).astype(np.uint8),
-    }
+    columns = scene_columns(rng, count, scenes, clear=0.1)
+    return columns | {"grasp/rejection": (1 - columns["grasp/valid"]).astype(np.uint8)}
 
 
 def _views(count: int) -> dict[str, Array]:
