@@ -10,7 +10,7 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,23 +45,20 @@ def plain_columns(shards: Shards) -> int:
 
 def plain_rows(shards: Shards) -> int:
     """The same grasp by grasp, each file opened once."""
-    count = 0
-    for file in shards.of("base"):
-        with h5py.File(shards.path(file), "r") as opened:
-            for row in range(len(opened["quality/valid"])):
-                for name in DEFAULT_COLUMNS:
-                    opened[name][row]
-                count += 1
-    return count
+    return _row_by_row(shards, "base", DEFAULT_COLUMNS)
 
 
 def plain_pictures(shards: Shards) -> int:
     """Colour, depth, labels and camera of every picture, one by one, each file opened once."""
+    return _row_by_row(shards, "views", PICTURE)
+
+
+def _row_by_row(shards: Shards, kind: str, columns: Sequence[str]) -> int:
     count = 0
-    for file in shards.of("views"):
+    for file in shards.of(kind):
         with h5py.File(shards.path(file), "r") as opened:
-            for row in range(len(opened["camera/eye"])):
-                for name in PICTURE:
+            for row in range(len(opened[columns[0]])):
+                for name in columns:
                     opened[name][row]
                 count += 1
     return count
