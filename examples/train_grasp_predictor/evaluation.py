@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from examples.train_grasp_predictor.samples import Example
 from service.readers import Grasps, Shards
@@ -20,11 +19,12 @@ from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
 
-Floats = NDArray[np.float64]
-
 #: Contact threshold of areas and wrench spaces [m]; how many grasps of an object count for them, best epsilon first.
 CONTACT_M: Final = 0.005
 BEST: Final = 10
+#: Quality columns with a value for each threshold, and with one.
+_SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
+_SINGLE: Final = ("intersection_volume_cm3", "simulated_displacement_cm")
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,6 @@ def in_data(shards: Shards, name: str) -> Score:
     arrays = Grasps(shards.only(objects=[name]), paths, valid=False).arrays()
     first = shards.only(objects=[name]).of("base")[0]
     return _summary(arrays | {"quality/thresholds_m": read_shard(shards.path(first))["quality/thresholds_m"]})
-
-
-_SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
-_SINGLE: Final = ("intersection_volume_cm3", "simulated_displacement_cm")
 
 
 def _summary(columns: Mapping[str, Any]) -> Score:
