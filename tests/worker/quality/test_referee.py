@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 from pathlib import Path
+from types import ModuleType
 
 import mujoco
 import numpy as np
@@ -16,10 +19,12 @@ from tests.worker.quality.helpers import plate_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.quality import postures
 from worker.quality.postures import pregrasp, squeeze
+from worker.quality.referee import protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose, union_volume
 from worker.quality.referee.judge import judge
-from worker.quality.referee.key import verdict_key
+from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from worker.quality.referee.model import OBJECT_MASS, Physics, build
 from worker.quality.referee.protocol import Outcome, Test
 from worker.quality.referee.robustness import robustness
@@ -160,6 +165,44 @@ def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatc
             patch.setattr(f"worker.quality.{constant}", 1.5)
             found.add(verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE))
     assert len(found) == 8
+
+
+def test_a_constant_that_moves_no_verdict_moves_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE)
+    monkeypatch.setattr(protocol, "UNRELATED", 7, raising=False)
+    monkeypatch.setattr(postures, "_CHUNK", 5)
+    assert verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE) == terms
+
+
+def test_a_constant_of_one_level_moves_the_key_of_that_level_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels: tuple[Level, ...] = ("letter", "certificate", "screen")
+
+    def terms() -> list[str]:
+        return [verdict_key(PLATES, BOX, level, False, pieces=WHOLE) for level in levels]
+
+    before = terms()
+    monkeypatch.setattr(protocol, "SCREEN_BAND", (0.2, 4.0))
+    assert [a == b for a, b in zip(before, terms(), strict=True)] == [True, True, False]
+
+
+def test_every_constant_of_the_protocol_is_said_to_move_verdicts_or_not_to() -> None:
+    # A new constant belongs in key.py, or here if no verdict depends on it.
+    still = {"postures._CHUNK"}
+    named = {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in MOVES.items() for name in names}
+    for modules in LEVEL_MOVES.values():
+        named |= {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in modules.items() for name in names}
+    there = {
+        f"{part.__name__.rpartition('.')[2]}.{name}"
+        for part in MOVES
+        for name in vars(part)
+        if name.lstrip("_").isupper() and _assigned(part, name)
+    }
+    assert there == named | still
+
+
+def _assigned(module: ModuleType, name: str) -> bool:
+    """Whether the constant is the module's own, not imported from another."""
+    return re.search(rf"^{name}\b[^=\n]*=", inspect.getsource(module), re.MULTILINE) is not None
 
 
 def test_joint_limits_reach_the_engine_in_radians() -> None:

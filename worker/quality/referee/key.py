@@ -23,6 +23,29 @@ Level = Literal["letter", "certificate", "screen"]
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
 REVISION: Final = 3
 
+_EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "LOST_ROTATION")
+#: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
+#: that stands in neither moves none.
+MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
+    protocol: (
+        "DIRECTIONS", "PUSH", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S",
+    ),
+    model: (
+        "OBJECT_MASS", "FRICTION", "HARD", "ARMATURE", "FRICTION_LOSS", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF",
+        "COUPLING_SOLREF", "COUPLING_SOLIMP", "_BARE_RADIUS", "_MIN_MASS",
+    ),
+    postures: (
+        "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "OPENING_STEPS", "JAM_M", "WAY",
+        "JAM_LOOKS", "RETREATS_M", "PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS",
+    ),
+    squeeze: ("SPREAD", "TORQUE", "SUM"),
+}  # fmt: skip
+LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
+    "letter": {protocol: ("LETTER_INTERVAL_S",)},
+    "certificate": {protocol: _EARLY},
+    "screen": {protocol: (*_EARLY, "SCREEN_BAND"), model: ("COARSE",)},
+}
+
 
 def verdict_key(
     hand: HandModel,
@@ -36,7 +59,7 @@ def verdict_key(
     """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
 
     In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
-    convex pieces of the object, constants of the protocol, version of the engine.
+    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine.
 
     Raises:
         MeshError: `pieces` is not given and the object has none that are usable.
@@ -53,7 +76,8 @@ def verdict_key(
             "gains": [array.tolist() for array in (hand.stiffness, hand.effort, hand.masses)],
             "object": [obj.digest, np.round(obj.inertia, 12).tolist(), np.round(obj.centre_of_mass, 9).tolist()],
             "pieces": pieces.digest,
-            "constants": [_constants(part) for part in (protocol, model, postures, squeeze)],
+            "physics": asdict(model.Physics().hardened() if hard else model.Physics()),
+            "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
         }
     )
 
@@ -65,7 +89,13 @@ def postures_key(terms: str, grasps: GraspSet) -> str:
     return digest_json([terms, digest_bytes(b"".join(np.ascontiguousarray(a, float).tobytes() for a in arrays))])
 
 
-def _constants(module: ModuleType) -> dict[str, Any]:
-    """Values of the module's constants."""
-    found = {name: value for name, value in vars(module).items() if name.lstrip("_").isupper()}
-    return {name: asdict(value) if isinstance(value, model.Physics) else value for name, value in found.items()}
+def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
+    """Values of the named constants, module by module; of a module's name the last word counts."""
+    return {
+        part.__name__.rpartition(".")[2]: {name: _plain(getattr(part, name)) for name in there}
+        for part, there in names.items()
+    }
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if isinstance(value, model.Physics) else value
