@@ -48,6 +48,7 @@ from service.index.views import (
     Stats,
     TaskView,
 )
+from service.integrity import Checked
 from service.keeper import PART as KEEPER
 from service.logs import bind
 from service.metrics.index_now import read_index
@@ -81,6 +82,7 @@ class Catalog:
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
         self._losses: dict[str, tuple[int, list[float]] | None] = {}
         self._grasp_files = GraspFiles(parts.store)
+        self._checked = Checked(parts.store)
         self._probes = Probes(parts)
 
     @property
@@ -172,6 +174,16 @@ class Catalog:
 
     def shard(self, shard_id: str) -> Shard:
         return _shard(self._parts.index.shard(shard_id))
+
+    def checked_shard(self, shard_id: str) -> Shard:
+        """A shard whose file is what its checksum says; read through once, then again only where it was changed.
+
+        Raises:
+            DamagedShard: its file is gone, or has another checksum.
+        """
+        shard = self.shard(shard_id)
+        self._checked.check(shard.key, shard.sha256)
+        return shard
 
     def assets(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
         return self._parts.index.assets(kind, limit=limit, cursor=cursor)

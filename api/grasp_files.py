@@ -10,6 +10,7 @@ from typing import Any, Final
 from api.models import GraspDetail, Posture, Push
 from service.errors import InputError, NotFoundError
 from service.index.views import GraspView, ShardView
+from service.integrity import read_checked
 from service.shards import SCHEMAS, Shard, read_shard
 from service.store import Store
 
@@ -36,9 +37,10 @@ class GraspFiles:
         """The grasp of the index with what stands in its shard.
 
         Raises:
-            NotFoundError: the file of the shard is gone.
+            NotFoundError: the shard holds no grasps.
+            DamagedShard: its file is gone, or not what its checksum says.
         """
-        file = self._read(shard.key)
+        file = self._read(shard.key, shard.sha256)
         row = grasp.row
         return GraspDetail(
             **grasp.model_dump(),
@@ -54,9 +56,10 @@ class GraspFiles:
             friction=_number(file.attributes.get("mu")),
         )
 
-    def _fetch(self, key: str) -> Shard:
+    def _fetch(self, key: str, sha256: str) -> Shard:
+        data = read_checked(self._store, key, sha256)
         try:
-            return read_shard(self._store.get(key), kind="base")
+            return read_shard(data, kind="base", name=key)
         except InputError as error:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 

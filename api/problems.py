@@ -18,6 +18,7 @@ from service.errors import (
     BusyError,
     ConflictError,
     DamagedError,
+    DamagedShard,
     GraspdError,
     HandError,
     IndexUnavailable,
@@ -45,8 +46,8 @@ ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
         InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
-        QueueUnavailable, StoreUnavailable, IndexUnavailable, RateError, BusyError, DamagedError, TaskError,
-        TaskCancelled, TaskRefused, GraspdError,
+        QueueUnavailable, StoreUnavailable, IndexUnavailable, RateError, BusyError, DamagedError, DamagedShard,
+        TaskError, TaskCancelled, TaskRefused, GraspdError,
     )
 }  # fmt: skip
 

@@ -15,6 +15,7 @@
     │   └── RateError             too many requests: exit 1, HTTP 429
     ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
     ├── DamagedError              a record in the store is not what its name says: exit 1, HTTP 500
+    │   └── DamagedShard          a shard's file is not what its checksum says, or is gone: exit 1, HTTP 500
     └── TaskError                 a task ended without a result: exit 1, HTTP 500
         ├── TaskCancelled
         └── TaskRefused           unknown schema or function: never retried
@@ -123,6 +124,12 @@ class DamagedError(GraspdError):
     """A record in the store is not what its name says; to try again does not help."""
 
     slug, title = "damaged", "A record in the store is damaged"
+
+
+class DamagedShard(DamagedError):
+    """A shard whose file is not what its checksum says, or is gone."""
+
+    slug, title = "damaged-shard", "A shard is damaged"
 
 
 class TaskError(GraspdError):

@@ -14,8 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from service import names
 from service.clock import timestamp
 from service.domain import Digest, JobRequest, Stage, TaskMessage
+from service.integrity import read_checked
 from service.records import put_record, read_record
-from service.shards import SCHEMAS, read_shard
+from service.shards import SCHEMAS, Shard, ShardKind, read_shard
 from service.store import Store
 from service.version import PACKAGE_VERSION, STAGE_REVISIONS
 
@@ -64,7 +65,7 @@ class ShardManifest(BaseModel):
     version: Literal[1] = 1
     shard_id: Digest
     stage: Stage
-    kind: str
+    kind: ShardKind
     key: str
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     size_bytes: int = Field(gt=0)
@@ -202,13 +203,24 @@ def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
     return read_record(ShardManifest, store, names.shard_manifest(stage, shard))
 
 
+def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
+    """A finished shard, checked against its manifest.
+
+    Raises:
+        NotFoundError: there is no such shard.
+        DamagedShard: its file is gone, or not what the manifest says.
+    """
+    manifest = load_manifest(store, stage, shard)
+    return read_shard(read_checked(store, manifest.key, manifest.sha256), kind=manifest.kind, name=manifest.key)
+
+
 def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
     return store.exists(names.shard_manifest(stage, shard))
 
 
 def _describing(manifest: ShardManifest, data: bytes) -> ShardManifest:
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
-    shard = read_shard(data, without=pictures)
+    shard = read_shard(data, without=pictures, name=manifest.key)
     update = {
         "sha256": hashlib.sha256(data).hexdigest(),
         "size_bytes": len(data),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,12 +16,17 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
+from service.errors import DamagedShard, InputError
+from service.integrity import check_file
 from service.version import PACKAGE_VERSION
 
 ShardKind = Literal["base", "scene", "views"]
 Arrays = Mapping[str, NDArray[np.generic]]
 Attribute = str | int | float | list[str]
+#: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.
+_DIGEST: Final = "sha256"
+#: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
+_UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True)
@@ -249,6 +256,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             dataset.attrs["units"] = column.units
             dataset.attrs["frame"] = column.frame
             dataset.attrs["description"] = column.description
+            dataset.attrs[_DIGEST] = _digest(data)
             if path.endswith("joint_positions") and "joint_names" in attributes:
                 dataset.attrs["joint_names"] = attributes["joint_names"]
     return buffer.getvalue()
@@ -285,27 +293,74 @@ class Shard:
         return self.arrays[path]
 
 
-def read_shard(source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = ()) -> Shard:
+def read_shard(
+    source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
+) -> Shard:
     """Read a shard whole, except the datasets named in `without`.
+
+    Args:
+        name: what errors call a shard that is given as bytes.
 
     Raises:
         InputError: not HDF5, not a graspd shard, or not of the wanted kind.
+        DamagedShard: it is not what its checksums say, or cannot be read to its end.
     """
-    name = "shard" if isinstance(source, bytes) else str(source)
+    name = name or ("shard" if isinstance(source, bytes) else str(source))
+    with open_shard(source, name=name) as file:
+        found = kind_of(file, name)
+        if kind is not None and found != kind:
+            raise InputError(f"{name} is a {found} shard; a {kind} shard is needed here")
+        arrays = {p: read_column(file, p, name) for p in SCHEMAS[found] if p in file and p not in without}
+        attributes = {k: _attribute(v) for k, v in file.attrs.items()}
+    return Shard(found, attributes, arrays)
+
+
+@contextmanager
+def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
+    """The HDF5 file of a shard, for reading what is needed of it; one in a folder is checked first: `check_file`.
+
+    Raises:
+        InputError: not HDF5.
+        DamagedShard: it is not what its checksum says, or cannot be read, here or in the body.
+    """
+    name = name or ("shard" if isinstance(source, bytes) else str(source))
+    if isinstance(source, Path) and source.is_file():
+        check_file(source)
     try:
         file = h5py.File(io.BytesIO(source) if isinstance(source, bytes) else source, "r")
     except OSError as error:
         raise InputError(f"{name} is not a readable HDF5 file: {error}") from None
     with file:
-        schema = str(file.attrs.get("schema", ""))
-        found = schema.removeprefix("graspd/").partition("@")[0]
-        if not schema.startswith("graspd/") or found not in SCHEMAS:
-            raise InputError(f"{name} is no graspd shard (attribute schema is {schema!r})")
-        if kind is not None and found != kind:
-            raise InputError(f"{name} is a {found} shard; a {kind} shard is needed here")
-        arrays = {p: np.asarray(file[p]) for p in SCHEMAS[found] if p in file and p not in without}
-        attributes = {k: _attribute(v) for k, v in file.attrs.items()}
-    return Shard(found, attributes, arrays)
+        try:
+            yield file
+        except _UNREADABLE as error:
+            raise DamagedShard(f"{name} is damaged and cannot be read: {_line(error)}") from error
+
+
+def kind_of(file: h5py.File, name: str) -> ShardKind:
+    """Kind of an open shard; InputError if it is none of graspd's."""
+    schema = str(file.attrs.get("schema", ""))
+    found = schema.removeprefix("graspd/").partition("@")[0]
+    if not schema.startswith("graspd/") or found not in SCHEMAS:
+        raise InputError(f"{name} is no graspd shard (attribute schema is {schema!r})")
+    return found
+
+
+def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
+    """A dataset whole; DamagedShard if its values are not those that were written."""
+    dataset = file[path]
+    data = np.asarray(dataset)
+    if (expected := dataset.attrs.get(_DIGEST)) is not None and _digest(data) != expected:
+        raise DamagedShard(f"{name} is damaged: the values of {path} are not those that were written")
+    return data
+
+
+def _digest(data: NDArray[Any]) -> str:
+    return hashlib.sha256(np.ascontiguousarray(data).data).hexdigest()
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def _attribute(value: object) -> Attribute:

@@ -44,6 +44,10 @@ class Entry:
     size: int
 
 
+#: Size, time of the last change and, where the store has one, tag of an object: it stays while the object does.
+Stamp = tuple[int, str, str]
+
+
 class Store:
     """Objects by key. Every method raises StoreUnavailable where the store does not answer."""
 
@@ -97,6 +101,12 @@ class Store:
         """Bytes of an object; NotFoundError if there is none."""
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
+
+    def stamp(self, key: str) -> Stamp:
+        """What tells whether an object was exchanged or written over; NotFoundError if there is none."""
+        with _mapped(key, self.url):
+            meta = obstore.head(self._backend, check_key(key))
+            return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
 
     def exists(self, key: str) -> bool:
         try:

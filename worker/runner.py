@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from service import logs, names, tracing
 from service.clock import timestamp
 from service.domain import IngestMessage, Origin, Stage, TaskMessage
-from service.errors import InputError, TaskCancelled, TaskRefused, UnavailableError
+from service.errors import DamagedError, InputError, TaskCancelled, TaskRefused, UnavailableError
 from service.manifests import publish_shard, shard_exists
 from service.queue.port import Event, EventKind, Message
 from service.records import AttemptRecord, put_record
@@ -113,8 +113,8 @@ class Runner:
 
     def _failed(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
         log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
-        # Bad input does not get better by trying again.
-        last = isinstance(error, InputError | TaskRefused) or message.attempt >= message.max_attempt
+        # Bad input and a damaged store do not get better by trying again.
+        last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
         attempt = AttemptRecord(
             task_id=message.task_id,
             job_id=message.job_id if isinstance(message, TaskMessage) else "",

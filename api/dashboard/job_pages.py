@@ -61,7 +61,8 @@ def picture(
     width: Annotated[int | None, Query(ge=16, le=4096)] = None,
 ) -> Response:
     """One rendered view as a PNG: colour, depth or segmentation, whole or no wider than `width` pixels."""
-    data = request.app.state.pictures.png(catalog.shard(shard_id).key, index, channel, width)
+    shard = catalog.shard(shard_id)
+    data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
 

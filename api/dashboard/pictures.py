@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import io
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Final, Literal
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from service.errors import NotFoundError
+from service.integrity import read_checked
+from service.shards import open_shard
 from service.store import Store
 
 Channel = Literal["rgb", "depth", "segmentation"]
@@ -35,15 +36,16 @@ class Pictures:
     """Decodes pictures of views shards; keeps the shards it read last."""
 
     def __init__(self, store: Store) -> None:
-        self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(store.get)
+        self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(partial(read_checked, store))
 
-    def png(self, key: str, index: int, channel: Channel = "rgb", width: int | None = None) -> bytes:
+    def png(self, key: str, sha256: str, index: int, channel: Channel = "rgb", width: int | None = None) -> bytes:
         """PNG of the picture at row `index` of a channel, no wider than `width` pixels.
 
         Raises:
             NotFoundError: the shard holds fewer pictures, or none of this channel.
+            DamagedShard: its file is gone, or not what its checksum says.
         """
-        with h5py.File(io.BytesIO(self._fetch(key)), "r") as file:
+        with open_shard(self._fetch(key, sha256), name=key) as file:
             path = f"image/{channel}"
             if path not in file:
                 raise NotFoundError("the shard holds no pictures; only a views shard does")

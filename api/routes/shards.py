@@ -61,8 +61,11 @@ def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
     ),
 )
 def get_file(shard_id: str, request: Request, catalog: CatalogOf) -> Response:
-    """The HDF5 file: from the store itself where it signs addresses, else through the API, by Range if asked."""
-    shard = catalog.shard(shard_id)
+    """The HDF5 file: from the store itself where it signs addresses, else through the API, by Range if asked.
+
+    One that is not what its checksum says is refused.
+    """
+    shard = catalog.checked_shard(shard_id)
     if (address := catalog.store.sign(shard.key)) is not None:
         return RedirectResponse(address, status_code=307)
     size = catalog.store.size(shard.key)

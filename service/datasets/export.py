@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from service.datasets.records import Snapshot, SnapshotShard
-from service.errors import InputError, StoreUnavailable
+from service.errors import InputError
+from service.integrity import check_digest
 
 #: Bytes of a shard, in chunks: from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]
@@ -26,7 +27,8 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
         number of files that had to be fetched.
 
     Raises:
-        StoreUnavailable: a file came with another checksum than the snapshot says, or could not be fetched.
+        DamagedShard: a file came with another checksum than the snapshot says.
+        StoreUnavailable: a file could not be fetched.
     """
     _make(folder)
     fetched = size = 0
@@ -76,10 +78,7 @@ def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
             for chunk in fetch(shard):
                 digest.update(chunk)
                 file.write(chunk)
-        if digest.hexdigest() != shard.sha256:
-            raise StoreUnavailable(
-                f"shard {shard.id} came with another checksum than its manifest says; export again, or check the store"
-            )
+        check_digest(f"shard {shard.id}", digest.hexdigest(), shard.sha256)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from service.errors import InputError
+from service.errors import DamagedShard, InputError, NotFoundError
+from service.integrity import check_content, check_digest, gone
 from service.store import Store
 
 DEFAULT_BYTES: Final = 20 << 30
@@ -30,17 +32,27 @@ class ShardCache:
         """A file of the store on this machine.
 
         Raises:
-            NotFoundError: the store has no such file.
-            InputError: its content is not what the checksum says.
+            DamagedShard: the store has no such file, or its content is not what the checksum says.
             StoreUnavailable: the store does not answer.
         """
         path = self.folder / f"{sha256}.h5"
-        if path.is_file():
-            os.utime(path)  # used now: others go first
+        if self._is_intact(path, sha256):
             return path
         self._download(store, key, sha256, path)
         self._make_room(keep=path)
         return path
+
+    @staticmethod
+    def _is_intact(path: Path, sha256: str) -> bool:
+        """Whether a file was fetched before and is still what it was; one that is not is fetched again."""
+        try:
+            check_content(path, sha256)
+            facts = path.stat()
+            # Used now: others go first. The time of change stays, which says that it was checked.
+            os.utime(path, ns=(time.time_ns(), facts.st_mtime_ns))
+        except (FileNotFoundError, DamagedShard):
+            return False
+        return True
 
     def _download(self, store: Store, key: str, sha256: str, path: Path) -> None:
         handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
@@ -50,11 +62,10 @@ class ShardCache:
                 for chunk in store.stream(key):
                     digest.update(chunk)
                     file.write(chunk)
-            if digest.hexdigest() != sha256:
-                raise InputError(
-                    f"{store.url}/{key} has SHA-256 {digest.hexdigest()[:12]}..., expected {sha256[:12]}..."
-                )
+            check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
             partial.replace(path)
+        except NotFoundError:
+            raise gone(f"{store.url}/{key}") from None
         finally:
             partial.unlink(missing_ok=True)
 
@@ -73,7 +84,7 @@ class ShardCache:
                 facts = path.stat()
             except FileNotFoundError:
                 continue
-            yield facts.st_mtime, facts.st_size, path
+            yield max(facts.st_atime, facts.st_mtime), facts.st_size, path
 
 
 def default_folder() -> Path:

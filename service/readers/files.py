@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-import h5py
-
 from service import names
 from service.datasets.records import newest_snapshot
 from service.errors import InputError, NotFoundError
+from service.integrity import check_file
 from service.manifests import load_manifest, shard_exists
 from service.planning import plan
 from service.readers.cache import DEFAULT_BYTES, ShardCache, default_folder
 from service.records import JobRecord, read_record
-from service.shards import SCHEMAS
+from service.shards import ShardKind, kind_of, open_shard
 from service.store import Store, open_store
 
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
@@ -27,8 +26,7 @@ class ShardFile:
     """A shard: on this machine under `path`, or in a store under `key`."""
 
     id: str
-    kind: str
-    """base, scene or views."""
+    kind: ShardKind
     hand: str
     object: str
     batch: int
@@ -76,8 +74,14 @@ class Shards:
         return Shards(tuple(kept), self.store, self.cache)
 
     def path(self, file: ShardFile) -> Path:
-        """The file on this machine, fetched where it is not there yet; see `ShardCache.fetch` for errors."""
+        """The file on this machine, fetched where it is not there yet, and checked.
+
+        Raises:
+            DamagedShard: it is not what its checksum says.
+            and what `ShardCache.fetch` raises.
+        """
         if file.path is not None:
+            check_file(file.path)
             return file.path
         assert self.store is not None and self.cache is not None, "a shard without a path comes from a store"
         return self.cache.fetch(self.store, file.key, file.sha256)
@@ -105,6 +109,7 @@ def open_shards(
     Raises:
         NotFoundError: no such file, job, dataset or snapshot.
         InputError: neither job nor dataset is named for a store, or a file is no shard.
+        DamagedShard: a file of a folder is not what its checksum says.
         StoreUnavailable: the store does not answer.
     """
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
@@ -127,15 +132,8 @@ def _paths(entry: Path) -> list[Path]:
 
 
 def _local(path: Path) -> ShardFile:
-    try:
-        with h5py.File(path, "r") as file:
-            said = dict(file.attrs)
-    except OSError as error:
-        raise InputError(f"{path} is not a readable HDF5 file: {error}") from None
-    schema = str(said.get("schema", ""))
-    kind = schema.removeprefix("graspd/").partition("@")[0]
-    if not schema.startswith("graspd/") or kind not in SCHEMAS:
-        raise InputError(f"{path} is no graspd shard (attribute schema is {schema!r})")
+    with open_shard(path) as file:
+        kind, said = kind_of(file, str(path)), dict(file.attrs)
     name = str(said.get("shard_id", path.resolve()))
     return ShardFile(
         name, kind, str(said.get("hand", "")), str(said.get("object", "")), int(said.get("batch", 0)), path=path

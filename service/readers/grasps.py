@@ -6,13 +6,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import InputError
 from service.readers.files import ShardFile, Shards
-from service.shards import SCHEMAS
+from service.shards import SCHEMAS, open_shard, read_column
 
 Array = NDArray[Any]
 #: From the columns of one base shard to a mask (N,) of the grasps to keep.
@@ -93,7 +92,7 @@ class Grasps(Sequence[dict[str, Any]]):
         """Joints of a hand in the order of `joint_positions`; InputError if no shard is of this hand."""
         for file in self._files:
             if file.hand == hand:
-                with h5py.File(self.shards.path(file), "r") as opened:
+                with open_shard(self.shards.path(file)) as opened:
                     return [str(name) for name in opened.attrs["joint_names"]]
         raise InputError(f"none of the shards is of the hand {hand!r}")
 
@@ -137,8 +136,8 @@ class Grasps(Sequence[dict[str, Any]]):
         held = self._memory.get(file.id, {})
         missing = [name for name in columns if name not in held]
         if missing:
-            with h5py.File(self.shards.path(file), "r") as opened:
-                held = held | {name: opened[name][()] for name in missing if name in opened}
+            with open_shard(self.shards.path(file)) as opened:
+                held = held | {name: read_column(opened, name, file.id) for name in missing if name in opened}
             self._check(file, columns, held, optional=not keep)
             if keep:
                 self._memory[file.id] = held

@@ -6,14 +6,13 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any, Final
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from service import transforms
 from service.errors import InputError
 from service.readers.files import ShardFile, Shards
-from service.shards import SCHEMAS, read_shard
+from service.shards import SCHEMAS, open_shard, read_shard
 
 Array = NDArray[Any]
 
@@ -82,14 +81,14 @@ class Pictures(Sequence[dict[str, Any]]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         file, scene_shard, scene, row = self._places[index]
-        with h5py.File(self.shards.path(file), "r") as opened:
+        with open_shard(self.shards.path(file)) as opened:
             sample: dict[str, Any] = {name: opened[name][row] for name in self.columns}
             extrinsics = np.asarray(opened["camera/extrinsics"][row], float)
         names = {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row, "scene": scene}
         return sample | self._scenes_of(scene_shard).grasps(scene, extrinsics) | names
 
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
-        with h5py.File(self.shards.path(file), "r") as opened:
+        with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
             scene_shard = str(opened.attrs["scene_shard"])
             if absent := [name for name in self.columns if name not in opened]:

@@ -39,7 +39,7 @@ def test_a_grasp_whose_file_is_gone_is_a_clear_error(http: TestClient, parts: Pa
     manifest = finish_all(parts, add_job(parts))[0]
     (parts.settings.data_dir / "store" / manifest.key).unlink()
     answer = http.get(f"/grasps/{manifest.shard_id}/0", headers={"Accept": "text/html"})
-    assert answer.status_code == 404
+    assert answer.status_code == 500
     assert manifest.key in answer.text
 
 

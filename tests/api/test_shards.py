@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 
 import h5py
 import pytest
 from starlette.testclient import TestClient
 
+from api.dashboard.pictures import Pictures
 from api.routes.shards import parse_range
 from service.parts import Parts
+from service.store import Store
 from tests.api.factories import add_job, finish_all
+from tests.damage import cut, flip, remove
 
 
 @pytest.fixture
@@ -86,3 +90,26 @@ def test_pages_of_grasps_meet_without_gap_or_overlap(http: TestClient, shard: st
         seen += [(grasp["shard_id"], grasp["row"]) for grasp in answer.json()["items"]]
         path = answer.links["next"]["url"] if "next" in answer.links else ""
     assert len(seen) == len(set(seen)) == 32
+
+
+@pytest.mark.parametrize("harm", [flip, cut, remove])
+@pytest.mark.parametrize("path", ["/v1/shards/{}/file", "/v1/grasps/{}/0"])
+def test_a_damaged_shard_is_refused_with_its_name(
+    http: TestClient, parts: Parts, shard: str, harm: Callable[[Store, str], None], path: str
+) -> None:
+    harm(parts.store, f"shards/base/{shard}.h5")
+    answer = http.get(path.format(shard), headers={"Range": "bytes=0-9"})
+    assert (answer.status_code, answer.json()["type"]) == (500, "/problems/damaged-shard")
+    assert shard in answer.json()["detail"]
+    assert "etag" not in answer.headers
+    assert "immutable" not in answer.headers.get("cache-control", "")
+
+
+def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, parts: Parts) -> None:
+    views = finish_all(parts, add_job(parts, scenes=1, views=2, width=24, height=16))[-1]
+    assert http.get(f"/shards/{views.shard_id}/pictures/0.png").status_code == 200
+    flip(parts.store, views.key)
+    http.app.state.pictures = Pictures(parts.store)  # type: ignore[attr-defined]
+    answer = http.get(f"/shards/{views.shard_id}/pictures/0.png")
+    assert answer.status_code == 500
+    assert views.key in answer.text

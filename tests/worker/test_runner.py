@@ -14,9 +14,11 @@ from service.queue.port import Event, EventKind
 from service.records import task_attempts
 from service.shards import read_shard
 from service.store import Store, open_store
+from tests.damage import flip
 from tests.fakes import fake_synthesize, make_shard, message_for
 from worker.context import StopReason, TaskContext
 from worker.runner import Runner
+from worker.stages import scene
 
 
 class Bench:
@@ -215,3 +217,17 @@ def test_a_part_of_a_task_moves_its_share_of_the_bar() -> None:
     context = TaskContext(open_store("memory://"), tell=lambda *args: told.append(args))
     context.part(0.8, 1.0)(1, 2, "quality")
     assert told == [(pytest.approx(0.9), 1.0, "quality")]
+
+
+def test_a_stage_refuses_a_damaged_shard_and_is_not_tried_again(bench: Bench) -> None:
+    base = make_shard(bench.store, message_for(scenes=1))
+    message = message_for(Stage.SCENE, scenes=1)
+    assert message.inputs == (base.shard_id,)
+    flip(bench.store, base.key)
+    runner = Runner({Stage.SCENE: scene.run}, worker="w", publish=bench.told.append)
+    outcome = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(bench.store))
+    assert outcome is not None
+    assert outcome.kind is EventKind.FAILED
+    attempt = task_attempts(bench.store, message.task_id)[0]
+    assert (attempt.kind, attempt.last) == ("DamagedShard", True)
+    assert base.shard_id in attempt.reason

@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-import h5py
 import numpy as np
 
 from service.assets import builtin_asset, builtin_files, builtin_names
@@ -20,6 +19,7 @@ from service.library import load_asset, load_asset_files, load_check
 from service.planning import plan
 from service.readers import Shards, open_shards
 from service.records import parse_record, task_attempts
+from service.shards import open_shard
 from service.store import Store
 from service.version import PACKAGE_VERSION
 
@@ -188,7 +188,7 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
     for file in shards:
         name = file.hand if kind is AssetKind.HAND else file.object
         if name not in found:
-            with h5py.File(shards.path(file), "r") as opened:
+            with open_shard(shards.path(file)) as opened:
                 found[name] = str(opened.attrs.get(f"{kind.value}_digest", ""))
     return found
 

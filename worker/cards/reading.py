@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from service import names
 from service.errors import NotFoundError
 from service.manifests import ShardManifest, load_manifest
 from service.readers import ShardFile
-from service.shards import json_attribute
+from service.shards import json_attribute, open_shard, read_column
 from worker.cards.contents import Contents
 
 #: Columns of which a card is made; those that a shard lacks are left out.
@@ -65,9 +64,9 @@ def _piece(contents: Contents, file: ShardFile, size: int | None) -> Piece:
     if manifest is not None and file.kind == "views":
         return _unopened(file, manifest)
     path = contents.shards.path(file)
-    with h5py.File(path, "r") as opened:
+    with open_shard(path) as opened:
         said = {key: _plain(value) for key, value in opened.attrs.items()}
-        columns = {name: opened[name][()] for name in COLUMNS[file.kind] if name in opened}
+        columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
         rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
     if manifest is not None:
         said = {**_unopened(file, manifest).said, **said}

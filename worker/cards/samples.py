@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from service.readers import ShardFile, Shards
+from service.shards import open_shard
 from worker.rendering import typography
 
 MOST: Final = 12
@@ -57,7 +57,7 @@ def choose(files: tuple[ShardFile, ...], most: int = MOST) -> list[ShardFile]:
 
 def _picture(path: Path) -> NDArray[np.uint8]:
     """(H, W, 3) the picture of a shard in which the object's box is largest."""
-    with h5py.File(path, "r") as opened:
+    with open_shard(path) as opened:
         box = np.asarray(opened["box/bounding_box_2d_tight"], float)
         area = np.nan_to_num((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]), nan=-1.0)
         return np.asarray(opened["image/rgb"][int(np.argmax(area))], np.uint8)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.domain import Stage, TaskMessage
-from service.names import shard_file
-from service.shards import read_shard
+from service.manifests import load_shard
 from worker.context import TaskContext
 from worker.rendering import Extras, render
 from worker.stages.assets import object_of
@@ -15,7 +14,7 @@ from worker.stages.output import Output, batch_seed
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
     """Render `request.views` camera placements of each scene."""
-    scene = read_shard(context.store.get(shard_file(Stage.SCENE, message.inputs[0])), kind="scene")
+    scene = load_shard(context.store, Stage.SCENE, message.inputs[0])
     obj = object_of(context.store, message)
     context.check()
     request = message.request

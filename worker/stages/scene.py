@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from service.domain import Stage, TaskMessage
-from service.names import shard_file
-from service.shards import Attribute, read_shard
+from service.manifests import load_shard
+from service.shards import Attribute
 from worker.context import TaskContext
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
@@ -17,7 +17,7 @@ from worker.stages.output import Output, batch_seed
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
     """Drop the object `request.scenes` times and carry the grasps of the base shard over."""
-    base = read_shard(context.store.get(shard_file(Stage.SYNTHESIZE, message.inputs[0])), kind="base")
+    base = load_shard(context.store, Stage.SYNTHESIZE, message.inputs[0])
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
     context.progress(0.0, 1.0, "drops")

@@ -13,7 +13,7 @@ import pytest
 from service.datasets import actions
 from service.datasets.export import export_shards, path_of
 from service.datasets.records import Snapshot, SnapshotShard
-from service.errors import InputError, StoreUnavailable
+from service.errors import DamagedShard, InputError, StoreUnavailable
 from service.parts import Parts
 from tests.service.datasets.makers import finish, jobs_of, plan_all, wanted
 
@@ -67,7 +67,7 @@ def test_a_file_that_was_changed_is_fetched_again(parts: Parts, snapshot: Snapsh
 
 
 def test_a_wrong_checksum_leaves_no_file(parts: Parts, snapshot: Snapshot, tmp_path: Path) -> None:
-    with pytest.raises(StoreUnavailable, match="another checksum"):
+    with pytest.raises(DamagedShard, match=snapshot.shards[0].id):
         export_shards(snapshot, tmp_path / "out", lambda shard: [b"something else"])
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.datasets.records import Snapshot, SnapshotShard
-from service.errors import InputError, NotFoundError
+from service.errors import DamagedShard, InputError, NotFoundError
 from service.names import dataset_snapshot, shard_file
 from service.parts import Parts
 from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
@@ -17,6 +17,7 @@ from service.records import JobRecord, put_record
 from service.shards import Shard, read_shard
 from service.transforms import compose, pose_from_matrix
 from tests.api import factories
+from tests.damage import flipped, flipped_values
 
 GRASPS = 40
 
@@ -129,9 +130,26 @@ def test_a_dataset_without_a_snapshot_says_how_to_take_one(parts: Parts, tmp_pat
 def test_a_file_that_changed_in_the_store_is_refused(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
     shard = open_shards(parts.store, job=job.id, cache=tmp_path / "cache").files[0]
     cache = ShardCache(tmp_path / "other")
-    with pytest.raises(InputError, match="SHA-256"):
+    with pytest.raises(DamagedShard, match=shard.id):
         cache.fetch(parts.store, shard.key, "0" * 64)
     assert not list((tmp_path / "other").iterdir())
+
+
+def test_a_cached_file_that_changed_is_fetched_again(parts: Parts, job: JobRecord, tmp_path: Path) -> None:
+    shards = open_shards(parts.store, job=job.id, cache=tmp_path / "cache")
+    path = shards.path(shards.files[0])
+    data = path.read_bytes()
+    path.write_bytes(flipped(data))
+    assert shards.path(shards.files[0]).read_bytes() == data
+
+
+def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> None:
+    file = open_shards(folder).of("base")[0]
+    assert file.path is not None
+    data = file.path.read_bytes()
+    file.path.write_bytes(flipped_values(data, read_shard(data)["grasp/hand_pose"]))
+    with pytest.raises(DamagedShard, match=r"grasp/hand_pose"):
+        Grasps(open_shards(folder))[0]
 
 
 def test_a_full_cache_drops_what_was_unused_longest(parts: Parts, tmp_path: Path) -> None:
