@@ -25,6 +25,10 @@ _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via",
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
 
 
+class NotYours(ApiError):
+    """A thing that another key submitted."""
+
+
 def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     """The key of a request; None while the service is open.
 
@@ -45,6 +49,37 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     if not key.scope.includes(scope):
         raise ApiError(403, f"the key {key.name!r} has scope {key.scope}; this needs {scope}")
     return key
+
+
+def may_change(owner: str) -> bool:
+    """Whether the key of the present request may cancel, retry or delete a thing: its own, or with `admin` any.
+
+    Args:
+        owner: id of the key that the thing was submitted with; empty where it was submitted without one, or before
+            ids were recorded: then it takes `admin`.
+    """
+    key = caller.get()
+    return key is None or key.scope.includes(Scope.ADMIN) or (key.scope.includes(Scope.SUBMIT) and key.id == owner)
+
+
+def must_own(owner: str, what: str) -> None:
+    """Refuse to change somebody else's thing. The route has asked for `submit` before.
+
+    Args:
+        owner: as in `may_change`.
+        what: names the thing in the refusal, such as "job 1a2b".
+
+    Raises:
+        NotYours: it is not the caller's, and the key is no `admin` key.
+    """
+    if not may_change(owner):
+        key = caller.get()
+        assert key is not None
+        raise NotYours(
+            403,
+            f"{what} was not submitted with the key {key.name!r}; the key that submitted it can do this, or one with "
+            "scope admin",
+        )
 
 
 def is_allowed(request: HTTPConnection, scope: Scope) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
-from api.auth import caller
+from api.auth import caller, must_own
 from api.dataset_quota import unfinished
 from api.grasp_files import GraspFiles
 from api.health import Probes
@@ -104,7 +104,7 @@ class Catalog:
         key = caller.get()
         if idempotency_key is not None:
             self._idempotency.claim(key.name if key else "", idempotency_key, request)
-        record = pipeline.prepare(self._parts, request)
+        record = pipeline.prepare(self._parts, request, owner=key.id if key else "")
         with bind(job=record.id), self.quotas.claim(key, record.id, record.request.grasps) as claim:
             job, is_new = pipeline.enter(self._parts, record)
             claim.counts = is_new
@@ -112,7 +112,12 @@ class Catalog:
         return self._detail(job)
 
     def cancel(self, job_id: str) -> JobDetail:
-        """Stop a job."""
+        """Stop a job.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        must_own(self._parts.index.job(job_id).owner, f"job {job_id}")
         with bind(job=job_id):
             job = pipeline.cancel(self._parts, job_id)
             log.info("job cancelled")
@@ -122,10 +127,12 @@ class Catalog:
         """Run again what failed or was cancelled.
 
         Raises:
+            NotYours: another key submitted it.
             QuotaError: the caller's key has all it may have.
         """
-        grasps = self._parts.index.job(job_id).request.grasps
-        with bind(job=job_id), self.quotas.claim(caller.get(), job_id, grasps, is_new=False):
+        known = self._parts.index.job(job_id)
+        must_own(known.owner, f"job {job_id}")
+        with bind(job=job_id), self.quotas.claim(caller.get(), job_id, known.request.grasps, is_new=False):
             job = pipeline.retry(self._parts, job_id)
             log.info("job retried")
         return self._detail(job)
@@ -203,7 +210,8 @@ class Catalog:
             # A refused upload holds no name: the same file with the mend must get in.
             if known.digest != digest and known.verdict != "refuse":
                 raise ConflictError(f"there is another {kind.value} named {name!r}; choose a name of its own")
-        asset = library.publish_asset(self._parts.store, kind, name, files)
+        key = caller.get()
+        asset = library.publish_asset(self._parts.store, kind, name, files, owner=key.id if key else "")
         self._parts.index.add_asset(asset, library.load_check(self._parts.store, kind, asset.digest))
         return self._parts.index.asset(kind, asset.digest)
 
@@ -341,6 +349,7 @@ class Catalog:
             progress=progress_of_job(job),
             eta_s=eta_of_job(job, stages),
             created=job.created,
+            owner=job.owner,
             finished=job.finished,
             reason=job.reason,
             stages=stages,

@@ -19,9 +19,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from service.errors import ConflictError, InputError, NotFoundError, UnavailableError
 
@@ -30,7 +30,10 @@ SESSION_S: Final = 12 * 3600
 
 
 class Scope(StrEnum):
-    """What a key may do; each includes the one before it."""
+    """What a key may do; each includes the one before it.
+
+    `submit` acts on what was submitted with the same key, `admin` on everybody's.
+    """
 
     READ = "read"
     SUBMIT = "submit"
@@ -51,8 +54,9 @@ class KeyLimits(BaseModel):
 
 
 class Key(BaseModel):
-    """A key as it is kept."""
+    """A key as it is kept. Its id lasts through rotation, and no later key of the same name has it."""
 
+    id: str = ""
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
     scope: Scope
     sha256: str
@@ -60,6 +64,12 @@ class Key(BaseModel):
     revoked: str | None = None
     expires: str | None = None
     limits: KeyLimits = KeyLimits()
+
+    @model_validator(mode="after")
+    def _has_an_id(self) -> Self:
+        # Keys made before there were ids: the old and the new secret of one that is being rotated share its name.
+        self.id = self.id or _sha256(f"name {self.name}")[:16]
+        return self
 
     @property
     def is_live(self) -> bool:
@@ -108,6 +118,7 @@ class KeyFile:
             token = PREFIX + secrets.token_urlsafe(32)
             try:
                 key = Key(
+                    id=secrets.token_hex(8),
                     name=name,
                     scope=scope,
                     sha256=_sha256(token),

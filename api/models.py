@@ -36,6 +36,7 @@ class Job(BaseModel):
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
     created: str
+    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
     finished: str | None = None
     reason: str | None = Field(None, description="why it failed")
     stages: list[StageStatus]

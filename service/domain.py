@@ -223,7 +223,11 @@ class Asset(Model):
     size_bytes: int
     created: str = Field(description="RFC 3339, UTC")
     builtin: bool = False
+    owner: str = Field("", max_length=64, description="id of the API key that uploaded it; empty: none, or not known")
     facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
+
+    # A newer graspd may have written more.
+    model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class Origin(Model):

@@ -20,18 +20,27 @@ UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
 def publish_asset(
-    store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], *, builtin: bool = False, created: str = ""
+    store: Store,
+    kind: AssetKind,
+    name: str,
+    files: Mapping[str, bytes],
+    *,
+    builtin: bool = False,
+    created: str = "",
+    owner: str = "",
 ) -> Asset:
     """Put a hand or object into the store: the archive first, its record last. Doing it twice changes nothing.
 
     Args:
         files: `asset.json` (names the main file) and all files it needs.
+        owner: id of the API key that uploads it.
 
     Raises:
         InputError: `asset.json` is missing or wrong.
         ConflictError: the same content is known under another name.
     """
     asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
+    asset = asset.model_copy(update={"owner": owner})
     record = names.asset_record(kind, asset.digest)
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)

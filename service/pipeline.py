@@ -36,8 +36,11 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
     return enter(parts, prepare(parts, request, lane=lane))
 
 
-def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> JobRecord:
+def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owner: str = "") -> JobRecord:
     """The job that a request stands for, of a hand and an object that may be used.
+
+    Args:
+        owner: id of the API key that submits it.
 
     Raises:
         NotFoundError: unknown hand or object.
@@ -57,6 +60,7 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> J
         lane=lane or lane_of(request),
         created=timestamp(),
         origin=_present_origin(),
+        owner=owner,
     )
 
 

@@ -35,6 +35,7 @@ class JobRecord(Record):
     lane: Lane
     created: str
     origin: Origin | None = None
+    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
 
     @model_validator(mode="before")
     @classmethod

@@ -13,6 +13,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from api import dataset_quota
+from api.auth import NotYours
 from api.catalog import Catalog
 from api.dashboard import matrix
 from api.dashboard.forms import asset_choices, first_message
@@ -99,14 +100,14 @@ async def act_on_cells(request: Request, name: str, catalog: CatalogOf) -> Redir
 @router.post("/{name}/{action}", dependencies=[Depends(may_submit)], response_model=None)
 def act(request: Request, name: str, action: str, catalog: CatalogOf) -> RedirectResponse | HTMLResponse:
     """Cancel or retry a whole dataset, or take a snapshot of it."""
-    do: dict[str, Callable[..., Any]] = {
-        "cancel": actions.cancel,
-        "retry": lambda _, name: dataset_quota.retry(catalog, name),
-        "snapshot": actions.snapshot,
+    do: dict[str, Callable[[], Any]] = {
+        "cancel": lambda: dataset_quota.cancel(catalog, name),
+        "retry": lambda: dataset_quota.retry(catalog, name),
+        "snapshot": lambda: actions.snapshot(catalog.parts, name),
     }
     if action not in do:
         raise InputError(f"a dataset has no action {action!r}; it can be cancelled, retried or taken as a snapshot")
-    do[action](catalog.parts, name)
+    do[action]()
     return _redirect(f"/datasets/{name}", action, done=1)
 
 
@@ -162,13 +163,13 @@ def _jobs_of(catalog: Catalog, pairs: Iterable[tuple[str, str]], action: str) ->
 
 
 def _each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
-    """How many took the action, and how many were in a state that has no use for it."""
+    """How many took the action, and how many were another key's, or in a state that has no use for it."""
     done = left = 0
     for one in wanted:
         try:
             do(one)
             done += 1
-        except ConflictError:
+        except (ConflictError, NotYours):
             left += 1
     return done, left
 
@@ -187,7 +188,11 @@ def _did(request: Request) -> str:
         return "The snapshot is taken; it lists every shard of now."
     what = "job" if done == "1" else "jobs"
     words = f"{done} {what} {_DONE[given['did']]}"
-    return words + (f"; {left} left as they are, in a state that has no use for it" if left != "0" else "") + "."
+    return (
+        words
+        + (f"; {left} left as they are: of another key, or in a state that has no use for it" if left != "0" else "")
+        + "."
+    )
 
 
 def _all_cells(catalog: Catalog, name: str) -> list[CellView]:

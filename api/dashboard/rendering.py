@@ -9,7 +9,9 @@ from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
+from api.auth import is_allowed, may_change
 from api.dashboard import filters
+from api.keys import Scope
 from service.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
@@ -47,7 +49,14 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "poll_s": 0,
         "health": request.app.state.catalog.health(),
     } | context
-    context |= {"navigation": NAVIGATION, "version": PACKAGE_VERSION, "signed_in": not request.app.state.keys.is_open}
+    context |= {
+        "navigation": NAVIGATION,
+        "version": PACKAGE_VERSION,
+        "signed_in": not request.app.state.keys.is_open,
+        # What the key may not do has no button; the routes refuse it all the same.
+        "may_submit": is_allowed(request, Scope.SUBMIT),
+        "may_change": may_change,
+    }
     text = request.app.state.templates.get_template(template).render(context)
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
 

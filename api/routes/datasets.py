@@ -98,7 +98,7 @@ def list_cells(
 )
 def cancel_dataset(name: DatasetName, response: Response, catalog: CatalogOf) -> DatasetView:
     """Stop a dataset and its unfinished jobs; what is written stays, and jobs that another dataset wants go on."""
-    return _placed(actions.cancel(catalog.parts, name), response)
+    return _placed(dataset_quota.cancel(catalog, name), response)
 
 
 @router.post(

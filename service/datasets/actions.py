@@ -29,8 +29,11 @@ from service.pipeline import usable
 from service.records import put_record
 
 
-def create(parts: Parts, request: DatasetRequest) -> tuple[DatasetView, bool]:
+def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[DatasetView, bool]:
     """Record a dataset; the keeper plans its jobs. The same hands, objects and options again are the same dataset.
+
+    Args:
+        owner: id of the API key that submits it; its jobs get the same.
 
     Returns:
         the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
@@ -48,7 +51,7 @@ def create(parts: Parts, request: DatasetRequest) -> tuple[DatasetView, bool]:
     new = False
     # One that is there stays what it is: a later chart changes none of its fidelities.
     if not parts.store.exists(key):
-        found = describe(request.name, hands, objects, request.shared, Resolver(parts.store))
+        found = describe(request.name, hands, objects, request.shared, Resolver(parts.store), owner)
         new = put_record(parts.store, key, found)
     record = load_dataset(parts.store, request.name)
     if not new:
@@ -63,7 +66,7 @@ def create(parts: Parts, request: DatasetRequest) -> tuple[DatasetView, bool]:
 def cancel(parts: Parts, name: str) -> DatasetView:
     """Stop a dataset: what is not planned never is, and its unfinished jobs are cancelled. Finished shards stay.
 
-    A job that another dataset waits for as well goes on.
+    A job that another dataset waits for as well goes on, and so does one that another key submitted.
 
     Raises:
         NotFoundError: unknown dataset.

@@ -54,6 +54,7 @@ class DatasetRecord(Record):
     jobs: tuple[Digest, ...]
     fidelities: tuple[str, ...] = ()
     created: str
+    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
 
     @model_validator(mode="after")
     def _a_job_a_cell(self) -> DatasetRecord:
@@ -124,8 +125,12 @@ def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> 
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
-def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int]) -> JobRecord:
-    """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk."""
+def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "") -> JobRecord:
+    """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk.
+
+    Args:
+        owner: whose dataset it is.
+    """
     return JobRecord(
         id=cell.job_id,
         request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
@@ -134,6 +139,7 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int]) -> JobRec
         object_digest=cell.object.digest,
         lane=Lane.BULK,
         created=timestamp(),
+        owner=owner,
     )
 
 

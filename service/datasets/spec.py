@@ -52,13 +52,14 @@ class DatasetRequest(Matrix):
 
 def describe(
     name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions,
-    resolve: Callable[[JobRequest], JobRequest],
+    resolve: Callable[[JobRequest], JobRequest], owner: str = "",
 ) -> DatasetRecord:  # fmt: skip
     """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
     name.
 
     Args:
         resolve: puts a fidelity in the place of `auto`.
+        owner: id of the API key that submits it; no part of the digest.
 
     Raises:
         InputError: no fidelity meets the target on one of the cells.
@@ -82,6 +83,7 @@ def describe(
         jobs=tuple(job_id(request, hand.digest, obj.digest) for hand, obj, request in cells),
         fidelities=fidelities,
         created=timestamp(),
+        owner=owner,
     )
 
 

@@ -24,6 +24,7 @@ class DatasetWork:
     cancelled: bool
     events: int
     applied: int
+    owner: str
 
 
 class DatasetChanges(Database):
@@ -40,6 +41,7 @@ class DatasetChanges(Database):
             "revisions": record.revisions,
             "cells": len(record.jobs),
             "created": record.created,
+            "owner": record.owner,
             "cancelled": False,
             "events": 0,
             "applied": 0,
@@ -109,6 +111,7 @@ class DatasetChanges(Database):
                     row["cancelled"],
                     row["events"],
                     row["applied"],
+                    row["owner"],
                 )
                 for row in connection.execute(query).mappings()
             ]
@@ -140,7 +143,8 @@ class DatasetChanges(Database):
         """Positions and jobs of the next cells in some states, behind a position.
 
         Args:
-            unshared: leave out jobs that another dataset, which is not cancelled, waits for as well.
+            unshared: leave out jobs that another dataset, which is not cancelled, waits for as well, and those that
+                another key submitted.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)
@@ -152,9 +156,12 @@ class DatasetChanges(Database):
         )
         if unshared:
             other = dataset_cells.alias()
+            query = query.join(datasets, datasets.c.name == dataset_cells.c.dataset)
+            query = query.where(jobs.c.owner == datasets.c.owner)
+            others = datasets.alias()
             waits = (other.c.job_id == dataset_cells.c.job_id, other.c.dataset != name)
             query = query.where(
-                ~exists().where(*waits, datasets.c.name == other.c.dataset, datasets.c.cancelled.is_(False))
+                ~exists().where(*waits, others.c.name == other.c.dataset, others.c.cancelled.is_(False))
             )
         with self.reading() as connection:
             return [(position, job) for position, job in connection.execute(query)]

@@ -147,7 +147,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     left = tasks_asked - work["share"]
     pace = made["seconds"] / work["done"] if work["done"] else None
     return DatasetView(
-        **{name: row[name] for name in ("name", "digest", "cells", "created", "cancelled")},
+        **{name: row[name] for name in ("name", "digest", "cells", "created", "owner", "cancelled")},
         hands=[member["name"] for member in row["hands"]],
         objects=[member["name"] for member in row["objects"]],
         options=options,

@@ -19,6 +19,7 @@ datasets: Final = Table(
     Column("revisions", JSON, nullable=False),
     Column("cells", Integer, nullable=False),
     Column("created", String(32), nullable=False),
+    Column("owner", String(64), nullable=False, server_default=""),
     Column("cancelled", Boolean, nullable=False),
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),

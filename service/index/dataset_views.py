@@ -32,6 +32,7 @@ class DatasetView(View):
     shards: int
     size_bytes: int
     created: str
+    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
     finished: str | None
     cancelled: bool = Field(description="cancelled by its user; `retry` lifts it")
 

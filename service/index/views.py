@@ -46,6 +46,7 @@ class JobView(View):
     hand_digest: str
     object_digest: str
     created: str
+    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
     finished: str | None
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
@@ -156,6 +157,7 @@ class AssetView(View):
     size_bytes: int
     created: str
     builtin: bool
+    owner: str = Field("", description="id of the key that uploaded it; empty: none, or not known")
     verdict: str | None = Field(description="accept, repair or refuse; None: the check is still to come")
     message: str | None
     repairs: list[str]
