@@ -26,6 +26,7 @@ import typer
 from api.client import Client
 from api.dashboard.filters import duration, size
 from api.dataset_client import DatasetClient
+from service.cores import available_cores
 from service.index.dataset_views import CellView, DatasetView
 from service.version import PACKAGE_VERSION
 
@@ -198,9 +199,9 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
         "",
         f"`python -m benchmarks.matrix DATA --data-dir DIR --out docs/results/matrix.md`, {options}",
         "",
-        f"graspd {PACKAGE_VERSION}, {platform.machine()}, {os.cpu_count()} CPU cores, {found.created[:10]}. URDFs and",
-        "meshes went in as they are, without an option. Every process was killed with -9 in the middle; then the same",
-        "commands went on.",
+        f"graspd {PACKAGE_VERSION}, {platform.machine()}, {available_cores()} CPU cores, {found.created[:10]}. URDFs",
+        "and meshes went in as they are, without an option. Every process was killed with -9 in the middle; then the",
+        "same commands went on.",
         "",
         "| what | |",
         "| --- | --- |",

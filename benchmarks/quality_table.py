@@ -7,12 +7,12 @@ The grasps are made first and do not count. Prints wall and CPU seconds of the t
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 
 import numpy as np
 
+from service.cores import available_cores
 from service.domain import FIDELITIES
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
@@ -54,9 +54,9 @@ def main() -> None:
     n, count = len(sample), len(grasps)
     sys.stdout.write(
         f"{count} grasps of {hand.name} on {obj.name}, {len(obj.faces)} faces, {len(DEFAULT_THRESHOLDS_M)} thresholds: "
-        f"{wall:.1f} s wall on {os.cpu_count()} cores, {cpu:.1f} s CPU; a grasp takes {1e3 * cpu / count:.1f} ms CPU, "
-        f"of which distances {1e3 * distances / n:.1f}, intersection volume {1e3 * volumes / n:.1f}, the rest wrench "
-        f"spaces; median epsilon {np.median(table['quality/epsilon'][:, 1]):.2f}\n"
+        f"{wall:.1f} s wall on {available_cores()} cores, {cpu:.1f} s CPU; a grasp takes {1e3 * cpu / count:.1f} ms "
+        f"CPU, of which distances {1e3 * distances / n:.1f}, intersection volume {1e3 * volumes / n:.1f}, the rest "
+        f"wrench spaces; median epsilon {np.median(table['quality/epsilon'][:, 1]):.2f}\n"
     )
 
 

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from worker.content import content_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -116,6 +119,11 @@ class HandModel:
     """Pairs of bodies (a < b) whose contact does not count: adjacent ones and those that touch in every posture."""
     masses: Floats
     """(L,) [kg] of each body, from the URDF or, where it gives none, from volume at 1000 kg/m^3."""
+
+    @cached_property
+    def content(self) -> str:
+        """Digest of the tree, the pieces and the numbers. `digest` is that of the files they were read from."""
+        return content_of(self)
 
     @property
     def bodies(self) -> int:

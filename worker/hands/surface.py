@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from typing import Final
 
 import numpy as np
@@ -34,18 +36,19 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     Raises:
         HandError: the hand has no outer surface.
     """
-    key = (hand.digest, hand.root_link, hand.dofs, len(hand.pieces), count, seed)
-    cached = _CACHE.get(key)
-    if cached is None or cached[0] is not hand.pieces:
-        cached = (hand.pieces, _sample(hand, count, seed))
-        if len(_CACHE) >= _CACHE_SIZE:
-            _CACHE.pop(next(iter(_CACHE)))
-        _CACHE[key] = cached
-    return cached[1]
+    key = (hand.content, count, seed)
+    with _lock:
+        if key not in _samples:
+            _samples[key] = _sample(hand, count, seed)
+            while len(_samples) > _KEPT:
+                _samples.popitem(last=False)
+        _samples.move_to_end(key)
+        return _samples[key]
 
 
-_CACHE_SIZE: Final = 32
-_CACHE: dict[tuple[object, ...], tuple[tuple[ConvexPiece, ...], SurfacePoints]] = {}
+_KEPT: Final = 32
+_samples: OrderedDict[tuple[str, int, int], SurfacePoints] = OrderedDict()
+_lock = threading.Lock()
 
 
 def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:

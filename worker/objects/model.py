@@ -6,9 +6,12 @@ Everything is in the object frame: the frame of the mesh as uploaded, in metres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from worker.content import content_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -42,6 +45,11 @@ class ObjectModel:
     deviation_m: float = 0.0
     """Largest distance between the prepared surface and the uploaded one [m]."""
     repairs: tuple[str, ...] = ()
+
+    @cached_property
+    def content(self) -> str:
+        """Digest of what was prepared. `digest` is the file's: the same for every fidelity."""
+        return content_of(self)
 
     @property
     def gyration_radius(self) -> float:

@@ -6,7 +6,6 @@ depend on the part it is in.
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 import warp as wp
 
+from service.cores import available_cores
 from service.errors import TaskCancelled
 from worker.planners.port import Cancelled, Progress
 
@@ -50,7 +50,7 @@ def cut(count: int, threads: int, device: str, *, least: int = 1) -> list[range]
     """
     if wp.get_device(device).is_cuda:
         return [range(count)]
-    parts = max(1, min(threads or os.cpu_count() or 1, count // least))
+    parts = max(1, min(threads or available_cores(), count // least))
     bounds = np.linspace(0, count, parts + 1).astype(int)
     return [range(int(a), int(b)) for a, b in pairwise(bounds)]
 

@@ -208,10 +208,10 @@ _lock = threading.Lock()
 
 def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int) -> Probe:
     """The probe of a pair, from memory where it was used lately."""
-    key = (hand.digest, obj.digest, hand_points, object_points)
+    key = (hand.content, obj.content, hand_points, object_points)
     with _lock:
         probe = _probes.get(key)
-        if probe is None or probe.hand is not hand or probe.obj is not obj:
+        if probe is None:
             probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points)
             _probes[key] = probe
         _probes.move_to_end(key)

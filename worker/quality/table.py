@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.cores import available_cores
 from service.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
@@ -83,7 +83,7 @@ def measure(
             progress(done, len(grasps), "quality")
         return columns
 
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="quality") as pool:
+    with ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="quality") as pool:
         parts = list(pool.map(work, chunks))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in pair.names} if parts else pair.empty()
     columns["quality/thresholds_m"] = thresholds

@@ -106,7 +106,7 @@ class Setting:
         self, drawn: DrawnHand, device: str, *, threads: int = 0, cancelled: Callable[[], bool] = lambda: False
     ) -> Pictures:
         """The same pictures with a hand in them."""
-        key = (*_key(self.objects), drawn.hand.digest, len(self.poses), device)
+        key = (*_key(self.objects), drawn.hand.content, len(self.poses), device)
         stage = _kept(key, lambda: [*_solids(self.objects), *hand_solids(drawn.hand)], len(self.poses), device)
         shown = [look_of(drawn.hand, body) for body in drawn_bodies(drawn.hand)]
         stage.place(
@@ -149,7 +149,7 @@ def _toward_lamp(rng: np.random.Generator) -> Floats:
 
 
 def _key(objects: Sequence[ObjectModel]) -> tuple[object, ...]:
-    return tuple((obj.digest, len(obj.faces), len(obj.vertices)) for obj in objects)
+    return tuple(obj.content for obj in objects)
 
 
 def _solids(objects: Sequence[ObjectModel]) -> list[Solid | Box]:

@@ -7,7 +7,6 @@ the pixel centres: depth, normals and shape indices come from it alone.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ import warp as wp
 from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
+from service.cores import available_cores
 from service.errors import TaskCancelled
 from service.transforms import compose, pose_from_matrix, quat_from_axis_angle, quat_rotate
 from worker import backend
@@ -231,11 +231,6 @@ class _Exposure:
 
 def _trace(exposure: _Exposure, *, rays: Any, one: LightPass, first: bool) -> None:
     exposure.trace(rays, one, first)
-
-
-def available_cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def _turns(angle: Floats) -> Floats:

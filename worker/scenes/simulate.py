@@ -109,26 +109,25 @@ def rest_probability(obj: ObjectModel, faces: Sequence[int]) -> Floats:
     """(S,) share of `REFERENCE_DROPS` drops of the object alone, and the scene's own, that rest on each face."""
     if not faces:
         return np.zeros(0)
-    known, reference = resting_faces(obj), np.array(_reference_faces(_ByDigest(obj)))
+    known, reference = resting_faces(obj), np.array(_reference_faces(_ByContent(obj)))
     return np.array([same_face(known, face, reference).sum() + 1.0 for face in faces]) / (REFERENCE_DROPS + 1.0)
 
 
-class _ByDigest:
-    """An object as a cache key: equal digests are equal objects."""
+class _ByContent:
+    """An object as a cache key."""
 
     def __init__(self, obj: ObjectModel) -> None:
         self.obj = obj
-        self.key = (obj.digest, len(obj.hull_vertices), float(obj.volume))
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return hash(self.obj.content)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByDigest) and self.key == other.key
+        return isinstance(other, _ByContent) and self.obj.content == other.obj.content
 
 
 @lru_cache(maxsize=64)
-def _reference_faces(obj: _ByDigest) -> tuple[int, ...]:
+def _reference_faces(obj: _ByContent) -> tuple[int, ...]:
     table = _build(obj.obj)
     return tuple(_redo_until_rest(table, obj.obj.name, (_REFERENCE_SEED, k)).face for k in range(REFERENCE_DROPS))
 

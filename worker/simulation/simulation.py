@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.errors import InputError
 from worker.hands.model import SurfacePoints
 from worker.simulation.device import DeviceHand, DeviceObject, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact, kinematics, optimizers, penalties, pieces, surface
@@ -25,6 +26,8 @@ REFERENCE_POINTS: Final = 800
 REFERENCE_SAMPLES: Final = 2000
 #: Weight of one hand point against other links is 1 at this many.
 REFERENCE_SELF_POINTS: Final = 1000
+#: Names that `Simulation.record_iteration` knows.
+OPTIMIZERS: Final = ("adam", "gd")
 #: Largest dilation a schedule may ask for [m].
 MAX_DILATION: Final = 0.1
 
@@ -332,7 +335,12 @@ class Simulation:
         """Fix the launches of one iteration for the present schedule.
 
         With a `patience`, a grasp that has not improved for so many iterations is switched off and costs nothing more.
+
+        Raises:
+            InputError: unknown optimizer.
         """
+        if optimizer not in OPTIMIZERS:
+            raise InputError(f"unknown optimizer {optimizer!r}; choose one of {', '.join(OPTIMIZERS)}")
         self._commands, self._graph = [], None
         self._record_kinematics()
         self._record_contact()

@@ -6,13 +6,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Final, TypeVar, cast
 
+from service import names
 from service.domain import AssetKind, TaskMessage
 from service.library import load_asset_files
 from service.store import Store
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.stages.models import publish_model
+from worker.stages.models import SHOWN_ERROR_M, publish_model
 from worker.stages.prepared import prepared_object
 
 T = TypeVar("T")
@@ -42,7 +43,10 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
 
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
-        publish_model(store, AssetKind.OBJECT, obj)
+        if not store.exists(names.asset_model(AssetKind.OBJECT, digest)):
+            # The same for whichever fidelity comes first.
+            shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
+            publish_model(store, AssetKind.OBJECT, shown)
         return obj
 
     return _cached(key, load)

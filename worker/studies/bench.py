@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from service.cores import available_cores
 from service.domain import Fidelity
 from service.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
@@ -112,4 +112,4 @@ def _peak_memory_mb(device: str) -> float:
 def device_name(device: str) -> str:
     """The device as people call it."""
     found = wp.get_device(device)
-    return str(found.name) if found.is_cuda else f"cpu ({os.cpu_count()} cores)"
+    return str(found.name) if found.is_cuda else f"cpu ({available_cores()} cores)"

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json as json_
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
+from service.cores import available_cores
 from service.domain import FIDELITIES, OFFERED, Fidelity
 from service.errors import InputError
 from worker.devices import Device
@@ -44,7 +44,7 @@ def bench(
         lambda error: object_from_path(object_, face_error_m=error),
         fidelities=_fidelities(fidelity, points, face_error),
         batches=batch or [1, 8, 32, 256],
-        threads=threads or ([1] if resolved != "cpu" else sorted({1, os.cpu_count() or 1})),
+        threads=threads or ([1] if resolved != "cpu" else sorted({1, available_cores()})),
         device=resolved,
         repeats=repeats,
         say=lambda line: typer.echo(line, err=True),

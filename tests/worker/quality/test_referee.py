@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
+import threading
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -137,6 +139,23 @@ def test_verdicts_do_not_depend_on_threads() -> None:
     one, two = (judge(PLATES, BOX, many_grasps(), threads=n, pieces=WHOLE) for n in (1, 2))
     assert np.array_equal(one.margin, two.margin)
     assert one.key == two.key
+
+
+def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> None:
+    told, alone, overlaps = [], threading.Lock(), 0
+
+    def progress(done: float, total: float, message: str) -> None:
+        nonlocal overlaps
+        if not alone.acquire(blocking=False):
+            overlaps += 1
+            return
+        told.append(done)
+        time.sleep(0.02)  # long enough for another thread to come in, if it may
+        alone.release()
+
+    judge(PLATES, BOX, many_grasps(), level="screen", threads=4, pieces=WHOLE, progress=progress)
+    assert overlaps == 0
+    assert told == list(range(1, len(many_grasps()) + 1))
 
 
 def test_everything_that_moves_a_verdict_is_in_its_key() -> None:

@@ -56,7 +56,7 @@ _lock = threading.Lock()
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> Pair:
     """The pair, from memory where it was used lately."""
-    key = (hand.digest, obj.digest, fidelity.model_dump_json(), device)
+    key = (hand.content, obj.content, fidelity.model_dump_json(), device)
     with _lock:
         if key in _pairs:
             _pairs.move_to_end(key)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any, Final
@@ -10,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
+from service.cores import available_cores
 from worker.simulation.device import DeviceObject
 from worker.simulation.kernels import surface
 
@@ -43,7 +43,7 @@ def distance_grid(obj: DeviceObject, cells: int) -> Any:
                 inputs=[flat, wp.vec3(*corner), cell, reach], outputs=[field[first:last]], device=device,
             )  # fmt: skip
 
-    threads = 1 if wp.get_device(device).is_cuda else os.cpu_count() or 1
+    threads = 1 if wp.get_device(device).is_cuda else available_cores()
     bounds = np.linspace(0, shape[0], 4 * threads + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda ends: slab(*ends), pairwise(bounds.tolist())))

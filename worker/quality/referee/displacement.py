@@ -7,7 +7,6 @@ The hand stands still in its grasp posture; the object of 1 kg, friction 3, fall
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
@@ -15,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.cores import available_cores
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -51,7 +51,7 @@ def simulated_displacement_cm(
         mujoco.mj_step(model, data, nstep=STEPS)
         return math.nan if void(data) else float(np.linalg.norm(data.qpos[:3] - centre))
 
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1, thread_name_prefix="displacement") as pool:
+    with ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="displacement") as pool:
         return 100.0 * np.array(list(pool.map(work, bodies)), float)
 
 

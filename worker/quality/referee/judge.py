@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import queue
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.cores import available_cores
 from service.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -111,16 +112,17 @@ def judge(
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
-    bench = _Bench(hand, obj, pieces, level, hard, threads or os.cpu_count() or 1)
-    done = 0
+    bench = _Bench(hand, obj, pieces, level, hard, threads or available_cores())
+    done, lock = 0, threading.Lock()
 
     def work(row: int) -> Trial:
         nonlocal done
         if cancelled():
             raise TaskCancelled("the referee was cancelled")
         trial = bench.trial(grasps, row)
-        done += 1
-        progress(done, len(grasps), "referee")
+        with lock:
+            done += 1
+            progress(done, len(grasps), "referee")
         return trial
 
     with ThreadPoolExecutor(bench.threads, thread_name_prefix="referee") as pool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,6 +9,7 @@ from typing import Any, Final
 import warp as wp
 
 from service.clock import timestamp
+from service.cores import available_cores
 from service.domain import FIDELITIES
 from service.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
@@ -61,7 +61,7 @@ def chart(
             for _ in range(repeats):
                 for cell in cells:
                     cell.repeat()
-                    cell.time_first(cell.setting.threads or os.cpu_count() or 1)
+                    cell.time_first(cell.setting.threads or available_cores())
             for cell in cells:
                 runs.append(_row(cell, hand, thing))
                 say(_line(runs[-1]))
@@ -74,7 +74,7 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> dict
         "created": timestamp(),
         "device": device_name(settings[0].device),
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
-        "threads": settings[0].threads or os.cpu_count(),
+        "threads": settings[0].threads or available_cores(),
         "referee": {"protocol": "dexgraspbench", "level": "certificate"},
         "friction": FRICTION,
         "threshold_m": THRESHOLD_M,

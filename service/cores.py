@@ -1,0 +1,67 @@
+"""How many cores this process may keep busy: not what the machine has, but what it is given of them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+_ROOT: Final = Path("/")
+#: Where systems mount the CPU controller of cgroup v1.
+_V1: Final = ("cpu", "cpu,cpuacct")
+
+
+def available_cores(root: Path = _ROOT) -> int:
+    """Cores for threads of this process: its affinity, or the CPU quota of its control group where that is less.
+
+    A quota of one and a half cores gives 2: a thread that waits for its share costs less than half a core unused.
+
+    Args:
+        root: the folder that holds `proc` and `sys`.
+    """
+    given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min([given, *(math.ceil(quota) for quota in _quotas(root))]))
+
+
+def _quotas(root: Path) -> Iterator[float]:
+    """Quotas [cores] of this process's control group and of those it is in."""
+    mount = root / "sys/fs/cgroup"
+    for controllers, path in _groups(root / "proc/self/cgroup"):
+        inside = (PurePosixPath(path), *PurePosixPath(path).parents)
+        for group in (str(one).lstrip("/") for one in inside):
+            if not controllers:
+                yield from _ratio(_words(mount / group / "cpu.max"))
+            elif "cpu" in controllers.split(","):
+                for name in _V1:
+                    files = (mount / name / group / f"cpu.cfs_{what}_us" for what in ("quota", "period"))
+                    yield from _ratio([word for file in files for word in _words(file)])
+
+
+def _groups(file: Path) -> Iterator[tuple[str, str]]:
+    """Controllers and path of each hierarchy that the process is in; no controllers: cgroup v2."""
+    try:
+        lines = file.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = [*line.split(":", 2), "", ""][:3]
+        yield controllers, path
+
+
+def _words(file: Path) -> list[str]:
+    try:
+        return file.read_text().split()
+    except OSError:
+        return []
+
+
+def _ratio(words: list[str]) -> Iterator[float]:
+    """Quota over period; none where there is no limit (`max`, -1)."""
+    try:
+        quota, period = map(int, words)
+    except ValueError:
+        return
+    if quota > 0 and period > 0:
+        yield quota / period

@@ -1,0 +1,86 @@
+"""One process that works at several fidelities gives what fresh ones give: no cache serves one's mesh to another.
+
+`python -m tests.worker.planners.test_fidelities method:fidelity ...` makes them in that order and prints their digests.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import trimesh
+
+from service.digests import digest_bytes
+from service.domain import FIDELITIES, Fidelity
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import load_object
+from worker.planners import PLANNERS, method, synthesize
+from worker.quality.table import measure
+
+#: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
+SHORT: dict[str, Any] = {
+    "starts": 1, "finalists": 1, "coarse_points": 64, "fine_points": 64, "object_points": 64, "coarse_iterations": 3,
+    "fine_iterations": 2, "polish_iterations": 1,
+}  # fmt: skip
+METHODS = sorted(PLANNERS)
+PAIR = ("draft", "fine")
+
+
+def egg() -> bytes:
+    """Round all over, so that every bound simplifies it to another mesh; small, so that this is soon done."""
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    mesh.apply_scale((1.0, 0.9, 1.3))
+    return bytes(mesh.export(file_type="stl"))
+
+
+def made(name: str, fidelity: Fidelity) -> dict[str, str]:
+    """Digests of what a method makes on an egg at a fidelity: the mesh, postures, quality."""
+    hand = hand_from_path("barrett")
+    obj = load_object({"egg.stl": egg()}, name="egg", digest="egg", face_error_m=fidelity.face_error_m)
+    options = dict(method(name).quick) | ({"grid": 24} if name == "graspd2022" else {})
+    found = synthesize(
+        hand, obj, count=2, method=name, fidelity=fidelity, options=options, seed=3, threads=1,
+    )  # fmt: skip
+    columns = {
+        "faces": obj.faces,
+        "grasp": found.grasp.hand_pose,
+        "joints": found.grasp.joint_positions,
+        "pregrasp": found.pregrasp.joint_positions,
+        "squeeze": found.squeeze.joint_positions,
+        **measure(hand, obj, found, threads=1),
+    }
+    return {column: digest_bytes(values.tobytes()) for column, values in columns.items()}
+
+
+def main(wanted: list[str]) -> None:
+    found = {}
+    for one in wanted:
+        name, _, level = one.partition(":")
+        found[one] = made(name, FIDELITIES[level].model_copy(update=SHORT))
+    print(json.dumps(found))
+
+
+def in_a_fresh_process(wanted: list[str]) -> dict[str, dict[str, str]]:
+    command = [sys.executable, "-m", "tests.worker.planners.test_fidelities", *wanted]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, dict[str, str]] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def test_every_method_at_two_fidelities_in_one_process_is_as_in_fresh_ones() -> None:
+    apart = [[f"{name}:{level}" for name in METHODS] for level in PAIR]
+    # The other way round in methods, so that what methods share is met in another order, too.
+    mixed = [f"{name}:{level}" for name in reversed(METHODS) for level in PAIR]
+    with ThreadPoolExecutor(3) as pool:
+        *fresh, together = pool.map(in_a_fresh_process, [*apart, mixed])
+    assert together == {key: value for found in fresh for key, value in found.items()}
+    coarse, fine = (fresh[k][f"autograsp:{level}"] for k, level in enumerate(PAIR))
+    assert coarse["faces"] != fine["faces"] and coarse["grasp"] != fine["grasp"]
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

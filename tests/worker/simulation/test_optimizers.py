@@ -1,0 +1,26 @@
+"""The optimizers that a simulation knows."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from service.domain import Fidelity
+from service.errors import InputError
+from tests.worker.simulation.rigs import ball, rig
+from worker.hands.load import hand_from_path
+from worker.simulation.simulation import OPTIMIZERS, LossOptions, still_schedule
+
+
+@pytest.mark.parametrize("name", ["lbfgs", "Adam", ""])
+def test_an_optimizer_that_nobody_knows_is_refused_in_one_line(name: str) -> None:
+    simulation = rig(hand_from_path("barrett"), ball(), capacity=1, options=LossOptions())
+    simulation.set_schedule(still_schedule())
+    with pytest.raises(InputError, match=r"unknown optimizer '.*'; choose one of adam, gd$"):
+        simulation.record_iteration(name)
+    assert simulation.commands() == []
+
+
+def test_every_optimizer_of_a_fidelity_is_known() -> None:
+    assert get_args(Fidelity.model_fields["optimizer"].annotation) == OPTIMIZERS
