@@ -102,13 +102,15 @@ class Catalog:
             QuotaError: the caller's key has all it may have.
         """
         key = caller.get()
+        bound: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if idempotency_key is not None:
-            self._idempotency.claim(key.name if key else "", idempotency_key, request)
-        record = pipeline.prepare(self._parts, request, owner=key.id if key else "")
-        with bind(job=record.id), self.quotas.claim(key, record.id, record.request.grasps) as claim:
-            job, is_new = pipeline.enter(self._parts, record)
-            claim.counts = is_new
-            log.info("job submitted" if is_new else "job was there already")
+            bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
+        with bound:
+            record = pipeline.prepare(self._parts, request, owner=key.id if key else "")
+            with bind(job=record.id), self.quotas.claim(key, record.id, record.request.grasps) as claim:
+                job, is_new = pipeline.enter(self._parts, record)
+                claim.counts = is_new
+                log.info("job submitted" if is_new else "job was there already")
         return self._detail(job)
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -204,16 +206,22 @@ class Catalog:
         Raises:
             ConflictError: the name stands for other content, or the content has another name.
         """
-        digest = digest_files(kind, files)
+        self._refuse_taken(kind, name, digest_files(kind, files))
+        key, index, store = caller.get(), self._parts.index, self._parts.store
+        asset = library.store_files(store, kind, name, files, owner=key.id if key else "")
+        # Of two uploads at once that want one name, the later one must see the earlier one's record.
+        with index.writing() as connection:
+            self._refuse_taken(kind, name, asset.digest)
+            asset = library.record_asset(store, asset)
+            index.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
+        return self._parts.index.asset(kind, asset.digest)
+
+    def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
         with contextlib.suppress(NotFoundError):
             known = self._parts.index.asset(kind, name)
             # A refused upload holds no name: the same file with the mend must get in.
             if known.digest != digest and known.verdict != "refuse":
                 raise ConflictError(f"there is another {kind.value} named {name!r}; choose a name of its own")
-        key = caller.get()
-        asset = library.publish_asset(self._parts.store, kind, name, files, owner=key.id if key else "")
-        self._parts.index.add_asset(asset, library.load_check(self._parts.store, kind, asset.digest))
-        return self._parts.index.asset(kind, asset.digest)
 
     def workers(self) -> list[Worker]:
         """Workers, the living first, each with the stage it does and the age of its lease."""

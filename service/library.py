@@ -39,17 +39,43 @@ def publish_asset(
         InputError: `asset.json` is missing or wrong.
         ConflictError: the same content is known under another name.
     """
+    return record_asset(store, store_files(store, kind, name, files, builtin=builtin, created=created, owner=owner))
+
+
+def store_files(
+    store: Store,
+    kind: AssetKind,
+    name: str,
+    files: Mapping[str, bytes],
+    *,
+    builtin: bool = False,
+    created: str = "",
+    owner: str = "",
+) -> Asset:
+    """The first half of `publish_asset`: the archive is there, and nothing counts it yet.
+
+    Raises:
+        InputError: `asset.json` is missing or wrong.
+    """
     asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
     asset = asset.model_copy(update={"owner": owner})
-    record = names.asset_record(kind, asset.digest)
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         store.put_file(names.asset_files(kind, asset.digest), archive)
-    if store.put(record, asset.model_dump_json().encode()):
+    return asset
+
+
+def record_asset(store: Store, asset: Asset) -> Asset:
+    """The second half of `publish_asset`: the record, from which on the asset counts.
+
+    Raises:
+        ConflictError: the same content is known under another name.
+    """
+    if store.put(names.asset_record(asset.kind, asset.digest), asset.model_dump_json().encode()):
         return asset
-    known = load_asset(store, kind, asset.digest)
-    if known.name != name:
-        raise ConflictError(f"this {kind.value} is already known as {known.name!r}; use that name")
+    known = load_asset(store, asset.kind, asset.digest)
+    if known.name != asset.name:
+        raise ConflictError(f"this {asset.kind.value} is already known as {known.name!r}; use that name")
     return known
 
 
