@@ -172,10 +172,10 @@ class Quotas:
         most_grasps, most_jobs = self._limits(key)
         limits = (most_grasps, most_jobs if is_new else 0)
         about = (job, grasps, *limits, _KEPT_S, int(is_new), number, _PENDING_S)
+        met, amount = b"unknown", b"0"
         with self._forgiving(key):
             met, amount = self._connection.eval(_CLAIM, 2, _held(key), _today(key), *about)
-            return met.decode(), int(amount)
-        return "unknown", 0
+        return met.decode(), int(amount)
 
     def _forget_ended(self, key: Key) -> None:
         """Drop the jobs that have ended. One that is being entered is not in the index yet, so it is not asked for; one
