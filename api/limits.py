@@ -17,6 +17,8 @@ MAX_BODY_BYTES: Final = 1 << 20
 PIECE_S: Final = 30.0
 #: Multipart framing and the other fields of an upload.
 _FORM_SLACK_BYTES: Final = 64 << 10
+#: Of a Content-Length: Python takes long to read a number of thousands, or refuses it.
+_MOST_DIGITS: Final = 18
 
 
 class BodyLimit:
@@ -43,7 +45,7 @@ class BodyLimit:
         is_upload = scope["method"] == "POST" and scope["path"].rstrip("/") in self.upload_paths
         limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
         declared = dict(scope["headers"]).get(b"content-length", b"0")
-        if not declared.isdigit() or int(declared) > limit:
+        if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
             await _refuse(_too_large(limit), scope, receive, send)
             return
         await self._watch(scope, receive, send, limit)

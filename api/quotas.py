@@ -180,7 +180,7 @@ class Quotas:
     def _forget_ended(self, key: Key) -> None:
         """Drop the jobs that have ended. One that is being entered is not in the index yet, so it is not asked for; one
         that is claimed again meanwhile has another entry, and stays."""
-        found = [word.decode() for word in self._connection.eval(_ENTERED, 1, _held(key))]
+        found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, _held(key))]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
         for start in range(0, len(ended), _AT_ONCE):

@@ -19,6 +19,9 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 #: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 
+#: An id or nothing. Whoever writes to Redis may say anything, so what is read from there is bounded like this.
+Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
+
 
 class State(StrEnum):
     """State of a job or a task. A task that lost its worker goes from `running` back to `queued`."""
@@ -246,8 +249,8 @@ class TaskMessage(Model):
 
     # `schema` is a field name in the message, an attribute of BaseModel in Python: hence the alias.
     schema_: int = Field(alias="schema")
-    task_id: str
-    job_id: str
+    task_id: Word
+    job_id: Word
     stage: Stage
     batch: int = Field(ge=0)
     count: int = Field(ge=1, description="grasps wanted of this batch")
@@ -257,8 +260,8 @@ class TaskMessage(Model):
     request: JobRequest
     hand_digest: Digest
     object_digest: Digest
-    inputs: tuple[str, ...] = Field((), description="shard ids this task reads")
-    output: str = Field(description="shard id this task writes")
+    inputs: tuple[Word, ...] = Field((), description="shard ids this task reads")
+    output: Word = Field(description="shard id this task writes")
     origin: Origin | None = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -268,7 +271,7 @@ class IngestMessage(Model):
     """A task that checks an uploaded hand or object in a child process."""
 
     schema_: int = Field(alias="schema")
-    task_id: str
+    task_id: Word
     stage: Literal[Stage.INGEST] = Stage.INGEST
     kind: AssetKind
     name: Name

@@ -91,6 +91,8 @@ class Keeper:
                 self._plan_again = now + self._parts.settings.keeper_interval_s
         if now >= self._tell_again:
             with _noted(away):
+                self._parts.queue.tidy()
+            with _noted(away):
                 self._indexer.flush()
                 self._look_after_workers()
                 self._tell_again = now + _WORKERS_EVERY_S
@@ -98,7 +100,6 @@ class Keeper:
             raise away[0]
 
     def _look_after_workers(self) -> None:
-        self._parts.queue.tidy()
         self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
         # One that ended as it should says so, but its registration is gone a moment before that is read.
         self._parts.index.set_workers(

@@ -11,7 +11,7 @@ from typing import Final
 from service import names
 from service.clock import timestamp
 from service.domain import AssetKind, IngestMessage, Stage, TaskMessage
-from service.errors import DamagedError
+from service.errors import DamagedError, UnavailableError
 from service.indexer import Indexer
 from service.manifests import shard_exists
 from service.parts import Parts
@@ -114,10 +114,15 @@ class Reaper:
     def _lose(self, lease: Lease) -> None:
         message = lease.message
         log.warning("worker %s was lost with task %s (attempt %d)", lease.worker, lease.task_id, lease.attempt)
-        if isinstance(message, TaskMessage):
-            self._lose_task(lease, message)
-        elif isinstance(message, IngestMessage):
-            self._lose_check(lease, message)
+        try:
+            if isinstance(message, TaskMessage):
+                self._lose_task(lease, message)
+            elif isinstance(message, IngestMessage):
+                self._lose_check(lease, message)
+        except UnavailableError:
+            raise
+        except Exception:  # anybody who writes to Redis can forge a lease: it must not hold up the others
+            log.exception("the lease of task %s is left out", lease.task_id)
         # Only now: if the store was away, the next round finds the lease again.
         self._parts.queue.release(lease)
 

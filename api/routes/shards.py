@@ -18,7 +18,8 @@ from service.index.views import Page
 router = APIRouter(prefix="/v1/shards", tags=["shards"])
 
 _MEDIA_TYPE = "application/x-hdf5"
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+#: No file has more bytes than such a number tells; a longer one is no range, and the whole file is sent.
+_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))

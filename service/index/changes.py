@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import Connection, delete, select, update
 
 from service.domain import Asset, State
-from service.index.database import Database, upsert
+from service.index.database import Database, chunks, upsert
 from service.index.rows import asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
 from service.index.states import settle
 from service.index.tables import assets, attempts, grasps, jobs, shards, tasks, workers
@@ -110,7 +110,7 @@ class Changes(Database):
     def set_queued(self, task_ids: Sequence[str]) -> None:
         """Tasks that were put into the queue."""
         with self.writing() as connection:
-            for some in _chunks(task_ids):
+            for some in chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
 
     def set_waiting(
@@ -125,7 +125,7 @@ class Changes(Database):
         values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message and clean(message)}
         touched: set[str] = set()
         with self.writing() as connection:
-            for some in _chunks(task_ids):
+            for some in chunks(task_ids):
                 statement = update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(**values)
                 touched |= set(connection.scalars(statement.returning(tasks.c.job_id)))
             return {job: settle(connection, job, []) for job in touched}
@@ -178,7 +178,7 @@ class Changes(Database):
 
     def _finished_shards(self, connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
         found: dict[str, dict[str, Any]] = {}
-        for some in _chunks(ids):
+        for some in chunks(ids):
             query = select(shards.c.id, *_OUTCOME).where(shards.c.id.in_(some))
             for row in connection.execute(query).mappings():
                 found[row["id"]] = _outcome(row["worker"], row["device"], row["seconds"], row["created"])
@@ -248,7 +248,3 @@ def _outcome(worker: str, device: str, seconds: float, created: str) -> dict[str
         "progress_total": 0.0,
         "progress_message": None,
     }
-
-
-def _chunks(ids: Sequence[str], size: int = 1000) -> Iterable[Sequence[str]]:
-    return (ids[start : start + size] for start in range(0, len(ids), size))

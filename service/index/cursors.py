@@ -6,9 +6,13 @@ import base64
 import json
 from typing import Any, Final
 
+from pydantic_core import from_json
+
 from service.errors import InputError
 
 MAX_LIMIT: Final = 200
+#: Every database holds whole numbers up to here.
+_MOST: Final = 2**63
 
 
 def encode(*key: Any) -> str:
@@ -19,11 +23,13 @@ def encode(*key: Any) -> str:
 def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
     """The sort key of a cursor, checked against the types of its parts; InputError if it is none of ours."""
     try:
-        key = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        key = from_json(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)), allow_inf_nan=False)
     except ValueError:
         raise InputError("the cursor is not one that this list gave out; start without it") from None
     if not isinstance(key, list) or len(key) != len(kinds) or not all(map(isinstance, key, kinds)):
         raise InputError("the cursor belongs to another list or another order; start without it")
+    if any(isinstance(part, int) and not -_MOST <= part < _MOST for part in key):
+        raise InputError("the cursor is not one that this list gave out; start without it")
     return tuple(key)
 
 

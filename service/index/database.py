@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -105,6 +105,11 @@ def upsert(
     connection.execute(statement, list(rows))
 
 
+def chunks(ids: Sequence[str], size: int = 1000) -> Iterable[Sequence[str]]:
+    """Ids in parts that a statement may name: databases bound the number of its parameters."""
+    return (ids[start : start + size] for start in range(0, len(ids), size))
+
+
 def _engine(url: str) -> Engine:
     try:
         parsed = make_url(url)
@@ -191,6 +196,8 @@ def _mapped() -> Iterator[None]:
     except DataError as error:
         # Not the database is at fault but what it was to hold: to try again would never end.
         raise InputError(f"the index cannot hold this: {_line(error)}") from error
+    except (OverflowError, UnicodeEncodeError):
+        raise InputError("the index knows whole numbers below 2^63 and Unicode text; give such values") from None
     except SQLAlchemyError as error:
         raise IndexUnavailable(f"the index does not answer or cannot be written: {_line(error)}") from error
 

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import Column, ColumnElement, exists, or_, select
 
 from service.domain import AssetKind, Lane, Stage, State
-from service.index.database import Database
+from service.index.database import Database, chunks
 from service.index.tables import assets, jobs, tasks
 from service.planning import MAX_BACKOFF_S, PlannedTask
 from service.records import JobRecord
@@ -96,15 +96,23 @@ class Feed(Database):
 
     def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
         """Stage and shard id of tasks."""
-        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id).where(tasks.c.id.in_(list(task_ids)))
+        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
         with self.reading() as connection:
-            return {task: (stage, shard) for task, stage, shard in connection.execute(query)}
+            return {
+                task: (stage, shard)
+                for some in chunks(list(task_ids))
+                for task, stage, shard in connection.execute(query.where(tasks.c.id.in_(some)))
+            }
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
         """Those of the tasks that are cancelled."""
-        query = select(tasks.c.id).where(tasks.c.id.in_(list(task_ids)), tasks.c.state == State.CANCELLED.value)
+        query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
         with self.reading() as connection:
-            return set(connection.scalars(query))
+            return {
+                task
+                for some in chunks(list(task_ids))
+                for task in connection.scalars(query.where(tasks.c.id.in_(some)))
+            }
 
     def has_jobs(self) -> bool:
         """Whether the index knows any job."""

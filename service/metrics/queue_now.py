@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
@@ -34,7 +33,9 @@ class QueueNow:
     workers: Mapping[str, WorkerPulse] = field(default_factory=dict)
 
 
-def read_queue(connection: Any, *, workers_key: str, worker_key: str, lease_s: float) -> QueueNow:
+def read_queue(
+    connection: Any, *, workers_key: str, worker_key: bytes, lease_s: float, read_beat: Callable[[bytes | None], Any]
+) -> QueueNow:
     """Two round trips: lengths and heads of the lists, then the age of the heads and the beats of the workers.
 
     Args:
@@ -42,6 +43,7 @@ def read_queue(connection: Any, *, workers_key: str, worker_key: str, lease_s: f
         workers_key: set of the workers' names.
         worker_key: what stands before a name in the key that a living worker renews.
         lease_s: how long that key lives after a beat [s].
+        read_beat: what a worker says of itself (`WorkerBeat`), None if that cannot be read.
     """
     places = list(product(Lane, Stage))
     with connection.pipeline(transaction=False) as pipe:
@@ -53,29 +55,26 @@ def read_queue(connection: Any, *, workers_key: str, worker_key: str, lease_s: f
         pipe.smembers(workers_key)
         *found, names = pipe.execute()
     lengths, heads, running = found[0::3], found[1::3], found[2::3]
-    first = {place: head.decode() for place, head in zip(places, heads, strict=True) if head is not None}
-    known = sorted(name.decode() for name in names)
+    first = {place: head for place, head in zip(places, heads, strict=True) if head is not None}
+    known = sorted(names)
     with connection.pipeline(transaction=False) as pipe:
         for head in first.values():
-            pipe.hget(f"rq:job:{head}", "enqueued_at")
+            pipe.hget(b"rq:job:" + head, "enqueued_at")
         for name in known:
-            pipe.get(f"{worker_key}{name}")
-            pipe.pttl(f"{worker_key}{name}")
-        rest = pipe.execute()
+            pipe.get(worker_key + name)
+            pipe.pttl(worker_key + name)
+        # Under a name that anybody may have put there lies anything: that hides no other.
+        rest = [None if isinstance(answer, Exception) else answer for answer in pipe.execute(raise_on_error=False)]
     since, beats = rest[: len(first)], rest[len(first) :]
-    ages = {place: age_of(when.decode()) if when else None for place, when in zip(first, since, strict=True)}
-    pulses = {name: _pulse(beats[2 * i], beats[2 * i + 1], lease_s) for i, name in enumerate(known)}
+    ages = {place: age_of((when or b"").decode(errors="replace")) for place, when in zip(first, since, strict=True)}
+    pulses = {}
+    for i, name in enumerate(known):
+        if (beat := read_beat(beats[2 * i])) is not None:
+            age = max(0.0, lease_s - (beats[2 * i + 1] or 0) / 1000)
+            pulses[name.decode(errors="replace")] = WorkerPulse(beat.device, beat.state, age)
     return QueueNow(
         depth=dict(zip(places, lengths, strict=True)),
         oldest_s={place: age for place, age in ages.items() if age is not None},
         running=dict(zip(places, running, strict=True)),
-        workers={name: pulse for name, pulse in pulses.items() if pulse is not None},
+        workers=pulses,
     )
-
-
-def _pulse(beat: bytes | None, lives_ms: int, lease_s: float) -> WorkerPulse | None:
-    try:
-        facts = json.loads(beat or b"")
-        return WorkerPulse(str(facts["device"]), str(facts["state"]), max(0.0, lease_s - lives_ms / 1000))
-    except (ValueError, KeyError, TypeError):
-        return None

@@ -10,6 +10,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Final, Protocol
 
+from pydantic_core import from_json
+
 from service.domain import State
 from service.manifests import ShardManifest
 from service.metrics.series import SERIES, STAGE_BUCKETS_S
@@ -88,7 +90,7 @@ def field(name: str, *labels: str) -> str:
 def parse_field(text: str) -> tuple[str, tuple[str, ...]] | None:
     """Series and label values of a sum; None if it is not one of ours."""
     try:
-        name, *labels = json.loads(text)
+        name, *labels = from_json(text)
     except (ValueError, TypeError):
         return None
     return (name, tuple(map(str, labels))) if isinstance(name, str) else None

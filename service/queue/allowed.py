@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from redis.exceptions import RedisError
+from redis.exceptions import RedisError, ResponseError
 from rq import Queue
 from rq.exceptions import NoSuchJobError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from service.errors import TaskRefused
+from service.queue.entries import is_wrong_type, text
 
 #: The one function name a job may carry.
 TASK_FUNCTION: Final = "graspd.task"
@@ -46,7 +47,11 @@ class AllowedJob(Job):  # type: ignore[misc]
         """A job from Redis. One that cannot be read counts as gone: it must not end the worker that took it."""
         try:
             job: AllowedJob = super().fetch(*args, **options)
-        except (NoSuchJobError, RedisError):
+        except NoSuchJobError:
+            raise
+        except RedisError as error:
+            if isinstance(error, ResponseError) and is_wrong_type(error):
+                raise NoSuchJobError(f"an entry of the queue is no job: {error}") from None
             raise
         except Exception as error:
             raise NoSuchJobError(f"an entry of the queue cannot be read: {error}") from None
@@ -72,3 +77,16 @@ class AllowedQueue(Queue):  # type: ignore[misc]
     def open(cls, name: str, connection: Any) -> AllowedQueue:
         """A queue by its name."""
         return cls(name, connection=connection, job_class=AllowedJob, serializer=JSONSerializer)
+
+    @classmethod
+    def lpop(cls, *args: Any, **options: Any) -> tuple[Any, str] | None:
+        """The next entry; one that is no text names no job, and RQ passes over it."""
+        return _readable(super().lpop(*args, **options))
+
+    @classmethod
+    def lmove(cls, *args: Any, **options: Any) -> tuple[Any, str] | None:
+        return _readable(super().lmove(*args, **options))
+
+
+def _readable(taken: tuple[Any, bytes] | None) -> tuple[Any, str] | None:
+    return None if taken is None else (taken[0], text(taken[1]))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
-from pydantic import ConfigDict
+from pydantic import BeforeValidator, ConfigDict, Field
 
-from service.domain import IngestMessage, Lane, Model, Stage, TaskMessage
+from service.domain import IngestMessage, Lane, Model, Stage, TaskMessage, Word
 from service.metrics.queue_now import QueueNow
 
 Message = TaskMessage | IngestMessage
@@ -44,23 +44,34 @@ class EventKind(StrEnum):
     """The job's state changed; `message` is the new state."""
 
 
+def _cut(value: object) -> object:
+    return value[:_LONGEST_MESSAGE] if isinstance(value, str) else value
+
+
+#: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
+HostWord = Annotated[str, Field(max_length=300)]
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
+_LONGEST_MESSAGE: Final = 2000
+
+
 class Event(Model):
     """One thing that happened to a task or a job. `total` is 0 where progress is unknown."""
 
     kind: EventKind
-    at: str
-    task_id: str = ""
-    job_id: str = ""
+    at: Annotated[str, Field(max_length=32)]
+    task_id: Word = ""
+    job_id: Word = ""
     stage: Stage | None = None
-    batch: int = 0
-    attempt: int = 0
-    worker: str = ""
-    done: float = 0.0
-    total: float = 0.0
-    message: str = ""
+    batch: Count = 0
+    attempt: Count = 0
+    worker: HostWord = ""
+    done: Amount = 0.0
+    total: Amount = 0.0
+    message: Annotated[str, BeforeValidator(_cut)] = ""
     last: bool = False
-    seconds: float = 0.0
-    output: str = ""
+    seconds: Amount = 0.0
+    output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
 
     # A newer worker may say more than an older keeper knows.
@@ -84,18 +95,18 @@ class Lease:
 class WorkerBeat:
     """What a living worker says about itself."""
 
-    name: str
-    host: str
-    pid: int
-    device: str
-    device_name: str
+    name: HostWord
+    host: HostWord
+    pid: Count
+    device: HostWord
+    device_name: HostWord
     stages: tuple[Stage, ...]
-    version: str
-    state: str
+    version: Annotated[str, Field(max_length=64)]
+    state: Annotated[str, Field(max_length=32)]
     """idle, busy or stopping."""
-    task_id: str
-    started: str
-    seen: str
+    task_id: Word
+    started: Annotated[str, Field(max_length=32)]
+    seen: Annotated[str, Field(max_length=32)]
 
 
 class TaskQueue(Protocol):

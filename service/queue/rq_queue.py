@@ -6,25 +6,23 @@ result storage are not used: each of them loses or repeats work in ways the keep
 
 from __future__ import annotations
 
-import json
 import time
-import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from typing import Any, Final
 
-from pydantic import TypeAdapter, ValidationError
 from redis import Redis
 from redis.backoff import ExponentialBackoff
 from redis.exceptions import RedisError, ResponseError
 from redis.retry import Retry
 from rq.exceptions import DuplicateJobError
 
-from service.domain import IngestMessage, Lane, Stage, TaskMessage
+from service.domain import Lane, Stage
 from service.embedded import redis_url
 from service.errors import QueueUnavailable
 from service.metrics.queue_now import QueueNow, read_queue
+from service.queue import entries
 from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
 from service.queue.port import Event, Lease, Message, WorkerBeat, lane_order
 from service.settings import Settings
@@ -35,11 +33,12 @@ EVENTS_KEPT: Final = 50_000
 WORKERS: Final = "graspd:workers"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
-_BEAT: Final = TypeAdapter(WorkerBeat)
 _GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
 _SOCKET_TIMEOUT_S: Final = 10.0
 _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
+_JOB: Final = b"rq:job:"
+_WORKER: Final = b"graspd:worker:"
 #: Later stages first: a batch that was begun is finished before the next begins.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 
@@ -92,16 +91,16 @@ class RqQueue:
             pipe.execute()
             for key in _queue_keys():
                 for job in self.connection.lrange(key, 0, -1):
-                    if task_of(job.decode())[0] in wanted:
+                    if entries.task_of(entries.text(job))[0] in wanted:
                         pipe.lrem(key, 0, job)
-                        pipe.delete(AllowedJob.key_for(job.decode()))
+                        pipe.delete(_JOB + job)
             pipe.execute()
 
     def waiting(self) -> set[str]:
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             for key in _queue_keys():
                 pipe.lrange(key, 0, -1)
-            return {task_of(job.decode())[0] for jobs in pipe.execute() for job in jobs}
+            return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
@@ -117,36 +116,37 @@ class RqQueue:
             for lane, stage in product(Lane, Stage):
                 key = f"rq:wip:{queue_name(lane, stage)}"
                 for entry, score in self.connection.zrange(key, 0, -1, withscores=True):
-                    leases.append(self._lease(key, entry.decode(), score))
+                    leases.append(self._lease(key, entry, score))
         return leases
 
-    def _lease(self, key: str, entry: str, score: float) -> Lease:
-        job = entry.partition(":")[0]
-        task, attempt = task_of(job)
-        beat = self.connection.hget(f"rq:execution:{entry}", "last_heartbeat")
-        worker, data = self.connection.hmget(AllowedJob.key_for(job), "worker_name", "data")
+    def _lease(self, key: str, entry: bytes, score: float) -> Lease:
+        job = entry.partition(b":")[0]
+        task, attempt = entries.task_of(entries.text(job))
+        (beat,) = entries.fields(self.connection, b"rq:execution:" + entry, "last_heartbeat")
+        worker, data = entries.fields(self.connection, _JOB + job, "worker_name", "data")
         return Lease(
             task_id=task,
             attempt=attempt,
-            worker=(worker or b"").decode(),
-            key=f"{key} {entry}",
-            beat=f"{score}/{(beat or b'').decode()}",
-            message=_message(data),
+            worker=entries.text(worker),
+            key=f"{key} {entry.hex()}",
+            beat=f"{score}/{entries.text(beat)}",
+            message=entries.message(data),
         )
 
     def release(self, lease: Lease) -> None:
-        key, entry = lease.key.split(" ")
+        key, _, digits = lease.key.partition(" ")
+        entry = bytes.fromhex(digits)
+        job = entry.partition(b":")[0]
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
-            pipe.delete(f"rq:execution:{entry}", f"rq:executions:{entry.partition(':')[0]}")
-            pipe.delete(AllowedJob.key_for(entry.partition(":")[0]))
+            pipe.delete(b"rq:execution:" + entry, b"rq:executions:" + job, _JOB + job)
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
         with _mapped():
-            names = sorted(name.decode() for name in self.connection.smembers(WORKERS))
-            found = self.connection.mget([worker_key(name) for name in names]) if names else []
-        return [beat for data in found if data is not None and (beat := _beat(data)) is not None]
+            names = sorted(self.connection.smembers(WORKERS))
+            found = self.connection.mget([_WORKER + name for name in names]) if names else []
+        return [beat for beat in map(entries.beat, found) if beat is not None]
 
     def publish(self, event: Event) -> None:
         with _mapped():
@@ -194,7 +194,9 @@ class RqQueue:
 
     def now(self, *, lease_s: float) -> QueueNow:
         with _mapped():
-            return read_queue(self.connection, workers_key=WORKERS, worker_key=worker_key(""), lease_s=lease_s)
+            return read_queue(
+                self.connection, workers_key=WORKERS, worker_key=_WORKER, lease_s=lease_s, read_beat=entries.beat
+            )
 
     def count(self, amounts: Mapping[str, float]) -> None:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
@@ -204,15 +206,17 @@ class RqQueue:
 
     def counted(self) -> dict[str, float]:
         with _mapped():
-            return {name.decode(): float(amount) for name, amount in self.connection.hgetall(METRICS).items()}
+            found = self.connection.hgetall(METRICS)
+        return {entries.text(name): amount for name, raw in found.items() if (amount := _amount(raw)) is not None}
 
     def tidy(self) -> None:
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
         lists = [queue_name(lane, stage) for lane, stage in product(Lane, Stage)]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            entries.sweep(self.connection, _kinds(), EVENTS)
             for name in self.connection.smembers(WORKERS):
-                if not self.connection.exists(worker_key(name.decode())):
-                    key = f"rq:worker:{name.decode()}"
+                if not self.connection.exists(_WORKER + name):
+                    key = b"rq:worker:" + name
                     pipe.delete(key)
                     for registry in ("rq:workers", *(f"rq:workers:{queue}" for queue in lists)):
                         pipe.srem(registry, key)
@@ -226,12 +230,12 @@ class RqQueue:
 
     @staticmethod
     def _events(reply: Any) -> list[tuple[str, Event]]:
-        streams = reply.values() if isinstance(reply, dict) else [entries for _, entries in reply or []]
+        streams = reply.values() if isinstance(reply, dict) else [found for _, found in reply or []]
         events = []
-        for entries in streams:
-            for entry in entries:
+        for found in streams:
+            for entry in found:
                 for event_id, fields in [entry] if isinstance(entry, tuple) else entry:
-                    if fields and (event := _event(fields.get(b"e"))):
+                    if fields and (event := entries.event(fields.get(b"e"))):
                         events.append((event_id.decode(), event))
         return events
 
@@ -271,12 +275,6 @@ def rq_id(task_id: str, attempt: int) -> str:
     return f"{task_id}-{attempt}"
 
 
-def task_of(job: str) -> tuple[str, int]:
-    """Task id and attempt of an RQ job id; a forged one is a task of its own."""
-    task, dash, attempt = job.rpartition("-")
-    return (task, int(attempt)) if dash and attempt.isdecimal() else (job, 0)
-
-
 def cancel_key(task_id: str) -> str:
     """Key that tells a worker to stop a task."""
     return f"graspd:cancel:{task_id}"
@@ -284,7 +282,7 @@ def cancel_key(task_id: str) -> str:
 
 def worker_key(name: str) -> str:
     """Key that a living worker keeps alive."""
-    return f"graspd:worker:{name}"
+    return f"{_WORKER.decode()}{name}"
 
 
 def encoded(event: Event) -> dict[str, str]:
@@ -296,27 +294,20 @@ def _queue_keys() -> list[str]:
     return [f"rq:queue:{queue_name(lane, stage)}" for lane, stage in product(Lane, Stage)]
 
 
-def _message(data: bytes | None) -> Message | None:
-    if data is None:
-        return None
+def _kinds() -> Iterator[tuple[str, str]]:
+    """Names of a fixed number, each with its type in Redis."""
+    yield from ((EVENTS, "stream"), (WORKERS, "set"), (METRICS, "hash"), ("rq:workers", "set"), ("rq:queues", "set"))
+    for lane, stage in product(Lane, Stage):
+        name = queue_name(lane, stage)
+        yield f"rq:queue:{name}", "list"
+        yield from ((f"rq:{registry}:{name}", "zset") for registry in ("wip", "failed"))
+        yield f"rq:workers:{name}", "set"
+
+
+def _amount(raw: bytes) -> float | None:
     try:
-        _name, _instance, (raw, *_), _options = json.loads(zlib.decompress(data))
-        return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
-    except Exception:  # forged data may fail anywhere
-        return None
-
-
-def _beat(data: bytes) -> WorkerBeat | None:
-    try:
-        return _BEAT.validate_json(data)
-    except ValidationError:  # forged, or of a worker much newer or older than this
-        return None
-
-
-def _event(data: bytes | None) -> Event | None:
-    try:
-        return Event.model_validate_json(data or b"")
-    except ValidationError:
+        return float(raw)
+    except ValueError:
         return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from datetime import UTC, datetime
 from pathlib import Path
@@ -74,10 +75,16 @@ def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(parts: Parts)
     assert found.valid_per_s == pytest.approx(manifest.valid / 60)
 
 
+_BUSY = {
+    "name": "w1", "host": "here", "pid": 1, "device": "cpu", "device_name": "", "stages": [], "version": "0",
+    "state": "busy", "task_id": "", "started": "", "seen": "",
+}  # fmt: skip
+
+
 def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
     rq_queue.enqueue(tasks(2), Lane.BULK)
     rq_queue.connection.sadd(WORKERS, "w1", "gone")
-    rq_queue.connection.set(worker_key("w1"), '{"device": "cpu", "state": "busy"}', px=4000)
+    rq_queue.connection.set(worker_key("w1"), json.dumps(_BUSY), px=4000)
     found = rq_queue.now(lease_s=6)
     place = (Lane.BULK, Stage.SYNTHESIZE)
     assert found.depth[place] == 2

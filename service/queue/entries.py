@@ -1,0 +1,100 @@
+"""What lies in Redis under graspd's names, read as what anybody may have written there.
+
+Whoever writes to Redis may put anything under any name. What cannot be read is nobody's: it is left out, and `sweep`
+takes away what would stand in the way for good.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from collections.abc import Iterable
+from typing import Any, Final
+
+from pydantic import TypeAdapter, ValidationError
+from redis.exceptions import ResponseError
+
+from service.domain import IngestMessage, Stage, TaskMessage
+from service.queue.port import Event, Message, WorkerBeat
+
+_BEAT: Final = TypeAdapter(WorkerBeat)
+_ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
+#: A message has a few kilobytes, whatever its few compressed bytes would unpack to.
+_MESSAGE_BYTES: Final = 1 << 20
+#: A stream takes no entry older than its newest: one so far in the future would shut it for good.
+_FUTURE_MS: Final = 24 * 3600 * 1000
+
+
+def text(raw: bytes | None) -> str:
+    """Text that every database takes; what is no UTF-8 turns into text that names nothing."""
+    return (raw or b"").decode(errors="replace")
+
+
+def task_of(job: str) -> tuple[str, int]:
+    """Task id and attempt of an RQ job id; a forged one is a task of its own."""
+    match = _ATTEMPT.fullmatch(job)
+    return (match[1], int(match[2])) if match else (job, 0)
+
+
+def fields(connection: Any, key: bytes, *names: str) -> list[bytes | None]:
+    """Fields of a hash; none of them where something else stands under its name."""
+    try:
+        return list(connection.hmget(key, *names))
+    except ResponseError as error:
+        if not is_wrong_type(error):
+            raise
+        return [None] * len(names)
+
+
+def is_wrong_type(error: Exception) -> bool:
+    """Whether Redis refused because another kind of value lies there."""
+    return str(error).startswith("WRONGTYPE")
+
+
+def message(data: bytes | None) -> Message | None:
+    """What an RQ job asks of a worker."""
+    if data is None:
+        return None
+    try:
+        raw = json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0]
+        return (IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage).model_validate(raw)
+    except Exception:  # forged data may fail anywhere
+        return None
+
+
+def beat(data: bytes | None) -> WorkerBeat | None:
+    """What a worker says of itself; None if it is forged, or of a worker much newer or older than this."""
+    try:
+        return _BEAT.validate_json(data or b"")
+    except ValidationError:
+        return None
+
+
+def event(data: bytes | None) -> Event | None:
+    """An entry of the stream of events."""
+    try:
+        return Event.model_validate_json(data or b"")
+    except ValidationError:
+        return None
+
+
+def sweep(connection: Any, kinds: Iterable[tuple[str, str]], stream: str) -> None:
+    """Remove what is not of the kind that its name says, and a stream that takes no more entries.
+
+    Args:
+        kinds: names with the type that Redis should tell of each.
+        stream: name of the stream of events.
+    """
+    expected = dict(kinds)
+    with connection.pipeline(transaction=False) as pipe:
+        for name in expected:
+            pipe.type(name)
+        found = dict(zip(expected, map(text, pipe.execute()), strict=True))
+    wrong = [name for name, kind in found.items() if kind not in ("none", expected[name])]
+    if found.get(stream) == "stream":
+        newest = int(text(connection.xinfo_stream(stream)["last-generated-id"]).partition("-")[0])
+        if newest > connection.time()[0] * 1000 + _FUTURE_MS:
+            wrong.append(stream)
+    if wrong:
+        connection.delete(*wrong)
