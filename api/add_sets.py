@@ -13,10 +13,11 @@ import typer
 from api.client import Client
 from api.dataset_client import DatasetClient
 from api.reports import open_client
-from api.uploads import UNPACK_FACTOR, json_object, name_of_upload
+from api.uploads import UNPACK_FACTOR, name_of_upload
 from service.asset_summary import verdict_line
 from service.assets import pack
 from service.cli import emit, load_settings
+from service.descriptions import json_object
 from service.domain import AssetKind
 from service.errors import InputError
 from service.object_sets import SUFFIXES, object_set, read_set

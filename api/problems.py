@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Callable
 from http import HTTPStatus
@@ -38,6 +39,10 @@ from service.errors import (
 
 MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
+_FULL_SAID: Final = "no space is left on the disk of this service; the same request succeeds when there is room"
+_LONGEST_POINTER: Final = 200
+#: Of the mistakes in one request, those that are told.
+_MOST_ERRORS: Final = 100
 
 _log = logging.getLogger("graspd.api")
 
@@ -133,7 +138,9 @@ def problem_response(
 def describe(error: Exception) -> tuple[str, str, int, str]:
     """(slug, title, status, detail) of an exception; an unforeseen one tells nothing of its inside."""
     if isinstance(error, GraspdError):
-        return error.slug, error.title, error.status, str(error) or error.title
+        return error.slug, error.title, error.status, plain(str(error)) or error.title
+    if _is_full(error) or _is_full(error.__cause__):
+        return StoreUnavailable.slug, StoreUnavailable.title, StoreUnavailable.status, _FULL_SAID
     if isinstance(error, ApiError):
         return HTTP_SLUGS.get(error.status, "internal"), HTTPStatus(error.status).phrase, error.status, str(error)
     if isinstance(error, HTTPException):
@@ -141,6 +148,16 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
         return HTTP_SLUGS.get(error.status_code, "internal"), phrase, error.status_code, str(error.detail)
     detail = "an unforeseen error; the log names it under this request id"
     return GraspdError.slug, GraspdError.title, GraspdError.status, detail
+
+
+def _is_full(error: BaseException | None) -> bool:
+    """Whether there was no room on the disk. FastAPI answers what breaks while it reads a body as a bad request."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def plain(text: str) -> str:
+    """Text that an answer can carry: JSON may name half a letter (a lone surrogate), UTF-8 cannot."""
+    return text.encode(errors="replace").decode()
 
 
 def answer(request: Request, error: Exception) -> JSONResponse:
@@ -182,7 +199,7 @@ def validation_answer(request: Request, error: RequestValidationError) -> JSONRe
         title="The body cannot be read" if is_syntax else InputError.title,
         status=400 if is_syntax else InputError.status,
         detail=detail,
-        errors=errors,
+        errors=errors[:_MOST_ERRORS],
     )
 
 
@@ -194,7 +211,8 @@ def _field_error(entry: dict[str, Any]) -> FieldError:
         message = str(entry.get("ctx", {}).get("error", message))
         tokens = []
     pointer = "#/" + "/".join(tokens) if place == "body" else ".".join(tokens)
-    return FieldError(pointer=pointer if tokens else "#", detail=message, type=str(entry["type"]))
+    where = plain(pointer) if tokens else "#"
+    return FieldError(pointer=where[:_LONGEST_POINTER], detail=plain(message), type=str(entry["type"]))
 
 
 def request_id_of(request: Request) -> str | None:

@@ -7,9 +7,10 @@ import json
 import re
 from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
-from typing import IO, Any, Final
+from typing import IO, Final
 
-from service.assets import ZipFiles, check_path
+from service.assets import ZipFiles, asset_json, check_path
+from service.descriptions import json_object
 from service.domain import AssetKind
 from service.errors import InputError, LimitError
 
@@ -58,21 +59,11 @@ def files_of_upload(
         files = {check_path(leaf): file.read()}
     if "asset.json" not in files:
         files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
+    said = asset_json(files)
     if options:
-        described = json_object(files["asset.json"], "asset.json") | json_object(options, "options")
+        described = json_object(said, "asset.json") | json_object(options, "options")
         files["asset.json"] = json.dumps(described).encode()
     return files
-
-
-def json_object(text: bytes | str, what: str) -> dict[str, Any]:
-    """A JSON object from its text; InputError if it is none."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = None
-    if not isinstance(value, dict):
-        raise InputError(f'{what} must be a JSON object such as {{"units": "mm"}}')
-    return value
 
 
 def name_of_upload(filename: str) -> str:

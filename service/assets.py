@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import shutil
 import zipfile
 import zlib
@@ -17,6 +16,7 @@ from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import IO, Final, Self
 
+from service.descriptions import MAX_BYTES, parse_description
 from service.digests import StreamedFiles, digest_bytes, digest_files
 from service.domain import Asset, AssetKind
 from service.errors import InputError, LimitError, NotFoundError
@@ -25,6 +25,9 @@ _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 #: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
+#: Of one name, and of all together: they stand in every list of hands or objects.
+MAX_NAME: Final = 255
+MAX_NAMES: Final = 128 << 10
 _PIECE_BYTES: Final = 1 << 16
 
 
@@ -152,6 +155,8 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
             # Others may ask for gigabytes of memory before the first byte.
             raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
         found[name] = entry
+    if sum(map(len, found)) > MAX_NAMES:
+        raise LimitError(f"the names of the files in the archive take more than {MAX_NAMES} characters")
     return found
 
 
@@ -182,6 +187,8 @@ def _damage_said(entry: zipfile.ZipInfo) -> Iterator[None]:
 def check_path(name: str) -> str:
     """The name itself, if it stays inside its folder; InputError otherwise."""
     path = PurePosixPath(name.replace("\\", "/"))
+    if len(name) > MAX_NAME:
+        raise InputError(f"the file name {name[:40]!r}... is longer than {MAX_NAME} characters; take a shorter one")
     if not name or path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name:
         raise InputError(f"the file name {name!r} leaves its folder; use plain relative names")
     return str(path)
@@ -218,11 +225,8 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
 
     `asset.json` of a hand may also hold palm, approach, preshape, couplings, ...; of an object units and density.
     """
-    try:
-        description = json.loads(files["asset.json"])
-        main = str(description["file"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{kind.value} {name!r}: asset.json must be a JSON object that names the main file") from None
+    described = parse_description(asset_json(files), f"{kind.value} {name!r}")
+    main = described.file
     if main not in files:
         raise InputError(f"{kind.value} {name!r}: the main file {main!r} is not among its files")
     return Asset(
@@ -234,8 +238,17 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
         size_bytes=sum(files.size(name) if isinstance(files, StreamedFiles) else len(files[name]) for name in files),
         created=created,
         builtin=builtin,
-        facts=description.get("facts", {}),
+        facts=described.facts,
     )
+
+
+def asset_json(files: Mapping[str, bytes]) -> bytes:
+    """`asset.json` among the files; InputError if it is not there, or too large to be read at all."""
+    if "asset.json" not in files:
+        raise InputError("asset.json, a JSON object that names the main file, is not among the files")
+    if isinstance(files, StreamedFiles) and files.size("asset.json") > MAX_BYTES:
+        raise InputError(f"asset.json has more than {MAX_BYTES} bytes; leave out what is not needed")
+    return files["asset.json"]
 
 
 def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:

@@ -62,7 +62,7 @@ class Model(BaseModel):
 class Fidelity(Model):
     """How much is modelled, and so what a grasp costs. Each knob is priced by `graspd chart`."""
 
-    name: str = "custom"
+    name: str = Field("custom", max_length=64)
     starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp, of which the best is kept")
     finalists: int = Field(2, ge=1, le=64, description="of these, hands that enter the fine phase")
     coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
@@ -73,7 +73,7 @@ class Fidelity(Model):
     fine_iterations: int = Field(40, ge=0, le=100_000)
     polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
     patience: int = Field(
-        10, ge=0, description="fine iterations without improvement after which a grasp is done; 0: never"
+        10, ge=0, le=100_000, description="fine iterations without improvement after which a grasp is done; 0: never"
     )
     velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
     contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
@@ -151,7 +151,9 @@ class JobOptions(Model):
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
     options: dict[
         Annotated[str, Field(max_length=40)],
-        int | Annotated[float, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=80)],
+        Annotated[int, Field(ge=-(2**53), le=2**53)]
+        | Annotated[float, Field(allow_inf_nan=False)]
+        | Annotated[str, Field(max_length=80)],
     ] = Field(
         default_factory=dict, max_length=16, description="the method's own options, such as steps; see docs/planners.md"
     )

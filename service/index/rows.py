@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 from service.domain import Asset, State
 from service.manifests import ShardManifest
@@ -11,6 +12,10 @@ from service.planning import CHAIN, plan
 from service.records import AttemptRecord, JobRecord
 
 Row = dict[str, Any]
+#: Facts, repairs and message of a hand or object stand in every list, and follow from files of a stranger's.
+_MOST_FACTS: Final = 64 << 10
+_MOST_REPAIRS: Final = 100
+_LONGEST_TEXT: Final = 2000
 
 
 def job_row(record: JobRecord) -> Row:
@@ -143,10 +148,17 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
         "builtin": asset.builtin,
         "owner": asset.owner,
         "verdict": found.get("verdict"),
-        "message": found.get("message") and clean(found["message"]),
-        "repairs": list(found.get("repairs") or []),
-        "facts": {**asset.facts, **(found.get("facts") or {})},
+        "message": found.get("message") and clean(found["message"], _LONGEST_TEXT),
+        "repairs": [clean(str(one), _LONGEST_TEXT) for one in (found.get("repairs") or [])[:_MOST_REPAIRS]],
+        "facts": _short({**asset.facts, **(found.get("facts") or {})}),
         "last_attempt": 0,
         "queued": False,
         "not_before": 0.0,
     }
+
+
+def _short(facts: dict[str, Any]) -> dict[str, Any]:
+    """Facts whole, or where they are too long, only the numbers among them; `check.json` has the rest."""
+    if len(json.dumps(facts)) <= _MOST_FACTS:
+        return facts
+    return {name[:100]: value for name, value in list(facts.items())[:100] if isinstance(value, int | float)}

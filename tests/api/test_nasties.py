@@ -1,0 +1,186 @@
+"""Requests made to break something: each gets an answer that says what is wrong with it."""
+
+from __future__ import annotations
+
+import base64
+import errno
+import io
+import json
+import os
+import tempfile
+import zipfile
+from typing import Any
+
+import pytest
+from redis.exceptions import ConnectionError as RedisAway
+from starlette.testclient import TestClient
+
+from api.keys import Key, Scope
+from api.limits import MAX_BODY_BYTES
+from api.quotas import Quotas
+from service.domain import AssetKind
+from service.errors import QuotaError
+from service.index import cursors
+from service.library import load_asset, load_check
+from service.parts import Parts
+from service.settings import Settings
+from tests.api.factories import add_job, finish_all
+
+STL = b"solid box\nendsolid box\n"
+LISTS = {
+    "/v1/jobs": ("t", "i"),
+    "/v1/shards": ("t", "i"),
+    "/v1/grasps": (0.5, "s", 1),
+    "/v1/objects": ("n", "d"),
+    "/v1/hands": ("n", "d"),
+    "/v1/datasets": ("t", "n"),
+}
+DEEP = "[" * 800 + "]" * 800
+
+
+def _cursor(*key: Any) -> str:
+    return base64.urlsafe_b64encode(json.dumps(key).encode()).decode().rstrip("=")
+
+
+def _nasty(key: tuple[Any, ...]) -> list[str]:
+    """Cursors of the right shape with a part that no database takes, in each place."""
+    bad = {str: "\ud800", int: 2**63, float: 2**63}
+    return [_cursor(*key[:i], bad[type(part)], *key[i + 1 :]) for i, part in enumerate(key)] + [_cursor(-(2**70))]
+
+
+@pytest.mark.parametrize("path", LISTS)
+def test_a_cursor_of_somebody_s_own_making_is_refused(http: TestClient, path: str) -> None:
+    for cursor in _nasty(LISTS[path]):
+        answer = http.get(path, params={"cursor": cursor})
+        assert answer.status_code == 422, cursor
+        assert "cursor" in answer.json()["detail"]
+
+
+def test_a_cursor_that_a_list_gave_out_is_taken(http: TestClient) -> None:
+    assert http.get("/v1/objects", params={"cursor": cursors.encode("a", "b")}).status_code == 200
+
+
+@pytest.mark.parametrize("row", ["9223372036854775808", "9" * 4000])
+def test_a_row_that_no_shard_has_is_no_500(http: TestClient, row: str) -> None:
+    assert http.get(f"/v1/grasps/{'0' * 32}/{row}").status_code in (404, 422)
+
+
+def test_a_range_of_4400_digits_is_no_range(http: TestClient, parts: Parts) -> None:
+    shard = finish_all(parts, add_job(parts))[0].shard_id
+    path = f"/v1/shards/{shard}/file"
+    for nasty in (f"bytes=-{'9' * 4400}", f"bytes={'9' * 4400}-", f"bytes=0-{'9' * 4400}"):
+        answer = http.get(path, headers={"Range": nasty})
+        assert (answer.status_code, len(answer.content)) == (200, parts.store.size(f"shards/base/{shard}.h5"))
+
+
+def test_a_length_of_4400_digits_is_too_large(http: TestClient) -> None:
+    assert http.post("/v1/jobs", content=b"{}", headers={"Content-Length": "9" * 4400}).status_code == 413
+
+
+@pytest.mark.parametrize(
+    "body", [b"[" * 100_000, b'{"\\ud800": 1}', b'{"hand": "\\ud800"}', b'{"hand": ' + b"9" * 5000 + b"}", b"\xff"]
+)
+@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/v1/object-sets", "/v1/datasets/estimate"])
+def test_a_body_made_to_break_the_reader_is_refused(http: TestClient, path: str, body: bytes) -> None:
+    answer = http.post(path, content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert answer.json()["type"] in ("/problems/bad-request", "/problems/invalid-input")
+
+
+def test_the_answer_to_a_thousand_mistakes_is_short(http: TestClient) -> None:
+    answer = http.post("/v1/jobs", json={f"{i:04}" * 60: i for i in range(3000)})
+    assert answer.status_code == 422
+    assert len(answer.content) < MAX_BODY_BYTES // 10
+
+
+@pytest.mark.parametrize(
+    "options", ["5", "[1]", "null", DEEP, '{"a": ' + DEEP + "}", '{"\\ud800": 1}', '{"facts": "\\udfff"}', "{" * 60_000,
+                '{"facts": 5}', '{"facts": null}', '{"facts": [1]}', '{"file": 5}', '{"licence": ["x"]}',
+                '{"density": 1' + "0" * 400 + "}", '{"density": NaN}', '{"facts": {"x": "' + "x" * 20_000 + '"}}'],
+)  # fmt: skip
+def test_upload_options_that_are_no_short_object_are_refused(http: TestClient, options: str) -> None:
+    answer = http.post("/v1/objects", files={"file": ("box.stl", STL)}, data={"options": options})
+    assert answer.status_code == 422, answer.text
+
+
+@pytest.mark.parametrize(
+    "description", [b"[" * 100_000, b"5", b"null", b"", b"\xff\xfe",
+                    b'{"file": "box.stl", "facts": {"x": ' + DEEP.encode() + b"}}",
+                    b'{"file": "box.stl", "facts": {"x": "\\ud800"}}', b" " * 10_000_000 + b'{"file": "box.stl"}'],
+    ids=str,
+)  # fmt: skip
+def test_an_asset_json_made_to_break_the_reader_is_refused(http: TestClient, description: bytes) -> None:
+    answer = http.post("/v1/objects", files={"file": ("x.zip", _zipped({"asset.json": description, "box.stl": STL}))})
+    assert answer.status_code == 422, answer.text
+    assert "asset.json" in answer.json()["detail"]
+
+
+def test_facts_of_an_upload_cannot_make_the_list_long(http: TestClient) -> None:
+    """195 KB of ZIP held facts of 200 MB, which every list of objects sent."""
+    facts = json.dumps({"file": "box.stl", "facts": {"x": "x" * 40_000_000}}).encode()
+    packed = _zipped({"asset.json": facts, "box.stl": STL})
+    assert len(packed) < 200_000
+    assert http.post("/v1/objects", files={"file": ("x.zip", packed)}).status_code == 422
+    assert len(http.get("/v1/objects").content) < 100_000
+
+
+def test_long_findings_of_a_check_do_not_make_the_list_long(http: TestClient, parts: Parts) -> None:
+    http.post("/v1/objects", files={"file": ("box.stl", STL)})
+    digest = http.get("/v1/objects/box").json()["digest"]
+    found = {"verdict": "repair", "message": "m" * 10**6, "repairs": ["r" * 10**6] * 1000}
+    found["facts"] = {"faces": 7, "names": ["n" * 1000] * 1000}
+    parts.store.put(f"assets/object/{digest}/check.json", json.dumps(found).encode())
+    kind = AssetKind.OBJECT
+    parts.index.add_asset(load_asset(parts.store, kind, digest), load_check(parts.store, kind, digest))
+    answer = http.get("/v1/objects/box")
+    assert len(answer.content) < 300_000
+    assert answer.json()["facts"] == {"faces": 7}
+
+
+def test_names_of_files_are_bounded(http: TestClient) -> None:
+    for files in ({f"{i}" * 60 + "n" * 300: b"" for i in range(3)}, {f"{i:05}" + "n" * 200: b"" for i in range(1500)}):
+        answer = http.post("/v1/objects", files={"file": ("x.zip", _zipped({**files, "box.stl": STL}))})
+        assert answer.status_code in (413, 422)
+
+
+@pytest.mark.parametrize("where", ["the body", "the archive", "the store"])
+def test_a_full_disk_is_said_and_the_upload_may_come_again(
+    http: TestClient, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> Any:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        if where == "the body":
+            patch.setattr(tempfile.SpooledTemporaryFile, "write", full)
+        elif where == "the archive":
+            patch.setattr("service.library.pack_into", full)
+        else:
+            patch.setattr("service.store.os.link", full)
+        answer = http.post("/v1/objects", files={"file": ("box.stl", STL)})
+    assert answer.status_code == 503, answer.text
+    assert answer.json()["type"] == "/problems/store-unavailable"
+    assert "space" in answer.json()["detail"]
+    assert http.post("/v1/objects", files={"file": ("box.stl", STL)}).status_code == 202
+
+
+def test_redis_that_drops_in_the_middle_of_a_claim_forgets_a_quota_not_a_job() -> None:
+    class Dropping:
+        def eval(self, *_: object) -> list[bytes]:
+            return [b"grasps", b"7"]
+
+        def hkeys(self, _: str) -> list[bytes]:
+            raise RedisAway("gone")
+
+    quotas = Quotas(Settings(quota_grasps_in_flight=10), Dropping(), lambda ids: set(ids))
+    key = Key(name="k", scope=Scope.SUBMIT, sha256="0" * 64, created="2026-01-01T00:00:00Z")
+    with pytest.raises(QuotaError, match="has 7 grasps in work"), quotas.claim(key, "j", 5):
+        pass
+
+
+def _zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
