@@ -166,11 +166,13 @@ def test_a_full_disk_is_said_and_the_upload_may_come_again(
 
 def test_redis_that_drops_in_the_middle_of_a_claim_forgets_a_quota_not_a_job() -> None:
     class Dropping:
-        def eval(self, *_: object) -> list[bytes]:
-            return [b"grasps", b"7"]
+        calls = 0
 
-        def hkeys(self, _: str) -> list[bytes]:
-            raise RedisAway("gone")
+        def eval(self, *_: object) -> list[bytes]:
+            self.calls += 1
+            if self.calls == 2:
+                raise RedisAway("gone")
+            return [b"grasps", b"7"]
 
     quotas = Quotas(Settings(quota_grasps_in_flight=10), Dropping(), lambda ids: set(ids))
     key = Key(name="k", scope=Scope.SUBMIT, sha256="0" * 64, created="2026-01-01T00:00:00Z")
