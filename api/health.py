@@ -51,7 +51,8 @@ class Probes:
 
     def _others(self) -> tuple[bool, int]:
         try:
-            return self._parts.queue.announced(KEEPER), len(self._parts.queue.workers())
+            fit = [beat for beat in self._parts.queue.workers() if beat.state != "quarantined"]
+            return self._parts.queue.announced(KEEPER), len(fit)
         except UnavailableError:
             return False, 0
 

@@ -128,8 +128,9 @@ class Supervisor:
         try:
             if not queue.announced(KEEPER):
                 missing.append("keeper")
-            if len(queue.workers()) < self._workers:
-                missing.append("workers")
+            beats = queue.workers()
+            if sum(beat.state != "quarantined" for beat in beats) < self._workers:
+                missing.append("; ".join(["workers", *sorted({beat.reason for beat in beats if beat.reason})]))
         except UnavailableError:
             missing += ["redis"]
         if self._api and not missing and not self._api_is_ready():

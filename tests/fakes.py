@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import time
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from service.planning import message_of, plan
 from service.records import JobRecord
 from service.store import Store
 from worker.context import TaskContext
+from worker.selfcheck import EngineError
 from worker.stages.output import Output, shard_of
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
@@ -106,6 +109,12 @@ def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes:
     return message_of(job, task, attempt=attempt, max_attempt=3)
 
 
+def hold_interpreter(seconds: float) -> None:
+    """Let no other Python of this process run for that long, as a compiler called without releasing the lock does."""
+    if seconds > 0:
+        ctypes.PyDLL(None).usleep(int(seconds * 1e6))
+
+
 def _pretend_to_work(context: TaskContext) -> None:
     seconds = float(os.environ.get("FAKE_SECONDS", "0"))
     end = time.monotonic() + seconds
@@ -118,7 +127,8 @@ def _pretend_to_work(context: TaskContext) -> None:
 def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
-    FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps.
+    FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how long
+    each task holds the interpreter lock, and while there is a file FAKE_BROKEN nothing works.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
@@ -130,13 +140,20 @@ def main() -> None:
     poison = os.environ.get("FAKE_POISON")
     leaked: list[bytes] = []
 
+    def check(stages: Collection[Stage]) -> None:
+        if os.path.exists(os.environ.get("FAKE_BROKEN", "")):
+            raise EngineError("no kernel can be loaded")
+
     def synthesize(message: TaskMessage, context: TaskContext) -> Output:
+        if os.path.exists(os.environ.get("FAKE_BROKEN", "")):
+            raise ImportError("libengine.so")
+        hold_interpreter(float(os.environ.get("FAKE_LOCK_S", "0")))
         if str(message.batch) == poison:
             os.kill(os.getpid(), 9)
         leaked.append(os.urandom(2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 
-    sys.exit(0 if run_worker(settings, table=table | {Stage.SYNTHESIZE: synthesize}) else 1)
+    sys.exit(0 if run_worker(settings, table=table | {Stage.SYNTHESIZE: synthesize}, check=check) else 1)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 import socket
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -43,8 +46,15 @@ def worker(
     ended_well = run_worker(
         settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
     )
-    if not ended_well:
-        raise typer.Exit(1)
+    _end(0 if ended_well else 1)
+
+
+def _end(code: int) -> None:
+    """End at once: taking Warp and its kernels apart takes the interpreter seconds, and nothing is left to be saved."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def check_worker(settings: Settings) -> None:

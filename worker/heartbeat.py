@@ -1,33 +1,25 @@
-"""Signs of life from a thread of its own, so that a launch that takes minutes does not cost the lease.
-
-Warp releases the interpreter lock while a kernel runs, so the thread keeps its time.
-"""
+"""The worker's side of its signs of life: what it is at, for `worker.pulse`, and what comes back from there."""
 
 from __future__ import annotations
 
 import json
 import logging
 import os
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from redis.exceptions import RedisError
-
-from service.clock import timestamp
-from service.queue.port import Event, EventKind, WorkerBeat
-from service.queue.rq_queue import EVENTS, EVENTS_KEPT, WORKERS, cancel_key, encoded, worker_key
+from service.queue.port import WorkerBeat
+from service.queue.rq_queue import EVENTS, EVENTS_KEPT, WORKERS, cancel_key, worker_key
 from worker.context import StopReason, TaskContext
 
 log = logging.getLogger(__name__)
-#: A cancelled task must stop within two seconds, so the key that says so is read twice in that time.
-_LONGEST_INTERVAL_S: Final = 0.8
-#: How long Redis keeps a lease without a beat [s]: much longer than the keeper, which watches beats, takes to act.
-LEASE_KEPT_S: Final = 3600
-#: Time a task has to notice that it must stop before its worker gives itself up [s].
-STUCK_AFTER_S: Final = 60.0
+_RESTART_PAUSE_S: Final = 0.5
+#: What leaving may take [s]: a round trip to Redis.
+_LEAVE_S: Final = 3.0
 
 
 @dataclass
@@ -36,103 +28,158 @@ class Hold:
 
     task_id: str
     context: TaskContext
-    execution: Any
-    registry: Any
+    entry: str
+    """Of the lease in its registry."""
+    registry: str
     timeout_s: float
-    started: float
+
+    @classmethod
+    def of(cls, task_id: str, context: TaskContext, execution: Any, registry: Any, timeout_s: float) -> Hold:
+        """The hold on an execution of RQ."""
+        return cls(task_id, context, execution.composite_key, registry.key, timeout_s)
+
+    def keys(self) -> dict[str, str]:
+        """What the pulse needs to keep the lease."""
+        return {
+            "entry": self.entry,
+            "registry": self.registry,
+            "execution": f"rq:execution:{self.entry}",
+            "executions": f"rq:executions:{self.entry.partition(':')[0]}",
+            "cancel": cancel_key(self.task_id),
+        }
 
 
 class Heartbeat:
     """Keeps a worker's registration and the lease of its task alive, and listens for cancellation."""
 
-    def __init__(
-        self,
-        connection: Any,
-        beat: WorkerBeat,
-        *,
-        lease_s: float,
-        give_up: Callable[[Hold], None] | None = None,
-    ) -> None:
-        self._connection = connection
+    def __init__(self, url: str, beat: WorkerBeat, *, lease_s: float) -> None:
+        """`url` is that of Redis."""
         self._beat = asdict(beat)
-        self._lease_s = lease_s
-        self._interval_s = min(_LONGEST_INTERVAL_S, lease_s / 3)
-        self._give_up = give_up or _exit
+        self._place = place_of(beat.name, lease_s) | {"url": url}
         self._hold: Hold | None = None
-        self._lock = threading.Lock()
-        self._stop = threading.Event()
+        self._limit: dict[str, Any] | None = None
+        self._lock = threading.RLock()
+        self._pending = False
+        self._stopping = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def start(self) -> None:
+        self._spawn()
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread and the registration, and say that this worker is not lost."""
-        self._stop.set()
-        self._thread.join(timeout=5.0)
-        try:
-            with self._connection.pipeline() as pipe:
-                pipe.delete(worker_key(self._beat["name"]))
-                pipe.srem(WORKERS, self._beat["name"])
-                left = Event(kind=EventKind.LEFT, at=timestamp(), worker=self._beat["name"])
-                pipe.xadd(EVENTS, encoded(left), maxlen=EVENTS_KEPT, approximate=True)
-                pipe.execute()
-        except RedisError:
-            log.debug("Redis was away when the worker left")
+        """End the pulse and the registration, and say that this worker is not lost."""
+        self._stopping.set()
+        deadline = time.monotonic() + _LEAVE_S
+        while not self._write({"beat": self._beat, "leave": True}) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        with self._lock:
+            process, self._process = self._process, None
+        if process is not None and process.stdin is not None:
+            process.stdin.close()
+            try:
+                process.wait(timeout=max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._thread.join(timeout=1.0)
+
+    @property
+    def pid(self) -> int | None:
+        """Of the pulse."""
+        return self._process.pid if self._process is not None else None
 
     def hold(self, hold: Hold | None, *, state: str | None = None) -> None:
         """The task in hand from now on, or None."""
         with self._lock:
             self._hold = hold
-            self._beat["task_id"] = hold.task_id if hold else ""
-            self._beat["state"] = state or ("busy" if hold else "idle")
+            self._limit = {"id": hold.entry, "seconds": hold.timeout_s} if hold else None
+            self.update(task_id=hold.task_id if hold else "", state=state or ("busy" if hold else "idle"))
+
+    def limit(self, what: str, seconds: float) -> None:
+        """Something besides a task that must end within a time, or else the worker is ended."""
+        with self._lock:
+            self._limit = {"id": what, "seconds": seconds} if what else None
+            self._tell()
 
     def stopping(self) -> None:
         """The worker takes no further task."""
-        self._beat["state"] = "stopping"
+        self.update(state="stopping")
 
     def update(self, **facts: str) -> None:
-        """Facts that were not known at the start, such as the name of the device."""
-        self._beat.update(facts)
+        """Facts that changed, such as the state, or the name of the device."""
+        with self._lock:
+            self._beat.update(facts)
+            self._tell()
+
+    def _tell(self) -> None:
+        now_at = {"beat": self._beat, "limit": self._limit, "hold": self._hold.keys() if self._hold else None}
+        # A pulse that is not there yet, or busy, gets the news after its next beat.
+        self._pending = not self._write(now_at)
+
+    def _write(self, line: dict[str, Any]) -> bool:
+        """Whether the pulse has the line; it never waits, and a line (under 4 KiB) is written whole or not at all."""
+        with self._lock:
+            if self._process is None or self._process.stdin is None:
+                return True
+            try:
+                os.write(self._process.stdin.fileno(), json.dumps(line).encode() + b"\n")
+            except BlockingIOError:
+                return False
+            except (OSError, ValueError):  # it ended; the next one is told
+                pass
+            return True
+
+    def _spawn(self) -> None:
+        with self._lock:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "worker.pulse", str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,
+            )
+            assert self._process.stdin is not None
+            os.set_blocking(self._process.stdin.fileno(), False)
+            self._write(self._place)
+            self._tell()
 
     def _run(self) -> None:
-        while not self._stop.is_set():
-            with self._lock:
-                hold = self._hold
+        """Listen; start the pulse again should it end (killed for memory, say)."""
+        while not self._stopping.is_set():
+            process = self._process
+            if process is not None and process.stdout is not None:
+                with process.stdout:
+                    for line in process.stdout:
+                        self._hear(line.decode(errors="replace").rstrip("\n"))
+                if self._stopping.is_set():
+                    return
+                if process.stdin is not None:
+                    process.stdin.close()
+                log.warning("the signs of life stopped (exit code %s); they are started again", process.wait())
+            self._stopping.wait(_RESTART_PAUSE_S)
             try:
-                self._tick(hold)
-            except RedisError as error:
-                log.warning("no sign of life could be given: %s", error)
-            except Exception:
-                log.exception("the heartbeat goes on after an error")
-            self._stop.wait(self._interval_s)
+                if not self._stopping.is_set():
+                    self._spawn()
+            except OSError as error:
+                self._process = None
+                log.warning("the signs of life cannot be started: %s", error)
 
-    def _tick(self, hold: Hold | None) -> None:
-        if hold is not None:
-            self._watch_time(hold)
-        lease = max(2, round(self._lease_s))
-        with self._connection.pipeline() as pipe:
-            pipe.set(worker_key(self._beat["name"]), json.dumps(self._beat | {"seen": timestamp()}), ex=lease)
-            pipe.sadd(WORKERS, self._beat["name"])
-            if hold is not None:
-                hold.execution.heartbeat(hold.registry, LEASE_KEPT_S, pipeline=pipe)
-                pipe.zscore(hold.registry.key, hold.execution.composite_key)
-                pipe.exists(cancel_key(hold.task_id))
-            results = pipe.execute()
-        if hold is not None:
-            if results[-1]:
-                hold.context.stop(StopReason.CANCELLED)
-            elif results[-2] is None:
-                hold.context.stop(StopReason.LEASE_LOST)
-
-    def _watch_time(self, hold: Hold) -> None:
-        running = time.monotonic() - hold.started
-        if running > hold.timeout_s:
-            hold.context.stop(StopReason.TIMEOUT)
-        if running > hold.timeout_s + STUCK_AFTER_S:
-            self._give_up(hold)
+    def _hear(self, line: str) -> None:
+        word, _, about = line.partition("\t")
+        with self._lock:
+            if word == "." and self._pending:
+                self._tell()
+            elif word in set(StopReason) and self._hold is not None and about == self._hold.entry:
+                self._hold.context.stop(StopReason(word))
 
 
-def _exit(hold: Hold) -> None:
-    log.critical("task %s does not stop; the worker ends itself and the task is taken from it", hold.task_id)
-    os._exit(70)
+def place_of(name: str, lease_s: float) -> dict[str, Any]:
+    """What the pulse of a worker must know of the queue's keys."""
+    return {
+        "worker": worker_key(name),
+        "workers": WORKERS,
+        "events": EVENTS,
+        "events_kept": EVENTS_KEPT,
+        "lease_s": lease_s,
+    }

@@ -11,7 +11,6 @@ import os
 import secrets
 import signal
 import socket
-import time
 from collections.abc import Collection, Mapping
 from typing import Any, Final
 
@@ -21,6 +20,7 @@ from rq.timeouts import BaseDeathPenalty
 
 from service.clock import timestamp
 from service.domain import Stage
+from service.embedded import redis_url
 from service.errors import QueueUnavailable
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.port import Event, EventKind, WorkerBeat
@@ -30,9 +30,12 @@ from service.store import Store, open_store
 from service.version import PACKAGE_VERSION
 from worker.context import StopReason, TaskContext
 from worker.devices import Device
-from worker.heartbeat import LEASE_KEPT_S, Heartbeat, Hold
+from worker.fitness import Check, Fitness
+from worker.heartbeat import Heartbeat, Hold
 from worker.memory import limit_mb, resident_mb
+from worker.pulse import LEASE_KEPT_S
 from worker.runner import Runner, StageFunction
+from worker.selfcheck import check_engine
 from worker.stages import stage_table
 
 log = logging.getLogger(__name__)
@@ -67,6 +70,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         runner: Runner,
         heart: Heartbeat,
         surroundings: Surroundings,
+        fitness: Fitness,
         *,
         stages: Collection[Stage],
         name: str,
@@ -83,7 +87,10 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._runner = runner
         self._heart = heart
         self._surroundings = surroundings
+        self._fitness = fitness
         self._stages, self._taken = stages, 0
+        self.gave_up = False
+        """Whether it ended because it is unfit for tasks."""
         self.makes_room = False
         """Whether it ended so that its supervisor starts a fresh one."""
         self._context: TaskContext | None = None
@@ -98,15 +105,15 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._outcome = None
         self.prepare_execution(job)
         self._context = self._surroundings.context(_raw(job), self._queue, self.name)
-        hold = Hold(
-            task_id=job.id.rpartition("-")[0],
-            context=self._context,
-            execution=self.execution,
-            registry=job.started_job_registry,
-            timeout_s=self._surroundings.settings.task_timeout_s,
-            started=time.monotonic(),
+        self._heart.hold(
+            Hold.of(
+                job.id.rpartition("-")[0],
+                self._context,
+                self.execution,
+                job.started_job_registry,
+                self._surroundings.settings.task_timeout_s,
+            )
         )
-        self._heart.hold(hold)
         try:
             self.perform_job(job, queue)
         finally:
@@ -114,6 +121,9 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._context = None
         self._tell_outcome()
         self._surroundings.tasks_done += 1
+        if self._fitness.reason and not self._stop_requested:
+            self.gave_up = not self._fitness.sit_out(self._stages, self._heart, lambda: self._stop_requested)
+            self._stop_requested = self._stop_requested or self.gave_up
         if why := self._surroundings.outgrown():
             log.info("this worker ends for a fresh one to start: %s", why)
             self._heart.stopping()
@@ -226,6 +236,7 @@ def run_worker(
     *,
     stages: Collection[Stage] = tuple(Stage),
     table: Mapping[Stage, StageFunction] | None = None,
+    check: Check | None = None,
     burst: bool = False,
     max_tasks: int | None = None,
 ) -> bool:
@@ -233,6 +244,7 @@ def run_worker(
 
     Args:
         table: what each stage does; the real ones by default.
+        check: of what they run on, before the first task and in doubt; that of the real engine if the stages are.
 
     Returns:
         False if the worker ended because something broke.
@@ -246,18 +258,40 @@ def run_worker(
     device = Device(settings.device)
     store = open_store(settings.resolved_store_url)
     queue.ping()
-    heart = Heartbeat(queue.connection, _first_beat(name, device, stages), lease_s=settings.lease_s)
-    runner = Runner(table if table is not None else stage_table(), worker=name, publish=queue.publish)
+    heart = Heartbeat(redis_url(settings), _first_beat(name, device, stages), lease_s=settings.lease_s)
+    if table is None:
+        table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
+    fitness = Fitness(store, check)
+    runner = Runner(table, worker=name, publish=queue.publish, fitness=fitness)
     surroundings = Surroundings(settings, store, device)
-    worker = GraspWorker(queue, runner, heart, surroundings, stages=stages, name=name)
+    worker = GraspWorker(queue, runner, heart, surroundings, fitness, stages=stages, name=name)
+    does_all = not burst and max_tasks is None
     heart.start()
-    device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
     try:
+        device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
+        if not _admitted(fitness, heart, stages, limit_s=settings.task_timeout_s, patient=does_all):
+            return False
         worker.work(burst=burst, max_jobs=max_tasks, logging_level="WARNING")
     finally:
         heart.stop()
         queue.close()
-    return burst or max_tasks is not None or worker.was_told_to_stop or worker.makes_room
+    return not worker.gave_up and (not does_all or worker.was_told_to_stop or worker.makes_room)
+
+
+def _admitted(fitness: Fitness, heart: Heartbeat, stages: Collection[Stage], *, limit_s: float, patient: bool) -> bool:
+    """Check the engine before the first task; a worker that is patient waits in quarantine until it passes.
+
+    A signal to stop ends the process at once here: it holds no task.
+    """
+    heart.update(state="checking")
+    heart.limit("the check of the engine", limit_s)
+    # The dearest part of the engine; what the other stages add is loaded by their first task, and checked in doubt.
+    first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else tuple(stages)
+    fit = fitness.try_engine(first) or (patient and fitness.sit_out(first, heart, lambda: False))
+    heart.limit("", 0.0)
+    if fit:
+        heart.update(state="idle")
+    return fit
 
 
 def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerBeat:
@@ -270,7 +304,7 @@ def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerB
         device_name=device.name,
         stages=tuple(stages),
         version=PACKAGE_VERSION,
-        state="idle",
+        state="checking",
         task_id="",
         started=now,
         seen=now,

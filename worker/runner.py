@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -19,6 +21,7 @@ from service.queue.port import Event, EventKind, Message
 from service.records import AttemptRecord, put_record
 from service.version import STAGE_REVISIONS, TASK_SCHEMA
 from worker.context import StopReason, TaskContext
+from worker.fitness import Fitness
 from worker.stages.output import Output, shard_of
 
 log = logging.getLogger(__name__)
@@ -36,10 +39,13 @@ _STOPPED: Final = {
 class Runner:
     """Does tasks one after the other with a table of stages."""
 
-    def __init__(self, stages: Mapping[Stage, StageFunction], *, worker: str, publish: Publish) -> None:
+    def __init__(
+        self, stages: Mapping[Stage, StageFunction], *, worker: str, publish: Publish, fitness: Fitness | None = None
+    ) -> None:
         self._stages = stages
         self._worker = worker
         self._publish = publish
+        self._fitness = fitness
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         """Do a task.
@@ -77,6 +83,13 @@ class Runner:
         except UnavailableError as error:
             return self._event(EventKind.DEFERRED, message, message=str(error))
         except Exception as error:
+            if is_disk_full(error):
+                return self._event(
+                    EventKind.DEFERRED, message, message=f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
+                )
+            if self._fitness is not None and (why := self._fitness.doubt(message, error)):
+                log.warning("the task is handed back; it failed because of this worker", exc_info=True)
+                return self._event(EventKind.RETURNED, message, message=why)
             return self._failed(message, error, context, started)
         finally:
             log.info("%s took %.2f s", message.stage, time.monotonic() - clock)
@@ -96,6 +109,8 @@ class Runner:
             context.check()
             manifest, data = shard_of(message, made, device=context.device, seconds=seconds, worker=self._worker)
             publish_shard(context.store, manifest, data)
+        if self._fitness is not None:
+            self._fitness.passed()
         return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
     def _is_done(self, message: Message, context: TaskContext) -> bool:
@@ -175,6 +190,15 @@ def _subjects(message: Message) -> dict[str, Any]:
 def output_of(message: Message) -> str:
     """What the task makes: a shard id, or kind and digest of the asset it checks."""
     return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
+
+
+def is_disk_full(error: BaseException | None) -> bool:
+    """Whether an error, or what it came from, is a disk (or a quota) without room."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _one_line(error: Exception) -> str:

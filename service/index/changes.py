@@ -148,10 +148,11 @@ class Changes(Database):
                 "device_name": clean(beat.device_name, 128),
                 "stages": [stage.value for stage in beat.stages],
                 "version": clean(beat.version, 32),
-                "state": clean(beat.state, 10),
+                "state": clean(beat.state, 16),
                 "task_id": clean(beat.task_id, 32) or None,
                 "started": beat.started,
                 "seen": beat.seen,
+                "reason": clean(beat.reason, 300),
             }
             for beat in beats
         ]
@@ -159,7 +160,7 @@ class Changes(Database):
             upsert(connection, workers, rows)
             gone = workers.c.name.not_in([beat.name for beat in beats])
             lost = update(workers).where(gone, workers.c.seen < lost_before)
-            connection.execute(lost.values(state="lost", task_id=None))
+            connection.execute(lost.values(state="lost", task_id=None, reason=""))
             connection.execute(delete(workers).where(gone, workers.c.seen < forget_before))
 
     def forget_worker(self, name: str) -> None:

@@ -186,10 +186,11 @@ workers: Final = Table(
     Column("device_name", String(128), nullable=False),
     Column("stages", JSON, nullable=False),
     Column("version", String(32), nullable=False),
-    Column("state", String(10), nullable=False),
+    Column("state", String(16), nullable=False),
     Column("task_id", String(32)),
     Column("started", String(32), nullable=False),
     Column("seen", String(32), nullable=False),
+    Column("reason", String(300), nullable=False, server_default=""),
 )
 
 #: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.

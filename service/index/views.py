@@ -172,10 +172,11 @@ class WorkerView(View):
     device_name: str
     stages: list[Stage]
     version: str
-    state: str = Field(description="idle, busy, stopping or lost")
+    state: str = Field(description="checking, idle, busy, stopping, quarantined or lost")
     task_id: str | None
     started: str
     seen: str
+    reason: str = Field("", description="why it is in quarantine")
 
 
 class FailureGroup(View):

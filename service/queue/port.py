@@ -103,10 +103,12 @@ class WorkerBeat:
     stages: tuple[Stage, ...]
     version: Annotated[str, Field(max_length=64)]
     state: Annotated[str, Field(max_length=32)]
-    """idle, busy or stopping."""
+    """checking, idle, busy, stopping or quarantined."""
     task_id: Word
     started: Annotated[str, Field(max_length=32)]
     seen: Annotated[str, Field(max_length=32)]
+    reason: Annotated[str, Field(max_length=300)] = ""
+    """Why it is in quarantine."""
 
 
 class TaskQueue(Protocol):

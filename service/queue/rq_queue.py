@@ -13,9 +13,7 @@ from itertools import product
 from typing import Any, Final
 
 from redis import Redis
-from redis.backoff import ExponentialBackoff
 from redis.exceptions import RedisError, ResponseError
-from redis.retry import Retry
 from rq.exceptions import DuplicateJobError
 
 from service.domain import Lane, Stage
@@ -24,6 +22,7 @@ from service.errors import QueueUnavailable
 from service.metrics.queue_now import QueueNow, read_queue
 from service.queue import entries
 from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
+from service.queue.connection import connect
 from service.queue.port import Event, Lease, Message, WorkerBeat, lane_order
 from service.settings import Settings
 
@@ -35,8 +34,6 @@ WORKERS: Final = "graspd:workers"
 METRICS: Final = "graspd:metrics"
 _GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
-_SOCKET_TIMEOUT_S: Final = 10.0
-_NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
 _JOB: Final = b"rq:job:"
 _WORKER: Final = b"graspd:worker:"
 #: Later stages first: a batch that was begun is finished before the next begins.
@@ -238,21 +235,6 @@ class RqQueue:
                     if fields and (event := entries.event(fields.get(b"e"))):
                         events.append((event_id.decode(), event))
         return events
-
-
-def connect(url: str, *, patience: int = 3) -> Redis:
-    """A client that reconnects by itself; `patience` is how often it tries before it gives up."""
-    over_network: dict[str, Any] = {} if url.startswith("unix:") else _NETWORK
-    try:
-        return Redis.from_url(
-            url,
-            **over_network,
-            socket_timeout=_SOCKET_TIMEOUT_S,
-            health_check_interval=30,
-            retry=Retry(ExponentialBackoff(cap=1.0, base=0.05), patience),
-        )
-    except (ValueError, TypeError) as error:
-        raise QueueUnavailable(f"the Redis URL cannot be used: {error}; give redis://, rediss:// or unix://") from None
 
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:

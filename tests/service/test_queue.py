@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import pytest
@@ -19,7 +19,8 @@ from service.queue.port import BULK_EVERY, Event, EventKind, TaskQueue, WorkerBe
 from service.queue.rq_queue import RqQueue, queue_names, worker_key
 from tests.fakes import request
 from worker.context import StopReason, TaskContext
-from worker.heartbeat import Heartbeat, Hold
+from worker.heartbeat import Heartbeat, Hold, place_of
+from worker.pulse import Pulse
 
 DIGEST = "0" * 32
 
@@ -103,11 +104,10 @@ class RqSide:
         return TaskMessage.model_validate(self.job.args[0])
 
     def beat(self) -> StopReason | None:
-        time.sleep(0.01)
-        registry = self.job.started_job_registry
         task_id = self.job.id.rpartition("-")[0]
-        hold = Hold(task_id, self.context, self.execution, registry, timeout_s=60, started=time.monotonic())
-        Heartbeat(self.connection, beat_of(self.name), lease_s=6)._tick(hold)
+        hold = Hold.of(task_id, self.context, self.execution, self.job.started_job_registry, timeout_s=60)
+        for word in one_beat(self.connection, self.name, hold):
+            self.context.stop(StopReason(word))
         return self.context.stop_reason
 
     def finish(self) -> None:
@@ -115,6 +115,15 @@ class RqSide:
             self.execution.delete(job=self.job, pipeline=pipe)
             pipe.delete(self.job.key)
             pipe.execute()
+
+
+def one_beat(connection: Any, name: str, hold: Hold | None = None) -> list[str]:
+    """Of a worker; returns why its task must stop."""
+    said: list[str] = []
+    pulse = Pulse(connection, place_of(name, 6), tell=lambda word, entry: said.append(word), end_worker=said.append)
+    pulse.take({"beat": asdict(beat_of(name)), "hold": hold.keys() if hold else None})
+    pulse.tick()
+    return said
 
 
 def beat_of(name: str) -> WorkerBeat:
@@ -286,11 +295,11 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) 
     assert not queue.announced("keeper")
 
 
-def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue) -> None:
-    heart = Heartbeat(rq_queue.connection, beat_of("alive"), lease_s=6)
+def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redis_server: str) -> None:
+    heart = Heartbeat(redis_server, beat_of("alive"), lease_s=6)
     heart.start()
     try:
-        deadline = time.monotonic() + 5
+        deadline = time.monotonic() + 20
         while not rq_queue.workers() and time.monotonic() < deadline:
             time.sleep(0.01)
         (found,) = rq_queue.workers()
@@ -327,8 +336,7 @@ def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
         job_class=AllowedJob,
     )
     worker.register_birth()
-    heart = Heartbeat(rq_queue.connection, beat_of("dead"), lease_s=6)
-    heart._tick(None)
+    one_beat(rq_queue.connection, "dead")
     rq_queue.tidy()
     assert [beat.name for beat in rq_queue.workers()] == ["dead"], "it lives"
     rq_queue.connection.delete(worker_key("dead"))  # as its time to live does
@@ -345,7 +353,7 @@ def test_a_lost_consumer_group_is_made_again(rq_queue: RqQueue) -> None:
 
 @pytest.mark.parametrize("data", [b"rubbish", b"{}", b"[]", b'{"name": 1}', b"\xff"])
 def test_a_forged_worker_is_left_out_and_hides_no_other(rq_queue: RqQueue, data: bytes) -> None:
-    Heartbeat(rq_queue.connection, beat_of("true"), lease_s=6)._tick(None)
+    one_beat(rq_queue.connection, "true")
     rq_queue.connection.sadd("graspd:workers", "forged")
     rq_queue.connection.set(worker_key("forged"), data)
     assert [beat.name for beat in rq_queue.workers()] == ["true"]

@@ -2,61 +2,46 @@
 
 from __future__ import annotations
 
-import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
 import time
-from types import SimpleNamespace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from typing import Any
 
 import pytest
-from redis.exceptions import ConnectionError as RedisConnectionError
 
 from service.clock import timestamp
 from service.domain import Stage
-from service.queue.port import WorkerBeat
+from service.queue.port import EventKind, WorkerBeat
+from service.queue.rq_queue import RqQueue, worker_key
 from service.store import open_store
+from tests.fakes import hold_interpreter
 from worker.context import StopReason, TaskContext
-from worker.heartbeat import STUCK_AFTER_S, Heartbeat, Hold
+from worker.heartbeat import Heartbeat, Hold, place_of
+from worker.pulse import STUCK_AFTER_S, Pulse, is_stopped
 
-INTERVAL_S = 0.05
-
-
-class FakeRedis:
-    """Counts what the heartbeat sends."""
-
-    def __init__(self) -> None:
-        self.beats: list[float] = []
-        self.answers: list[Any] = [True, 1, None, 1.0, 0]
-        self.away = False
-
-    def pipeline(self) -> FakeRedis:
-        return self
-
-    def __enter__(self) -> FakeRedis:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *args, **kwargs: None
-
-    def execute(self) -> list[Any]:
-        if self.away:
-            raise RedisConnectionError("away")
-        self.beats.append(time.monotonic())
-        return self.answers
+LEASE_S = 2.0
+ENTRY = "task-1:execution"
 
 
-def make(redis: FakeRedis, **options: Any) -> Heartbeat:
+def beat_of(state: str = "idle") -> WorkerBeat:
     now = timestamp()
-    beat = WorkerBeat("w", "h", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
-    return Heartbeat(redis, beat, lease_s=3 * INTERVAL_S, **options)
+    return WorkerBeat("w", "h", 1, "cpu", "CPU", tuple(Stage), "0", state, "", now, now)
 
 
-def hold(context: TaskContext, *, timeout_s: float = 60.0, started: float | None = None) -> Hold:
-    execution = SimpleNamespace(heartbeat=lambda *args, **kwargs: None, composite_key="k")
-    registry = SimpleNamespace(key="r")
-    return Hold("t", context, execution, registry, timeout_s, time.monotonic() if started is None else started)
+def hold_of(context: TaskContext) -> Hold:
+    return Hold("task", context, ENTRY, "registry", timeout_s=60.0)
+
+
+def until(met: Callable[[], Any], what: str, seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < end, f"after {seconds} s still not: {what}"
+        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -64,60 +49,154 @@ def context() -> TaskContext:
     return TaskContext(open_store("memory://"))
 
 
-def test_it_beats_through_a_call_that_never_comes_back_to_python() -> None:
-    redis = FakeRedis()
-    heart = make(redis)
+@pytest.fixture
+def heart(rq_queue: RqQueue, redis_server: str) -> Iterator[Heartbeat]:
+    """A heart whose first beat was seen."""
+    heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S)
     heart.start()
-    start = time.monotonic()
-    # One call into C of about a second that releases the interpreter lock, as a kernel launch of Warp does.
-    hashlib.pbkdf2_hmac("sha256", b"password", b"salt", 1_500_000)
-    busy = time.monotonic() - start
+    until(lambda: rq_queue.connection.exists(worker_key("w")), "the first beat")
+    yield heart
     heart.stop()
-    within = [beat for beat in redis.beats if start < beat < start + busy]
-    assert busy > 4 * INTERVAL_S
-    # A loaded machine may skip some; half of them is many times what the lease needs.
-    assert len(within) >= busy / INTERVAL_S / 2
 
 
-def test_redis_away_for_a_while_is_survived() -> None:
-    redis = FakeRedis()
-    heart = make(redis)
-    redis.away = True
-    heart.start()
-    time.sleep(4 * INTERVAL_S)
-    redis.away = False
-    deadline = time.monotonic() + 5
-    while not redis.beats and time.monotonic() < deadline:
-        time.sleep(0.01)
-    heart.stop()
-    assert redis.beats
+def test_it_beats_while_nothing_else_in_the_process_can_run(heart: Heartbeat, rq_queue: RqQueue) -> None:
+    begun = timestamp()
+    hold_interpreter(1.5 * LEASE_S)
+    ended = timestamp()
+    beat = json.loads(rq_queue.connection.get(worker_key("w")) or b'{"seen": ""}')
+    # Half a lease before the end the registration of a worker without a beat would have ended.
+    assert begun < beat["seen"] < ended
 
 
-def test_a_cancelled_task_hears_of_it(context: TaskContext) -> None:
-    redis = FakeRedis()
-    redis.answers[-1] = 1
-    make(redis)._tick(hold(context))
+def test_a_cancelled_task_hears_of_it(heart: Heartbeat, rq_queue: RqQueue, context: TaskContext) -> None:
+    rq_queue.connection.zadd("registry", {ENTRY: 1.0})
+    heart.hold(hold_of(context))
+    until(lambda: (rq_queue.connection.zscore("registry", ENTRY) or 0.0) > 1.0, "the lease is renewed")
+    assert context.stop_reason is None
+    rq_queue.discard(["task"])
+    until(lambda: context.stop_reason, "the task hears of it")
     assert context.stop_reason is StopReason.CANCELLED
 
 
-def test_a_task_whose_lease_was_taken_hears_of_it(context: TaskContext) -> None:
-    redis = FakeRedis()
-    redis.answers[-2] = None
-    make(redis)._tick(hold(context))
+def test_a_task_whose_lease_was_taken_hears_of_it(heart: Heartbeat, context: TaskContext) -> None:
+    heart.hold(hold_of(context))
+    until(lambda: context.stop_reason, "the task hears of it")
     assert context.stop_reason is StopReason.LEASE_LOST
 
 
-def test_a_task_is_stopped_when_its_time_is_over(context: TaskContext) -> None:
-    make(FakeRedis())._tick(hold(context, timeout_s=10, started=time.monotonic() - 11))
-    assert context.stop_reason is StopReason.TIMEOUT
+def test_a_lease_that_was_taken_is_not_made_again(heart: Heartbeat, rq_queue: RqQueue, context: TaskContext) -> None:
+    heart.hold(hold_of(context))
+    until(lambda: context.stop_reason, "a beat for it")
+    assert not rq_queue.connection.exists("registry", f"rq:execution:{ENTRY}", "rq:executions:task-1")
 
 
-def test_a_task_that_does_not_stop_takes_its_worker_down(context: TaskContext) -> None:
-    given_up: list[Hold] = []
-    heart = make(FakeRedis(), give_up=given_up.append)
-    stuck = hold(context, timeout_s=10, started=time.monotonic() - 11 - STUCK_AFTER_S)
-    heart._tick(stuck)
-    assert given_up == [stuck]
+def test_signs_of_life_that_were_killed_are_started_again(heart: Heartbeat, rq_queue: RqQueue) -> None:
+    first = heart.pid
+    assert first is not None
+    heart.update(state="busy")
+    os.kill(first, signal.SIGKILL)
+    rq_queue.connection.delete(worker_key("w"))
+    until(lambda: rq_queue.workers(), "another beat")
+    assert heart.pid != first
+    assert [beat.state for beat in rq_queue.workers()] == ["busy"], "it knows what the worker is at"
+
+
+def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -> None:
+    heart.stop()
+    assert rq_queue.workers() == []
+    assert [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)] == [EventKind.LEFT]
+
+
+_WORKER = """
+import sys, time
+from tests.worker.test_heartbeat import LEASE_S, beat_of
+from worker.heartbeat import Heartbeat
+heart = Heartbeat(sys.argv[1], beat_of(sys.argv[2]), lease_s=LEASE_S)
+heart.start()
+print(heart.pid, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def worker(rq_queue: RqQueue, redis_server: str) -> Iterator[Callable[..., tuple[subprocess.Popen[bytes], int]]]:
+    """Starts a process with a heart; gives it and the pid of its pulse, once it was seen to beat."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(state: str = "idle") -> tuple[subprocess.Popen[bytes], int]:
+        started.append(subprocess.Popen([sys.executable, "-c", _WORKER, redis_server, state], stdout=subprocess.PIPE))
+        assert started[-1].stdout is not None
+        pulse = int(started[-1].stdout.readline())
+        until(lambda: rq_queue.connection.exists(worker_key("w")), "the first beat")
+        return started[-1], pulse
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def test_a_worker_that_was_stopped_by_a_signal_falls_silent(worker: Callable[..., Any], rq_queue: RqQueue) -> None:
+    process, _ = worker()
+    process.send_signal(signal.SIGSTOP)
+    until(lambda: rq_queue.workers() == [], "its registration ends")
+    process.send_signal(signal.SIGCONT)
+    until(rq_queue.workers, "it gives signs of life again")
+
+
+@pytest.mark.parametrize(("state", "left"), [("idle", []), ("checking", [EventKind.LEFT])])
+def test_no_pulse_outlives_its_worker_and_only_one_that_took_tasks_is_lost(
+    worker: Callable[..., Any], rq_queue: RqQueue, state: str, left: list[EventKind]
+) -> None:
+    process, pulse = worker(state)
+    process.kill()
+    process.wait()
+    until(lambda: is_stopped(pulse), "the pulse ended")
+    assert [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)] == left
+
+
+class Silence:
+    """A Redis that takes everything."""
+
+    def pipeline(self) -> Silence:
+        return self
+
+    def __enter__(self) -> Silence:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def execute(self) -> list[Any]:
+        return [1.0, 0]
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *args, **kwargs: None
+
+
+def test_a_task_is_stopped_when_its_time_is_over_and_then_its_worker() -> None:
+    now, said, ended = [0.0], [], []
+    pulse = Pulse(
+        Silence(),
+        place_of("w", LEASE_S),
+        tell=lambda word, about: said.append((word, about)),
+        end_worker=ended.append,
+        clock=lambda: now[0],
+    )
+    at = {"beat": asdict(beat_of("busy")), "limit": {"id": ENTRY, "seconds": 10.0}}
+    pulse.take(at)
+    pulse.tick()
+    assert said == []
+    now[0] = 10.5
+    pulse.take(at)
+    pulse.tick()
+    assert said == [("timeout", ENTRY)], "being told the same again does not start its time anew"
+    assert ended == []
+    now[0] = 11.0 + STUCK_AFTER_S
+    pulse.tick()
+    assert ended and "does not stop" in ended[0]
 
 
 def test_the_first_reason_to_stop_stands(context: TaskContext) -> None:

@@ -1,0 +1,53 @@
+"""A worker whose engine breaks steps aside, and takes no attempts of tasks with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.domain import State
+from tests.fakes import request
+from tests.system.conftest import System
+
+pytestmark = pytest.mark.chaos
+
+
+def test_a_worker_whose_engine_breaks_hands_its_tasks_back_and_returns_when_it_is_mended(
+    start: Callable[..., System], tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken"
+    system = start(api=True, environment={"FAKE_BROKEN": str(broken)})
+    system.finish(system.submit(request(seed=1)), seconds=60)
+    broken.touch()
+    jobs = [system.submit(request(seed=seed)) for seed in (2, 3)]
+    url = f"{system.supervisor.api_url}/v1/workers"
+    found: list[dict[str, str]] = []
+
+    def is_shown() -> bool:
+        found[:] = [worker for worker in httpx.get(url).json() if worker["state"] == "quarantined"]
+        return bool(found)
+
+    system.until(is_shown, 60, "the worker is shown in quarantine")
+    assert found[0]["reason"] == "no kernel can be loaded"
+    page = httpx.get(f"{system.supervisor.api_url}/workers").text
+    assert "takes no tasks: no kernel can be loaded" in page
+    broken.unlink()
+    done = system.finish(*jobs, seconds=90)
+    assert {job.state for job in done} == {State.SUCCEEDED}
+    assert system.parts.index.attempts() == [], "it cost no attempt"
+
+
+def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[..., System], tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    system = start(environment={"FAKE_BROKEN": str(broken)})
+    broken.touch()
+    first = system.kill("worker-0")
+    job = system.submit(request())
+    states = lambda: {worker.state for worker in system.parts.index.workers()}  # noqa: E731
+    system.until(lambda: "quarantined" in states(), 60, "its successor is in quarantine")
+    assert system.supervisor.pids["worker-0"] != first
+    assert system.parts.index.job(job).state is State.QUEUED
+    assert system.parts.index.attempts() == []

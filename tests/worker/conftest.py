@@ -1,0 +1,5 @@
+"""What tests of the engine room share with those of the service."""
+
+from tests.service.conftest import redis_server, rq_queue
+
+__all__ = ["redis_server", "rq_queue"]
