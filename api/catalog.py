@@ -54,7 +54,7 @@ from service.logs import bind
 from service.metrics.index_now import read_index
 from service.metrics.queue_now import QueueNow
 from service.parts import Parts
-from service.queue.rq_queue import connect
+from service.queue.connection import connect
 from service.store import Store
 
 log = logging.getLogger(__name__)

@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -127,8 +128,8 @@ def _pretend_to_work(context: TaskContext) -> None:
 def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
-    FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how long
-    each task holds the interpreter lock, and while there is a file FAKE_BROKEN nothing works.
+    FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
+    long each task holds the interpreter lock, and while there is a file FAKE_BROKEN nothing works.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
@@ -140,12 +141,14 @@ def main() -> None:
     poison = os.environ.get("FAKE_POISON")
     leaked: list[bytes] = []
 
+    broken = Path(os.environ.get("FAKE_BROKEN", "none"))
+
     def check(stages: Collection[Stage]) -> None:
-        if os.path.exists(os.environ.get("FAKE_BROKEN", "")):
+        if broken.exists():
             raise EngineError("no kernel can be loaded")
 
     def synthesize(message: TaskMessage, context: TaskContext) -> Output:
-        if os.path.exists(os.environ.get("FAKE_BROKEN", "")):
+        if broken.exists():
             raise ImportError("libengine.so")
         hold_interpreter(float(os.environ.get("FAKE_LOCK_S", "0")))
         if str(message.batch) == poison:

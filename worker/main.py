@@ -91,6 +91,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._stages, self._taken = stages, 0
         self.gave_up = False
         """Whether it ended because it is unfit for tasks."""
+        self._stop_requested: bool = False
         self.makes_room = False
         """Whether it ended so that its supervisor starts a fresh one."""
         self._context: TaskContext | None = None
@@ -122,13 +123,14 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._tell_outcome()
         self._surroundings.tasks_done += 1
         if self._fitness.reason and not self._stop_requested:
-            self.gave_up = not self._fitness.sit_out(self._stages, self._heart, lambda: self._stop_requested)
+            fit = self._fitness.sit_out(self._stages, self._heart, lambda: self._stop_requested)
+            self.gave_up = not fit and not self._stop_requested
             self._stop_requested = self._stop_requested or self.gave_up
         if why := self._surroundings.outgrown():
             log.info("this worker ends for a fresh one to start: %s", why)
             self._heart.stopping()
             self.makes_room = True
-            self._stop_requested: bool = True
+            self._stop_requested = True
         self.set_state("idle")
 
     def _tell_outcome(self) -> None:

@@ -10,6 +10,7 @@ out on stdout: why the task in hand must stop, and after every beat a dot.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -42,9 +43,9 @@ _WITHOUT_TASKS: Final = ("checking", "quarantined")
 class Pulse:
     """Beats for one worker.
 
-    `place` names the keys (`worker`, `workers`, `events`), `events_kept` and `lease_s`. What the worker is at: `beat` is
-    what its registration says; `limit` names a piece of work that must end (`id`, `seconds`); `hold` is the lease of a
-    task (`entry`, and the keys `registry`, `execution`, `executions`, `cancel`).
+    `place` names the keys (`worker`, `workers`, `events`), `events_kept` and `lease_s`. What the worker is at: `beat`
+    is what its registration says; `limit` names a piece of work that must end (`id`, `seconds`); `hold` is the lease of
+    a task (`entry`, and the keys `registry`, `execution`, `executions`, `cancel`).
     """
 
     def __init__(
@@ -157,15 +158,15 @@ class _Lines:
 
 
 def _say(word: str, about: str = "") -> None:
-    try:
+    # Where the worker does not listen, or is gone, stdin tells which.
+    with contextlib.suppress(OSError):
         os.write(1, f"{word}\t{about}\n".encode())
-    except OSError:  # the worker does not listen, or is gone: stdin tells which
-        pass
 
 
 def _complain(message: str) -> None:
     line = {"time": timestamp(), "level": "WARNING", "process": "worker", "pid": os.getpid(), "message": message}
-    print(json.dumps(line), file=sys.stderr, flush=True)
+    sys.stderr.write(json.dumps(line) + "\n")
+    sys.stderr.flush()
 
 
 def _end(parent: int, why: str) -> None:

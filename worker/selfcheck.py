@@ -100,6 +100,6 @@ def _ball() -> ObjectModel:
     return load_object({"ball.stl": mesh}, name="ball", digest="", face_error_m=0.0)
 
 
-def _expect(sensible: bool, otherwise: str) -> None:
+def _expect(sensible: object, otherwise: str) -> None:
     if not sensible:
         raise ArithmeticError(otherwise)

@@ -18,7 +18,8 @@ import pytest
 from api.keys import KeyFile, KeyLimits, Scope
 from service.embedded import redis_url, server_command
 from service.parts import Parts
-from service.queue.rq_queue import RqQueue, connect
+from service.queue.connection import connect
+from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.supervisor import Supervisor
 from tests.api.factories import add_builtins

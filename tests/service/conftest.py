@@ -14,7 +14,8 @@ from service.errors import QueueUnavailable
 from service.index.index import Index
 from service.parts import Parts
 from service.queue.memory import MemoryQueue
-from service.queue.rq_queue import RqQueue, connect
+from service.queue.connection import connect
+from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store import open_store
 from tests.fakes import add_assets

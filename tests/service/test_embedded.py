@@ -12,7 +12,8 @@ import pytest
 from service import embedded
 from service.embedded import find_server, own_redis, redis_url, server_command, socket_path
 from service.errors import BusyError, QueueUnavailable
-from service.queue.rq_queue import RqQueue, connect
+from service.queue.connection import connect
+from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from tests.service.conftest import wait_for_redis
 
