@@ -13,8 +13,8 @@ from service.embedded import redis_url, server_command
 from service.errors import QueueUnavailable
 from service.index.index import Index
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.queue.connection import connect
+from service.queue.memory import MemoryQueue
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store import open_store
