@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +35,7 @@ def up(
     json: JsonFlag = False,
 ) -> None:
     """The whole service on this machine, until Ctrl-C."""
+    _check_rooms(workers)
     from service.supervisor import Supervisor
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
@@ -129,6 +131,13 @@ def path(data_dir: DataDir = None) -> None:
     from sqlalchemy import make_url
 
     typer.echo(make_url(load_settings(data_dir=data_dir).resolved_index_url).render_as_string(hide_password=True))
+
+
+def _check_rooms(workers: int) -> None:
+    """UnavailableError if a room that the children are of is not installed."""
+    needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
+    if any(find_spec(library) is None for library in needed):
+        raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
 
 
 def check_keeper(settings: Settings) -> None:

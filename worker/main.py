@@ -15,6 +15,7 @@ from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 from rq import SimpleWorker
+from rq.exceptions import InvalidJobOperation
 from rq.serializers import JSONSerializer
 from rq.timeouts import BaseDeathPenalty
 
@@ -96,6 +97,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """Whether it ended so that its supervisor starts a fresh one."""
         self._context: TaskContext | None = None
         self._outcome: Event | None = None
+        self._was_late = False
         AllowedJob.function = self._run_task
 
     def get_heartbeat_ttl(self, job: Any) -> int:
@@ -132,6 +134,21 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self.makes_room = True
             self._stop_requested = True
         self.set_state("idle")
+
+    def handle_exception(self, job: Any, *exc_info: Any) -> None:
+        """An error that the runner did not sort. Where RQ finds no books to close, the keeper has closed them."""
+        self._was_late = isinstance(exc_info[1], InvalidJobOperation)
+        if self._was_late:
+            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
+        else:
+            super().handle_exception(job, *exc_info)
+
+    def handle_job_failure(self, job: Any, *args: Any, **options: Any) -> None:
+        """Forget what ending a task that was taken away wrote about it again."""
+        if self._was_late:
+            self.connection.delete(job.key)
+        else:
+            super().handle_job_failure(job, *args, **options)
 
     def _tell_outcome(self) -> None:
         if self._outcome is not None:

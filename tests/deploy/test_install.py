@@ -84,10 +84,10 @@ graspd.main()
 """
 
 
-def without_engine(*command: str) -> subprocess.CompletedProcess[str]:
-    """A command of graspd where the engine's libraries are not installed."""
+def without_engine(*command: str, absent: str = "warp,newton,trimesh,mujoco,scipy") -> subprocess.CompletedProcess[str]:
+    """A command of graspd where the engine's libraries, or others, are not installed."""
     return subprocess.run(
-        [sys.executable, "-c", WITHOUT_ENGINE, "warp,newton,trimesh,mujoco,scipy", *command],
+        [sys.executable, "-c", WITHOUT_ENGINE, absent, *command],
         capture_output=True,
         text=True,
         check=False,
@@ -95,12 +95,21 @@ def without_engine(*command: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("command", ["worker", "synth", "demo"])
+@pytest.mark.parametrize("command", ["worker", "synth", "demo", "up"])
 def test_a_command_of_a_room_that_is_not_installed_says_what_to_install(command: str) -> None:
     done = without_engine(command)
     assert done.returncode == 1
     assert done.stderr.startswith(f"graspd: `graspd {command}` is not part of this install; run pip install 'graspd[")
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_up_without_any_extra_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path / "data"))
+    done = without_engine("up", "--workers", "0", absent="httpx,fastapi,warp,newton")
+    assert (done.returncode, done.stderr) == (
+        1, "graspd: `graspd up` is not part of this install; run pip install 'graspd[all]'\n",
+    )  # fmt: skip
+    assert not (tmp_path / "data").exists()
 
 
 def test_the_front_door_makes_keys_without_the_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -120,6 +121,22 @@ def test_a_part_that_is_away_costs_no_attempt(bench: Bench, error: Exception) ->
     outcome = bench.run(message, raising(error))
     assert outcome is not None
     assert outcome.kind is EventKind.DEFERRED
+    assert task_attempts(bench.store, message.task_id) == []
+
+
+def test_a_disk_without_room_costs_no_attempt_wherever_it_is_found(bench: Bench) -> None:
+    def full(message: TaskMessage, context: TaskContext) -> None:
+        try:
+            Path("/dev/full").write_text("a kernel, a picture")
+        except OSError as error:
+            raise RuntimeError("no file could be written") from error
+
+    message = message_for(attempt=3)
+    outcome = bench.run(message, full)
+    assert outcome is not None
+    assert (outcome.kind, outcome.message) == (
+        EventKind.DEFERRED, "No space left on device: no file could be written",
+    )  # fmt: skip
     assert task_attempts(bench.store, message.task_id) == []
 
 
