@@ -51,6 +51,15 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     return key
 
 
+def may_still(request: HTTPConnection, scope: Scope) -> bool:
+    """Whether a long answer may go on: its key may have been revoked, or have expired, since the request came."""
+    keys: KeyFile = request.app.state.keys
+    if keys.is_open:
+        return True
+    key = identify(request.scope, keys)
+    return key is not None and key.scope.includes(scope)
+
+
 def may_change(owner: str) -> bool:
     """Whether the key of the present request may cancel, retry or delete a thing: its own, or with `admin` any.
 

@@ -1,4 +1,5 @@
-"""Server-sent events: a stream that says when a job, or anything, has changed."""
+"""Server-sent events: a stream that says when a job, or anything, has changed. It ends when
+its key does."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
+from api.auth import may_still
 from api.catalog import Catalog
+from api.keys import Scope
 from service.digests import digest_json
 from service.errors import UnavailableError
 
@@ -25,7 +28,7 @@ RETRY_MS: Final = 2000
 async def job_events(catalog: Catalog, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
     """`progress` with the job whenever it changed; `end` when its state is final."""
     last = ""
-    while not await request.is_disconnected():
+    while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
             job = await run_sync(catalog.job_state, job_id)
         except UnavailableError as error:
@@ -46,7 +49,7 @@ async def job_events(catalog: Catalog, job_id: str, request: Request) -> AsyncIt
 async def service_events(catalog: Catalog, request: Request) -> AsyncIterator[ServerSentEvent]:
     """`progress` without content whenever a job, a task or a worker changed: the home page looks again."""
     last = ""
-    while not await request.is_disconnected():
+    while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
             digest = await run_sync(_seen.of, catalog)
         except UnavailableError as error:

@@ -44,7 +44,14 @@ class BodyLimit:
             return
         is_upload = scope["method"] == "POST" and scope["path"].rstrip("/") in self.upload_paths
         limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
-        declared = dict(scope["headers"]).get(b"content-length", b"0")
+        given = dict(scope["headers"])
+        if b"transfer-encoding" in given and b"content-length" in given:
+            # Two lengths: a proxy may have taken the other one, and what is left would be read as the next request.
+            await _refuse(
+                ApiError(400, "Transfer-Encoding and Content-Length exclude each other"), scope, receive, send
+            )
+            return
+        declared = given.get(b"content-length", b"0")
         if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
             await _refuse(_too_large(limit), scope, receive, send)
             return

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import errno
+import os
 import socket
 import sys
 import tempfile
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from api.app import create_app
+from api.protocol import TimedProtocol
 from service.errors import BusyError, InputError
 from service.settings import Settings
 
@@ -57,12 +60,21 @@ def serve(settings: Settings) -> None:
         host, port = listener.getsockname()[:2]
         shown = f"[{host}]" if ":" in host else host
         print(f"graspd answers at http://{shown}:{port}", file=sys.stderr, flush=True)  # noqa: T201
-        config = uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            timeout_graceful_shutdown=_GRACE_S,
-            server_header=False,
-            log_level=settings.log_level.lower(),
-        )
-        uvicorn.Server(config).run(sockets=[listener])
+        uvicorn.Server(configuration(app, settings)).run(sockets=[listener])
+
+
+def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
+    """How uvicorn serves the application."""
+    return uvicorn.Config(
+        app,
+        http=TimedProtocol,
+        ws="none",
+        # Whoever is believed may name any address as its client's, and so evade what is counted by address: nobody is,
+        # loopback included, unless the variable says so.
+        proxy_headers=bool(os.environ.get("FORWARDED_ALLOW_IPS")),
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=_GRACE_S,
+        server_header=False,
+        log_level=settings.log_level.lower(),
+    )

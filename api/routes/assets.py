@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from threading import BoundedSemaphore
 from typing import Annotated, Final
 
@@ -9,6 +10,7 @@ from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
 from starlette.datastructures import UploadFile as AnyUpload
 
 from api.catalog import Catalog
+from api.conditions import is_known
 from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
 from api.problems import responses
@@ -44,20 +46,35 @@ def asset_router(kind: AssetKind) -> APIRouter:
         """One of them, with what the check found."""
         return catalog.asset(kind, name)
 
+    @router.head("/{name}/model", dependencies=[Depends(may_read)], include_in_schema=False)
     @router.get(
         "/{name}/model",
         dependencies=[Depends(may_read)],
         response_class=Response,
-        responses=responses(401, 403, 404, 503, others={200: {"content": {_GLB: {}}, "description": "Binary glTF"}}),
+        responses=responses(
+            401,
+            403,
+            404,
+            503,
+            others={
+                200: {"content": {_GLB: {}}, "description": "Binary glTF"},
+                304: {"description": "What If-None-Match names is this file"},
+            },
+        ),
         name=f"get_{kind}_model",
     )
-    def get_model(name: str, catalog: CatalogOf) -> Response:
+    def get_model(name: str, request: Request, catalog: CatalogOf) -> Response:
         """The prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
         asset = catalog.asset(kind, name)
         # Under a digest it never changes; a name may come to stand for something else.
         lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
         data = catalog.store.get(names.asset_model(kind, asset.digest))
-        return Response(data, media_type=_GLB, headers={"Cache-Control": lasting})
+        headers = {"ETag": f'"{hashlib.sha256(data).hexdigest()}"', "Cache-Control": lasting}
+        if is_known(request.headers, headers["ETag"]):
+            return Response(status_code=304, headers=headers)
+        if request.method == "HEAD":
+            return Response(media_type=_GLB, headers=headers | {"Content-Length": str(len(data))})
+        return Response(data, media_type=_GLB, headers=headers)
 
     @router.post(
         "",

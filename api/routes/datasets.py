@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from api import dataset_quota
 from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
-from api.problems import responses
+from api.problems import ApiError, responses
 from service.charts import Resolver
 from service.datasets import actions
 from service.datasets.cost import Estimate, estimate
@@ -56,6 +56,12 @@ def create_dataset(body: DatasetRequest, response: Response, catalog: CatalogOf)
 def estimate_dataset(body: Matrix, catalog: CatalogOf) -> Estimate:
     """What a dataset will cost: time for 1, 8 and 64 workers, storage, network. Nothing is recorded."""
     return estimate(catalog.parts.index, body, Resolver(catalog.parts.store))
+
+
+@router.api_route("/estimate", methods=["GET", "HEAD", "PUT", "PATCH", "DELETE"], include_in_schema=False)
+def no_dataset() -> None:
+    """`estimate` is the name of no dataset, so only POST has a meaning here."""
+    raise ApiError(405, "an estimate is asked for with POST", headers={"Allow": "POST"})
 
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 
+from api.conditions import is_known, range_applies
 from api.dependencies import CatalogOf, Cursor, Limit, may_read
 from api.models import Shard
 from api.paging import link_next
@@ -44,6 +45,7 @@ def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
     return catalog.shard(shard_id)
 
 
+@router.head("/{shard_id}/file", dependencies=[Depends(may_read)], include_in_schema=False)
 @router.get(
     "/{shard_id}/file",
     dependencies=[Depends(may_read)],
@@ -57,6 +59,7 @@ def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
         others={
             200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
             206: {"content": {_MEDIA_TYPE: {}}, "description": "The bytes asked for"},
+            304: {"description": "What If-None-Match names is this file"},
             307: {"description": "The store hands the file out itself, under a signed address"},
         },
     ),
@@ -64,22 +67,28 @@ def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
 def get_file(shard_id: str, request: Request, catalog: CatalogOf) -> Response:
     """The HDF5 file: from the store itself where it signs addresses, else through the API, by Range if asked.
 
-    One that is not what its checksum says is refused.
+    If-None-Match and If-Range are heeded. One that is not what its checksum says is refused.
     """
     shard = catalog.checked_shard(shard_id)
-    if (address := catalog.store.sign(shard.key)) is not None:
+    # The name says the content: what was fetched once never changes.
+    headers = {"ETag": f'"{shard.sha256}"', "Cache-Control": "private, max-age=31536000, immutable"}
+    if is_known(request.headers, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    only_head = request.method == "HEAD"
+    # A signed address is for GET alone.
+    if not only_head and (address := catalog.store.sign(shard.key)) is not None:
         return RedirectResponse(address, status_code=307)
     size = catalog.store.size(shard.key)
-    span = parse_range(request.headers.get("range"), size)
+    wanted = request.headers.get("range")
+    span = None if only_head or not range_applies(request.headers, headers["ETag"]) else parse_range(wanted, size)
     start, end = span or (0, size)
-    headers = {
+    headers |= {
         "Accept-Ranges": "bytes",
         "Content-Length": str(end - start),
         "Content-Disposition": f'attachment; filename="{shard.kind}-{shard_id}.h5"',
-        "ETag": f'"{shard.sha256}"',
-        # The name says the content: what was fetched once never changes.
-        "Cache-Control": "private, max-age=31536000, immutable",
     }
+    if only_head:
+        return Response(media_type=_MEDIA_TYPE, headers=headers)
     if span is not None:
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
     chunks: Iterator[bytes] = catalog.store.stream(shard.key, start, end - start)

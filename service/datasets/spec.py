@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Annotated, Final, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from service.clock import timestamp
 from service.datasets.records import DatasetRecord, Member, request_of
@@ -47,7 +47,14 @@ class Matrix(JobOptions):
 class DatasetRequest(Matrix):
     """A matrix with a name."""
 
-    name: Name = Field(description="name of the dataset")
+    name: Name = Field(description="name of the dataset; `estimate` is taken by an address of the API")
+
+    @field_validator("name")
+    @classmethod
+    def _is_free(cls, value: str) -> str:
+        if value == "estimate":
+            raise ValueError("the API answers estimates at this name; take another one")
+        return value
 
 
 def describe(

@@ -70,6 +70,7 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
     api, plain, secure = free_ports(3)
     key = KeyFile(folder / "data" / "keys.json").add("admin", Scope.ADMIN)
     environment = os.environ | {"GRASPD_DATA_DIR": str(folder / "data"), "GRASPD_PORT": str(api)}
+    environment |= {"FORWARDED_ALLOW_IPS": "127.0.0.1"}
     configuration = served(folder, api, plain, secure)
     with (folder / "api.log").open("wb") as log:
         started = [

@@ -1,0 +1,174 @@
+"""Connections to a real server on loopback: half-sent headers, two lengths, forwarded addresses, streams of events."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import uvicorn
+from fastapi import FastAPI, Request
+
+from api import events
+from api.keys import KeyFile, Scope
+from api.protocol import TimedProtocol
+from api.server import bind, configuration
+from service.parts import Parts
+from service.settings import Settings
+from tests.api.factories import add_job
+
+Connect = Callable[..., socket.socket]
+_WHOLE = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+_HALF = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Half: "
+
+
+class _Quick(TimedProtocol):
+    headers_s = 0.3
+
+
+async def tells_its_client(scope: Any, receive: Any, send: Any) -> None:
+    """Answers with the address it sees, after longer than headers may take."""
+    if scope["type"] != "http":
+        return
+    await asyncio.sleep(2 * _Quick.headers_s)
+    body = scope["client"][0].encode()
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
+    await send({"type": "http.response.body", "body": body})
+
+
+@pytest.fixture
+def connect(settings: Settings) -> Iterator[Connect]:
+    """Opens connections to an application, each served as `graspd api` does but for a shorter patience."""
+    running: list[tuple[uvicorn.Server, threading.Thread]] = []
+    opened: list[socket.socket] = []
+
+    def start(app: Any = tells_its_client) -> socket.socket:
+        config = configuration(app, settings)
+        assert config.http is TimedProtocol
+        config.http = _Quick
+        listener = bind("127.0.0.1", 0)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        running.append((server, thread))
+        connection = socket.create_connection(listener.getsockname(), timeout=20)
+        opened.append(connection)
+        return connection
+
+    yield start
+    for connection in opened:
+        connection.close()
+    for server, thread in running:
+        server.should_exit = True
+        thread.join(20)
+
+
+def rest(connection: socket.socket) -> bytes:
+    """What still comes until the server ends the connection."""
+    found = b""
+    while piece := connection.recv(65536):
+        found += piece
+    return found
+
+
+def test_a_connection_that_sends_nothing_is_ended(connect: Connect) -> None:
+    assert rest(connect()) == b""
+
+
+def test_half_sent_headers_are_given_up(connect: Connect) -> None:
+    connection = connect()
+    connection.sendall(_HALF)
+    assert rest(connection).startswith(b"HTTP/1.1 408 ")
+
+
+def test_headers_that_trickle_in_win_no_time(connect: Connect) -> None:
+    connection = connect()
+    connection.sendall(_HALF)
+    deadline = time.monotonic() + 20
+    answer = b""
+    connection.settimeout(0.02)
+    while not answer and time.monotonic() < deadline:
+        try:
+            answer = connection.recv(100)
+        except TimeoutError:
+            connection.sendall(b"a")
+    assert answer.startswith(b"HTTP/1.1 408 ")
+
+
+def test_half_of_a_later_request_is_given_up_too(connect: Connect) -> None:
+    connection = connect()
+    connection.sendall(_WHOLE)
+    assert b" 200 " in connection.recv(65536)
+    connection.sendall(_HALF)
+    assert b" 408 " in rest(connection)
+
+
+def test_half_of_a_request_behind_another_is_given_up_after_its_answer(connect: Connect) -> None:
+    connection = connect()
+    connection.sendall(_WHOLE + _HALF)
+    answer = rest(connection)
+    assert answer.index(b" 200 ") < answer.index(b" 408 ")
+
+
+def test_an_answer_may_take_longer_than_headers(connect: Connect) -> None:
+    connection = connect()
+    connection.sendall(_WHOLE)
+    assert b" 200 " in connection.recv(65536)
+
+
+def test_a_request_of_two_lengths_is_refused(connect: Connect, app: FastAPI) -> None:
+    connection = connect(app)
+    lengths = b"Transfer-Encoding: chunked\r\nContent-Length: 5\r\n"
+    connection.sendall(
+        b"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n0\r\n\r\nGET /healthz HTTP/1.1\r\n"
+    )
+    answer = rest(connection)
+    assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1") == 1
+
+
+@pytest.mark.parametrize(("believed", "seen"), [("", b"127.0.0.1"), ("127.0.0.1", b"192.0.2.7")])
+def test_a_forwarded_address_is_believed_only_where_the_operator_says_so(
+    connect: Connect, monkeypatch: pytest.MonkeyPatch, believed: str, seen: bytes
+) -> None:
+    monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
+    if believed:
+        monkeypatch.setenv("FORWARDED_ALLOW_IPS", believed)
+    connection = connect()
+    forwarded = b"X-Forwarded-For: 192.0.2.7\r\nConnection: close\r\n\r\n"
+    connection.sendall(_WHOLE.removesuffix(b"\r\n") + forwarded)
+    assert rest(connection).endswith(b"\r\n\r\n" + seen)
+
+
+@pytest.mark.parametrize("end", ["revoked", "a first key"])
+@pytest.mark.parametrize("what", ["job", "service"])
+def test_a_stream_of_events_ends_with_its_key(
+    app: FastAPI, parts: Parts, settings: Settings, what: str, end: str
+) -> None:
+    keys: KeyFile = app.state.keys
+    headers = []
+    if end == "revoked":
+        headers = [(b"authorization", f"Bearer {keys.add('me', Scope.READ)}".encode())]
+    job = add_job(parts).id
+
+    async def nothing() -> dict[str, Any]:
+        await asyncio.sleep(60)
+        return {"type": "http.disconnect"}
+
+    async def watch() -> None:
+        request = Request({"type": "http", "app": app, "headers": headers, "state": {}}, nothing)
+        catalog = app.state.catalog
+        stream = events.job_events(catalog, job, request) if what == "job" else events.service_events(catalog, request)
+        async with asyncio.timeout(20):
+            await anext(stream)
+            if end == "revoked":
+                keys.revoke("me")
+            else:
+                keys.add("me", Scope.READ)
+            with pytest.raises(StopAsyncIteration):
+                await anext(stream)
+
+    asyncio.run(watch())
