@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 from fastapi import FastAPI
@@ -25,7 +25,8 @@ from api.routes.assets import asset_router
 from api.turnstile import Turnstile
 from service.domain import AssetKind
 from service.embedded import redis_url
-from service.errors import InputError
+from service.errors import InputError, UnavailableError
+from service.index.rebuild import complete_if_new
 from service.parts import Parts
 from service.settings import Settings
 from service.version import PACKAGE_VERSION
@@ -44,6 +45,8 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     keys = KeyFile(settings.resolved_keys_file)
     check_exposure(settings.host, keys)
     opened = parts or Parts.open(settings)
+    with suppress(UnavailableError):
+        complete_if_new(opened.index, opened.store)
     rates = Rates(redis_url(settings))
 
     @asynccontextmanager

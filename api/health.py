@@ -16,6 +16,7 @@ from service.parts import Parts
 KEPT_S: Final = 2.0
 #: A part that has not answered by then counts as away [s].
 PATIENCE_S: Final = 2.0
+_INCOMPLETE: Final = "the keeper makes it from the store now; until it has, jobs are missing from it"
 
 
 class Probes:
@@ -37,10 +38,10 @@ class Probes:
             return self._known[1]
 
     def _ask(self) -> Health:
-        questions: dict[str, Callable[[], float]] = {
-            "redis": self._parts.queue.ping,
-            "index": self._parts.index.ping,
-            "store": self._parts.store.probe,
+        questions: dict[str, Callable[[], Part]] = {
+            "redis": lambda: _answering(self._parts.queue.ping()),
+            "index": self._index,
+            "store": lambda: _answering(self._parts.store.probe()),
         }
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
         deadline = time.monotonic() + self._patience_s
@@ -48,6 +49,17 @@ class Probes:
         self._hanging = {name: probe for name, probe in probes.items() if probe.thread.is_alive()}
         keeper, workers = self._others() if parts["redis"].ok else (False, 0)
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, keeper=keeper, workers=workers)
+
+    def _index(self) -> Part:
+        """An index that may lack what the store has is not ready: jobs would seem to be gone."""
+        part, made = _answering(self._parts.index.ping()), self._parts.index.completeness()
+        if made is None:
+            return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
+        if made.left_out:
+            some = ", ".join(made.names[:3])
+            detail = f"{made.left_out} damaged records of the store are left out: {some}; `graspd store verify`"
+            return part.model_copy(update={"detail": detail})
+        return part
 
     def _others(self) -> tuple[bool, int]:
         try:
@@ -57,10 +69,14 @@ class Probes:
             return False, 0
 
 
+def _answering(seconds: float) -> Part:
+    return Part(ok=True, latency_ms=round(1000 * seconds, 3))
+
+
 class _Probe:
     """One question to one part."""
 
-    def __init__(self, name: str, question: Callable[[], float]) -> None:
+    def __init__(self, name: str, question: Callable[[], Part]) -> None:
         self._question = question
         self._part: Part | None = None
         self.thread = threading.Thread(target=self._run, name=f"probe-{name}", daemon=True)
@@ -74,7 +90,7 @@ class _Probe:
 
     def _run(self) -> None:
         try:
-            self._part = Part(ok=True, latency_ms=round(1000 * self._question(), 3))
+            self._part = self._question()
         except GraspdError as error:
             self._part = Part(ok=False, detail=str(error))
         except Exception as error:

@@ -22,6 +22,7 @@ from service.errors import (
     DamagedShard,
     GraspdError,
     HandError,
+    IndexDamaged,
     IndexUnavailable,
     InputError,
     LimitError,
@@ -51,8 +52,8 @@ ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
         InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
-        QueueUnavailable, StoreUnavailable, IndexUnavailable, RateError, BusyError, DamagedError, DamagedShard,
-        TaskError, TaskCancelled, TaskRefused, GraspdError,
+        QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError, DamagedError,
+        DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
     )
 }  # fmt: skip
 

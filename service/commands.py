@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
-from service.errors import UnavailableError
+from service.errors import IndexDamaged, UnavailableError
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)
@@ -94,8 +94,13 @@ def rebuild(
 
     settings = load_settings(data_dir=data_dir)
     store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
-    found = differences(index, store)
-    counts: dict[str, int] = {} if check else make(index, store)
+    try:
+        found = differences(index, store)
+        counts: dict[str, int] = {} if check else make(index, store)
+    except IndexDamaged:
+        if check:
+            raise
+        found, counts = ["the file of the index was damaged; a new one took its place"], make(index, store)
     if json:
         emit({"differences": found, "changed": bool(found) and not check, **counts})
     else:

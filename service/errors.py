@@ -12,6 +12,7 @@
     │   ├── QueueUnavailable
     │   ├── StoreUnavailable
     │   ├── IndexUnavailable
+    │   │   └── IndexDamaged      its file is damaged: a new one takes its place
     │   └── RateError             too many requests: exit 1, HTTP 429
     ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
     ├── DamagedError              a record in the store is not what its name says: exit 1, HTTP 500
@@ -106,6 +107,12 @@ class IndexUnavailable(UnavailableError):
     """The index database does not answer."""
 
     slug, title = "index-unavailable", "The index does not answer"
+
+
+class IndexDamaged(IndexUnavailable):
+    """The file of the index is damaged; a new one takes its place and is filled from the store."""
+
+    slug, title = "index-damaged", "The index is damaged"
 
 
 class RateError(UnavailableError):

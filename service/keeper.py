@@ -14,10 +14,10 @@ from service import names
 from service.clock import timestamp
 from service.datasets.planner import Planner
 from service.domain import Lane
-from service.errors import StoreUnavailable, UnavailableError
-from service.index.rebuild import rebuild
+from service.errors import DamagedError, StoreUnavailable, UnavailableError
+from service.index.rebuild import complete_if_new, rebuild
 from service.indexer import Indexer
-from service.library import load_check, publish_builtins, stored_assets
+from service.library import publish_builtins, stored_assets
 from service.parts import Parts
 from service.pipeline import queue_tasks
 from service.planning import ingest_id, ingest_message
@@ -76,6 +76,8 @@ class Keeper:
         """
         if not self._started:
             self._start()
+        elif self._parts.index.completeness() is None:
+            self._make_whole()
         away: list[UnavailableError] = []
         with _noted(away):
             self._index_events(0.0 if self._has_plans else wait_s)
@@ -110,15 +112,25 @@ class Keeper:
 
     def _start(self) -> None:
         publish_builtins(self._parts.store)
-        self._index_assets()
-        if not self._parts.index.has_jobs() and next(self._parts.store.list(names.JOBS), None) is not None:
-            log.warning("the index is empty and the store is not: rebuilding the index")
-            rebuild(self._parts.index, self._parts.store)
+        complete_if_new(self._parts.index, self._parts.store)
+        made = self._parts.index.completeness()
+        # What was left out may have been mended since.
+        if made is None or made.left_out:
+            self._make_whole()
+        else:
+            self._index_assets()
         self._started = True
+
+    def _make_whole(self) -> None:
+        log.warning("the index may lack what the store has: it is made from the store")
+        rebuild(self._parts.index, self._parts.store)
 
     def _index_assets(self) -> None:
         for kind, digest in stored_assets(self._parts.store):
-            self._indexer.checked(kind, digest)
+            try:
+                self._indexer.checked(kind, digest)
+            except DamagedError as error:
+                log.warning("%s", error)
 
     def _index_events(self, wait_s: float) -> None:
         """Take up what came in; what the store is needed for waits while that is away."""
@@ -160,8 +172,9 @@ class Keeper:
     def _feed_checks(self, present: set[str], now: float) -> None:
         for check in self._parts.index.ready_checks(now=now, limit=self._parts.settings.queue_window):
             self._parts.index.set_asset_waiting([check.digest], queued=True)
-            if load_check(self._parts.store, check.kind, check.digest) is not None:
-                self._indexer.checked(check.kind, check.digest)
+            if self._parts.store.exists(names.asset_check(check.kind, check.digest)):
+                with _noted([]):
+                    self._indexer.checked(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in present:
                 message = ingest_message(
                     check.kind,
@@ -175,8 +188,10 @@ class Keeper:
 
 @contextmanager
 def _noted(away: list[UnavailableError]) -> Iterator[None]:
-    """A part that is away must not keep the keeper from what does not need it."""
+    """A part that is away, or one damaged record, must not keep the keeper from what does not need it."""
     try:
         yield
     except UnavailableError as error:
         away.append(error)
+    except DamagedError as error:
+        log.warning("%s", error)

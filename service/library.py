@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 from collections.abc import Mapping
 from typing import Final
@@ -12,9 +13,11 @@ from service.assets import builtin_asset, builtin_model, builtin_names, describe
 from service.clock import timestamp
 from service.digests import digest_files
 from service.domain import Asset, AssetKind
-from service.errors import ConflictError, InputError
+from service.errors import ConflictError, DamagedError, InputError
+from service.records import read_record
 from service.store import Store
 
+log = logging.getLogger(__name__)
 #: An archive the service packed itself is bounded by the upload limit; this only stops a store that was tampered with.
 UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
@@ -85,7 +88,10 @@ def publish_builtins(store: Store) -> list[Asset]:
     for kind in AssetKind:
         for name in builtin_names(kind):
             asset, files = builtin_asset(kind, name)
-            published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+            try:
+                published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+            except DamagedError as error:
+                log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
             store.put(names.asset_model(kind, asset.digest), builtin_model(kind, name))
     return published
 
@@ -94,12 +100,13 @@ def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
     """Kind and digest of every hand and object in the store."""
     records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
     # Other files of an asset may lie deeper, such as an object's convex pieces.
-    return [(AssetKind(key[1]), key[2]) for key in records if len(key) == 4 and key[3] == "asset.json"]
+    is_record = (len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json" for key in records)
+    return [(AssetKind(key[1]), key[2]) for key, record in zip(records, is_record, strict=True) if record]
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
-    """The record of a hand or object; NotFoundError if there is none."""
-    return Asset.model_validate_json(store.get(names.asset_record(kind, digest)))
+    """The record of a hand or object; NotFoundError if there is none, DamagedError if it is not what its name says."""
+    return read_record(Asset, store, names.asset_record(kind, digest))
 
 
 def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
@@ -116,6 +123,18 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
-    """What ingest found (`verdict`, `message`, `repairs`, `facts`); None while it has not run."""
+    """What ingest found (`verdict`, `message`, `repairs`, `facts`); None while it has not run.
+
+    Raises:
+        DamagedError: the record is not what its name says.
+    """
     key = names.asset_check(kind, digest)
-    return json.loads(store.get(key)) if store.exists(key) else None
+    if not store.exists(key):
+        return None
+    try:
+        found: dict[str, object] = json.loads(store.get(key))
+        if found["verdict"] in ("accept", "repair", "refuse"):
+            return found
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise DamagedError(f"the record {key} in the store is damaged; remove it, and the {kind.value} is checked again")

@@ -76,7 +76,11 @@ class Reaper:
                 self._find(task, Stage(stage), shard)
                 continue
             known = self._parts.index.task(task).attempt
-            recorded = [a for a in task_attempts(self._parts.store, task) if a.number >= known]
+            try:
+                recorded = [a for a in task_attempts(self._parts.store, task) if a.number >= known]
+            except DamagedError as error:
+                self._fail(task, Stage(stage), error)
+                continue
             for attempt in recorded:
                 self._indexer.failed(attempt)
             if not recorded:
@@ -90,24 +94,31 @@ class Reaper:
         try:
             self._indexer.finished(stage, shard)
         except DamagedError as error:
-            task = self._parts.index.task(task_id)
-            attempt = AttemptRecord(
-                task_id=task_id,
-                job_id=task.job_id,
-                stage=stage,
-                number=task.attempt,
-                kind=type(error).__name__,
-                reason=str(error),
-                worker="keeper",
-                ended=timestamp(),
-                last=True,
-            )
-            put_record(self._parts.store, names.attempt(task_id, attempt.number), attempt)
-            self._indexer.failed(attempt)
+            self._fail(task_id, stage, error)
+
+    def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
+        """End a task that a damaged record stands in the way of."""
+        task = self._parts.index.task(task_id)
+        attempt = AttemptRecord(
+            task_id=task_id,
+            job_id=task.job_id,
+            stage=stage,
+            number=task.attempt,
+            kind=type(error).__name__,
+            reason=str(error),
+            worker="keeper",
+            ended=timestamp(),
+            last=True,
+        )
+        put_record(self._parts.store, names.attempt(task_id, attempt.number), attempt)
+        self._indexer.failed(attempt)
 
     def _recover_check(self, kind: AssetKind, digest: str) -> None:
         if self._parts.store.exists(names.asset_check(kind, digest)):
-            self._indexer.checked(kind, digest)
+            try:
+                self._indexer.checked(kind, digest)
+            except DamagedError as error:
+                log.warning("%s", error)
         else:
             self._parts.index.set_asset_waiting([digest], queued=False)
 
@@ -143,7 +154,11 @@ class Reaper:
         )
         key = names.attempt(message.task_id, message.attempt)
         if not put_record(self._parts.store, key, attempt):
-            attempt = read_record(AttemptRecord, self._parts.store, key)
+            try:
+                attempt = read_record(AttemptRecord, self._parts.store, key)
+            except DamagedError as error:
+                self._fail(message.task_id, message.stage, error)
+                return
         # A first loss is the machine's fault more often than the task's, so there is no wait.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import sqlite3
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,8 +18,10 @@ from sqlalchemy import Connection, Engine, Table, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
-from service.errors import IndexUnavailable, InputError
+from service.errors import IndexDamaged, IndexUnavailable, InputError
+from service.index.sqlite_file import Identity, SqliteFile
 
+log = logging.getLogger(__name__)
 _MIGRATIONS: Final = Path(__file__).parent / "migrations"
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
 _BUSY_TIMEOUT_S: Final = 20.0
@@ -25,6 +29,8 @@ _BUSY_TIMEOUT_S: Final = 20.0
 _MIGRATION_LOCK: Final = 0x67727370
 #: The same for one writer at a time.
 _WRITE_LOCK: Final = 0x67727371
+#: Codes of SQLite for a file whose content makes no sense.
+_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 class Database:
@@ -37,19 +43,21 @@ class Database:
             InputError: the URL names no known database.
             IndexUnavailable: the database does not answer or cannot be written.
         """
-        self._engine = _engine(url)
+        self._url = url
+        self._file = _file_of(url)
         self._write_lock = threading.Lock()
+        self._opening = threading.Lock()
+        self._identity: Identity = None
         try:
-            with _mapped():
-                _migrate(self._engine)
-        except BaseException:
-            self._engine.dispose()
-            raise
+            self._engine = self._open()
+        except IndexDamaged:
+            self._put_aside()
+            self._engine = self._open()
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for queries, which all see the same moment."""
-        with _mapped(), self._engine.connect() as connection:
+        with self._mended(), self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
                 connection.exec_driver_sql("BEGIN")
             else:
@@ -66,7 +74,7 @@ class Database:
         if within is not None:
             yield within
             return
-        with _mapped(), self._write_lock, self._engine.connect() as connection:
+        with self._mended(), self._write_lock, self._present().connect() as connection:
             if connection.dialect.name == "sqlite":
                 # A transaction that reads first and writes later fails at once when another one wrote in between.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
@@ -86,6 +94,53 @@ class Database:
     def close(self) -> None:
         """Give the connections back."""
         self._engine.dispose()
+
+    def set_aside(self) -> None:
+        """Begin with an empty index: the file of this one is moved away. Nothing happens where it is no file."""
+        if self._file is not None:
+            self._put_aside()
+            self._present()
+
+    def _open(self) -> Engine:
+        """An engine on the present file, which is made and migrated if need be."""
+        engine = _engine(self._url)
+        try:
+            with _mapped(), self._file.opening() if self._file is not None else nullcontext():
+                self._note_identity()
+                _migrate(engine)
+                self._note_identity()
+        except BaseException:
+            engine.dispose()
+            raise
+        return engine
+
+    def _note_identity(self) -> None:
+        self._identity = self._file.identity() if self._file is not None else None
+
+    def _present(self) -> Engine:
+        """The engine; another one where the file was removed or exchanged meanwhile."""
+        if self._file is not None and self._file.identity() != self._identity:
+            with self._opening:
+                if self._file.identity() != self._identity:
+                    log.warning("the index %s was removed or exchanged; it is opened again", self._file.path)
+                    old, self._engine = self._engine, self._open()
+                    old.dispose()
+        return self._engine
+
+    @contextmanager
+    def _mended(self) -> Iterator[None]:
+        """Errors as ours; a damaged file is put aside, so that the next call finds a new one."""
+        try:
+            with _mapped():
+                yield
+        except IndexDamaged:
+            self._put_aside()
+            raise
+
+    def _put_aside(self) -> None:
+        if self._file is not None:
+            with _mapped(), self._file.opening():
+                self._file.set_aside(self._identity)
 
 
 def upsert(
@@ -108,6 +163,16 @@ def upsert(
 def chunks(ids: Sequence[str], size: int = 1000) -> Iterable[Sequence[str]]:
     """Ids in parts that a statement may name: databases bound the number of its parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
+
+
+def _file_of(url: str) -> SqliteFile | None:
+    """The file of an SQLite index; None for another database, and for one in memory."""
+    try:
+        parsed = make_url(url)
+    except ArgumentError:
+        return None
+    is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
+    return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
 def _engine(url: str) -> Engine:
@@ -199,6 +264,10 @@ def _mapped() -> Iterator[None]:
     except (OverflowError, UnicodeEncodeError):
         raise InputError("the index knows whole numbers below 2^63 and Unicode text; give such values") from None
     except SQLAlchemyError as error:
+        if getattr(getattr(error, "orig", None), "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
+            raise IndexDamaged(
+                f"the index is damaged ({_line(error)}); a new one takes its place, and is filled from the store"
+            ) from error
         raise IndexUnavailable(f"the index does not answer or cannot be written: {_line(error)}") from error
 
 

@@ -9,12 +9,22 @@ from service.index.dataset_queries import DatasetQueries
 from service.index.feed import Feed
 from service.index.grasp_queries import GraspQueries
 from service.index.job_queries import JobQueries
+from service.index.notes import Notes
 from service.index.service_queries import ServiceQueries
 from service.index.summaries import Summaries
 
 
 class Index(
-    JobQueries, GraspQueries, Summaries, ServiceQueries, DatasetQueries, CostQueries, Feed, Changes, DatasetChanges
+    JobQueries,
+    GraspQueries,
+    Summaries,
+    ServiceQueries,
+    DatasetQueries,
+    CostQueries,
+    Feed,
+    Changes,
+    DatasetChanges,
+    Notes,
 ):
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 

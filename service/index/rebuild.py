@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from sqlalchemy import Connection, Table, delete, select
+from sqlalchemy.exc import DataError
 
 from service import names
-from service.datasets.records import DatasetRecord, ObjectSet, Snapshot, dataset_events
+from service.datasets.records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
 from service.domain import State
+from service.errors import DamagedError, InputError, NotFoundError
 from service.index.index import Index
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
 from service.library import load_asset, load_check, stored_assets
 from service.manifests import ShardManifest
-from service.records import AttemptRecord, JobRecord, job_events, parse_record
+from service.records import AttemptRecord, JobEvent, JobRecord, Record, parse_record
 from service.store import Store
 
+log = logging.getLogger(__name__)
+EventT = TypeVar("EventT", bound=Record)
+#: What a record that makes no sense raises, here or in the database; that a part is away is none of it.
+_OF_THE_RECORD: Final = (DamagedError, InputError, DataError, ValueError, TypeError, LookupError, ArithmeticError)
 #: Reads in flight: what hides the latency of a remote store.
 _READERS: Final = 16
 _SHOWN_DIFFERENCES: Final = 50
@@ -28,68 +36,138 @@ _SHOWN_DIFFERENCES: Final = 50
 def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] | None = None) -> dict[str, int]:
     """Replace all rows by what follows from the store. The old rows stay until all new ones are there.
 
+    A record that is damaged is left out, named in the log and in `index.completeness()`; the others go on.
+
     Args:
         progress: called with what is being read and how many of it there were so far.
 
     Returns:
-        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read.
+        number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of records left out.
     """
-    counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
-
-    def count(what: str) -> None:
-        counts[what] += 1
-        if progress is not None:
-            progress(what, counts[what])
-
     with index.writing() as connection:
         for table in metadata.tables.values():
             if table.name not in LIVE_TABLES:
                 connection.execute(delete(table))
-        for asset in _assets(store):
-            index.add_asset(*asset, within=connection)
-            count("assets")
-        jobs = list(_records(JobRecord, store, names.JOBS, "/job.json"))
-        for record in jobs:
-            index.add_job(record, within=connection)
-            count("jobs")
-        for attempt in sorted(_records(AttemptRecord, store, names.TASKS, ".json"), key=lambda a: a.number):
-            index.add_attempt(attempt, within=connection)
-            count("attempts")
-        for record in jobs:
-            if events := job_events(store, record.id):
-                index.set_job_events(record.id, events, within=connection)
-        for manifest in _records(ShardManifest, store, names.SHARDS, ".json"):
-            index.add_manifests([manifest], within=connection)
-            count("shards")
-        _rebuild_datasets(index, store, connection, count)
-    return counts
+        made = _Rebuild(index, store, connection, progress)
+        made.assets()
+        made.jobs()
+        made.shards()
+        made.datasets()
+        index.set_complete(made.left_out, within=connection)
+    return {**made.counts, "left_out": len(made.left_out)}
 
 
-def _rebuild_datasets(index: Index, store: Store, connection: Connection, count: Callable[[str], None]) -> None:
-    for record in _records(DatasetRecord, store, names.DATASETS, "/dataset.json"):
-        index.add_dataset(record, within=connection)
-        if events := dataset_events(store, record.name):
-            index.set_dataset_events(record.name, events, within=connection)
-        count("datasets")
-    for entry in list(store.list(names.DATASETS)):
-        if "/snapshots/" in entry.key:
-            index.add_snapshot(parse_record(Snapshot, store.get(entry.key), entry.key), within=connection)
-            count("snapshots")
-    for found in _records(ObjectSet, store, names.OBJECT_SETS, ".json"):
-        index.add_object_set(found, within=connection)
-        count("object_sets")
+class _Rebuild:
+    """One rebuild: each record in a savepoint of its own, so that one that does not fit leaves nothing behind."""
+
+    def __init__(
+        self, index: Index, store: Store, connection: Connection, progress: Callable[[str, int], None] | None
+    ) -> None:
+        self._index, self._store, self._connection, self._progress = index, store, connection, progress
+        self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
+        self.left_out: list[str] = []
+
+    def assets(self) -> None:
+        for kind, digest in stored_assets(self._store):
+            with self._each(names.asset_check(kind, digest)):
+                check = load_check(self._store, kind, digest)
+                with self._each(names.asset_record(kind, digest), "assets"):
+                    self._index.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
+
+    def jobs(self) -> None:
+        """Jobs, then their failed attempts in order, then what users did to them."""
+        known = []
+        for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
+            with self._each(key, "jobs"):
+                record = parse_record(JobRecord, data, key)
+                self._index.add_job(record, within=self._connection)
+                known.append(record.id)
+        attempts = []
+        for key, data in self._read(names.TASKS, lambda key: key.endswith(".json")):
+            with self._each(key):
+                attempts.append(parse_record(AttemptRecord, data, key))
+        for attempt in sorted(attempts, key=lambda attempt: attempt.number):
+            with self._each(names.attempt(attempt.task_id, attempt.number), "attempts"):
+                self._index.add_attempt(attempt, within=self._connection)
+        for job in known:
+            if events := self._events(JobEvent, names.job_events(job)):
+                self._index.set_job_events(job, events, within=self._connection)
+
+    def shards(self) -> None:
+        for key, data in self._read(names.SHARDS, lambda key: key.endswith(".json")):
+            with self._each(key, "shards"):
+                self._index.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
+
+    def datasets(self) -> None:
+        """Datasets with what users did to them, snapshots, sets of objects."""
+        for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
+            with self._each(key, "datasets"):
+                record = parse_record(DatasetRecord, data, key)
+                self._index.add_dataset(record, within=self._connection)
+                if events := self._events(DatasetEvent, names.dataset_events(record.name)):
+                    self._index.set_dataset_events(record.name, events, within=self._connection)
+        for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
+            with self._each(key, "snapshots"):
+                self._index.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
+        for key, data in self._read(names.OBJECT_SETS, lambda key: key.endswith(".json")):
+            with self._each(key, "object_sets"):
+                self._index.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
+
+    def _events(self, model: type[EventT], prefix: str) -> list[EventT]:
+        found = []
+        for key, data in sorted(self._read(prefix, lambda key: True)):
+            with self._each(key):
+                found.append(parse_record(model, data, key))
+        return found
+
+    def _read(self, prefix: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+        """Keys and bytes of records; one that was removed since it was listed is no record."""
+        keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key)]
+        with ThreadPoolExecutor(_READERS) as pool:
+            for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
+                if data is not None:
+                    yield key, data
+
+    def _bytes(self, key: str) -> bytes | None:
+        try:
+            return self._store.get(key)
+        except NotFoundError:
+            return None
+
+    @contextmanager
+    def _each(self, key: str, what: str | None = None) -> Iterator[None]:
+        try:
+            with self._connection.begin_nested():
+                yield
+        except _OF_THE_RECORD as error:
+            self.left_out.append(key)
+            log.warning("%s is left out of the index: %s", key, error)
+            return
+        if what is not None:
+            self.counts[what] += 1
+            if self._progress is not None:
+                self._progress(what, self.counts[what])
+
+
+def complete_if_new(index: Index, store: Store) -> None:
+    """An index is whole, though nobody made it from the store, where the store holds no job yet."""
+    if index.completeness() is None and not any(
+        True for prefix in (names.JOBS, names.DATASETS) for _ in store.list(prefix)
+    ):
+        index.set_complete()
 
 
 def differences(index: Index, store: Store) -> list[str]:
-    """What `rebuild` would change, one line a row; empty if the index is what the store says."""
+    """Damaged records, then what `rebuild` would change, one line a row; empty if the index is what the store says."""
     with tempfile.TemporaryDirectory(prefix="graspd-index-") as folder:
         fresh = Index(f"sqlite:///{Path(folder) / 'index.sqlite'}")
         try:
             rebuild(fresh, store)
+            made = fresh.completeness()
+            damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
             with index.reading() as live, fresh.reading() as derived:
-                return [line for table in metadata.tables.values() for line in _compare(table, live, derived)][
-                    :_SHOWN_DIFFERENCES
-                ]
+                rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
+            return [*damaged, *rows][:_SHOWN_DIFFERENCES]
         finally:
             fresh.close()
 
@@ -128,17 +206,3 @@ def _lasting(row: dict[str, Any]) -> dict[str, Any]:
     if "verdict" in row:  # attempts of a check are not kept in the store: it either ends in a finding or is repeated
         row["last_attempt"] = 0
     return row
-
-
-def _assets(store: Store) -> Iterator[tuple[Any, Any]]:
-    for kind, digest in stored_assets(store):
-        yield load_asset(store, kind, digest), load_check(store, kind, digest)
-
-
-def _records(model: type[Any], store: Store, prefix: str, suffix: str) -> Iterable[Any]:
-    keys = [entry.key for entry in store.list(prefix) if entry.key.endswith(suffix)]
-    if prefix == names.JOBS:
-        keys = [key for key in keys if key.count("/") == 2]
-    with ThreadPoolExecutor(_READERS) as pool:
-        for key, data in zip(keys, pool.map(store.get, keys), strict=True):
-            yield parse_record(model, data, key)

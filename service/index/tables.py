@@ -193,8 +193,21 @@ workers: Final = Table(
     Column("reason", String(300), nullable=False, server_default=""),
 )
 
+notes: Final = Table(
+    "notes", metadata, Column("name", String(64), primary_key=True), Column("value", JSON, nullable=False)
+)
+
+damage: Final = Table(
+    "damage",
+    metadata,
+    Column("key", String(512), primary_key=True),
+    Column("what", Text, nullable=False),
+    Column("shard", String(64), nullable=False),
+    Column("found", String(32), nullable=False),
+)
+
 #: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
 LIVE_COLUMNS: Final = frozenset(
     {"queued", "not_before", "progress_done", "progress_total", "progress_message", "applied", "planned"}
 )
-LIVE_TABLES: Final = frozenset({"workers"})
+LIVE_TABLES: Final = frozenset({"workers", "notes", "damage"})

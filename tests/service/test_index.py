@@ -18,7 +18,7 @@ from sqlalchemy import delete, update
 from service import names, pipeline
 from service.clock import timestamp
 from service.domain import AssetKind, Lane, Origin, Stage, State
-from service.errors import ConflictError, IndexUnavailable, InputError, NotFoundError
+from service.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
 from service.index import tables
 from service.index.filters import GraspFilter, GraspSort
 from service.index.index import Index
@@ -30,7 +30,7 @@ from service.planning import message_of, plan
 from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, put_record, read_record
 from service.settings import Settings
-from service.store import open_store
+from service.store import Store, open_store
 from service.turns import Turns
 from service.version import STAGE_REVISIONS
 from tests.fakes import add_assets, make_shard, request
@@ -367,11 +367,15 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(parts: Parts) -> N
     assert differences(parts.index, parts.store) == []
 
 
-def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts) -> None:
+def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
     build_a_history(parts)
     jobs = len(parts.index.jobs(limit=99).items)
-    parts.store.put("shards/base/damaged.json", b"{")
-    with pytest.raises(Exception, match="damaged"):
+
+    def away(_store: Store, key: str) -> bytes:
+        raise StoreUnavailable("away")
+
+    monkeypatch.setattr(Store, "get", away)
+    with pytest.raises(StoreUnavailable):
         rebuild(parts.index, parts.store)
     assert len(parts.index.jobs(limit=99).items) == jobs
 
