@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.errors import InputError
-from worker.hands.load import assemble, main_file
+from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
 from worker.hands.options import HandOptions, parse_options
 from worker.hands.surface import sample_surface
@@ -34,7 +34,10 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
     except InputError as error:
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
-    stated = {"palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing)}
+    stated = {
+        "palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing),
+        "effort": not assumed_efforts(urdf, hand.dof_names, settings),
+    }  # fmt: skip
     facts = hand_facts(hand, urdf) | {
         "surface_area_m2": area,
         "guessed": [key for key, said in stated.items() if not said],

@@ -29,7 +29,7 @@ app = typer.Typer(add_completion=False)
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
 @reporting_errors
 def check(
-    file: Annotated[str, typer.Argument(help="A URDF, a ZIP of its folder, or the name of a built-in hand.")],
+    file: Annotated[str, typer.Argument(help="A URDF, its folder, a ZIP of that, or the name of a built-in hand.")],
     palm: PalmOption = None,
     approach: ApproachOption = None,
     root: RootOption = None,

@@ -1,9 +1,8 @@
-"""A hand from its files: URDF, meshes, `asset.json`."""
+"""A hand from its files: URDF, meshes, and what is said of it in `asset.json` or `hand.json`."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,12 +13,13 @@ from service.assets import builtin_files, builtin_names, unpack
 from service.digests import digest_files, digest_variant
 from service.domain import AssetKind
 from service.errors import HandError, NotFoundError
+from service.hand_files import files_of_hand
 from service.settings import Settings
 from service.transforms import compose
 from worker.hands.collisions import resting_neighbours
 from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
-from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, PLACEHOLDER_EFFORT, HandOptions, parse_options
+from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
 from worker.hands.primitives import volume
 from worker.hands.shapes import Hulls, find_mesh, make_piece
 from worker.hands.tree import Tree, build_tree, joint_type
@@ -35,10 +35,10 @@ def load_hand(
     """The hand that `files` describe.
 
     Args:
-        files: the URDF, its collision meshes and, if there is more to say, `asset.json` (see `HandOptions`).
+        files: the URDF, its meshes and, if there is more to say, `asset.json` or `hand.json` (see `parse_options`).
         name: name of the hand.
         digest: digest of its files.
-        options: keys that go over those of `asset.json`.
+        options: keys that go over those in the files.
 
     Raises:
         HandError: the files describe no usable hand; the message names what is wrong and the mend.
@@ -91,12 +91,13 @@ def assemble(
 
 
 def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
-    """Name of the URDF: as `asset.json` says, else the only one."""
+    """Name of the URDF: as the description says, else the only one; an XML file counts where there is no URDF."""
     if options.file:
         if options.file not in files:
             raise HandError(f"asset.json names the file {options.file!r}, which is not there")
         return options.file
-    found = sorted(name for name in files if name.lower().endswith((".urdf", ".xml")))
+    found = sorted(name for name in files if name.lower().endswith(".urdf"))
+    found = found or sorted(name for name in files if name.lower().endswith(".xml"))
     if len(found) != 1:
         raise HandError(f'{len(found)} URDF files among the hand\'s files; name one in asset.json under "file"')
     return found[0]
@@ -115,18 +116,20 @@ def _body_of(tree: Tree, joint: str) -> int:
     return next(body for body, carried in enumerate(tree.joint) if carried and carried.name == joint)
 
 
+def assumed_efforts(urdf: Urdf, dofs: Sequence[str], options: HandOptions) -> list[str]:
+    """Degrees of freedom whose limit of torque or force nobody states: neither the URDF nor the options."""
+    if isinstance(options.effort, float):
+        return []
+    return [dof for dof in dofs if dof not in (options.effort or {}) and urdf.joints[dof].effort <= 0]
+
+
 def _effort(urdf: Urdf, tree: Tree, options: HandOptions) -> Floats:
-    """(D,) stated, else the URDF's unless that is a placeholder."""
-    stated = options.effort if isinstance(options.effort, dict) else {}
+    """(D,) stated, else the URDF's, else assumed."""
+    assumed = assumed_efforts(urdf, tree.dof_names, options)
     values = []
     for dof in tree.dof_names:
-        effort = urdf.joints[dof].effort
-        if isinstance(options.effort, float):
-            effort = options.effort
-        elif dof in stated:
-            effort = stated[dof]
-        elif effort <= 0 or effort >= PLACEHOLDER_EFFORT:
-            effort = DEFAULT_EFFORT
+        stated = options.effort if isinstance(options.effort, float) else (options.effort or {}).get(dof)
+        effort = stated if stated is not None else DEFAULT_EFFORT if dof in assumed else urdf.joints[dof].effort
         if effort <= 0:
             raise HandError(f"the effort of {dof!r} is {effort:g}; it must be positive")
         values.append(effort)
@@ -154,7 +157,7 @@ def _masses(urdf: Urdf, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats:
 
 
 def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None) -> HandModel:
-    """A hand for the command line: name of a built-in, a URDF, or a ZIP of its folder.
+    """A hand for the command line: name of a built-in, a URDF, its folder, or a ZIP of that.
 
     Raises:
         NotFoundError: neither a file nor a built-in hand.
@@ -170,69 +173,17 @@ def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None) -
 
 
 def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
-    """Name, files and further options of the hand at `path`; only files inside the URDF's folder are read."""
+    """Name, files and further options of a hand: of a URDF, its folder, a ZIP of that, or a built-in's name."""
     path = Path(path)
-    if not path.is_file():
-        if str(path) in builtin_names(AssetKind.HAND):
-            return str(path), builtin_files(AssetKind.HAND, str(path)), {}
+    if not path.is_file() and str(path) in builtin_names(AssetKind.HAND):
+        return str(path), builtin_files(AssetKind.HAND, str(path)), {}
+    if not path.exists():
         known = ", ".join(builtin_names(AssetKind.HAND))
         raise NotFoundError(f"{path} is neither a file nor a built-in hand ({known})")
     if path.suffix.lower() == ".zip":
         return path.stem, unpack(path.read_bytes(), limit_bytes=8 * Settings().max_upload_bytes), {}
-    files = {path.name: path.read_bytes()}
-    folder = path.parent.resolve()
-    for reference in mesh_references(files[path.name], path.name):
-        for mesh in sorted(_candidates(folder, reference)):
-            files[mesh] = (folder / mesh).read_bytes()
-    beside = folder / "asset.json"
-    if beside.is_file():
-        files["asset.json"] = beside.read_bytes()
-        return path.stem, files, {"file": path.name}
-    described = folder / "hand.json"
-    return (
-        path.stem,
-        files,
-        {"file": path.name, **(read_hand_json(described, path.name) if described.is_file() else {})},
-    )
-
-
-def mesh_references(urdf: bytes, filename: str) -> list[str]:
-    """Names of the collision meshes as the URDF writes them."""
-    links = read_urdf(urdf, filename).links.values()
-    return sorted({shape.filename for link in links for shape in link.shapes if shape.filename})
-
-
-def _candidates(folder: Path, reference: str) -> set[str]:
-    """Relative names of existing files that the reference may mean; links that lead out of the folder are not."""
-    path = reference.partition("://")[2] or reference
-    shorter = "/".join(PurePosixPath(path).parts[1:]) if "://" in reference else ""
-    found = set()
-    for name in filter(None, (path, shorter)):
-        target = (folder / name).resolve()
-        if target.is_file() and target.is_relative_to(folder):
-            found.add(PurePosixPath(name).as_posix())
-    return found
-
-
-def read_hand_json(path: Path, urdf_name: str) -> dict[str, Any]:
-    """Options from a `hand.json` of reference data: palm link and normal, fingertip links, torque limit."""
-    try:
-        facts = json.loads(path.read_bytes())
-        if facts.get("urdf", urdf_name) != urdf_name:
-            return {}
-        options: dict[str, Any] = {}
-        if "palm_link" in facts:
-            options["palm"] = {"link": facts["palm_link"], "approach": facts.get("palm_normal_in_palm_link")}
-            # Forearm and wrist carry no grasp: what lies above the palm is left out.
-            options["root"] = facts["palm_link"]
-        if facts.get("fingertips"):
-            options["fingertips"] = list(dict(facts["fingertips"]).values())
-        limits = [v for k, v in facts.get("physical", {}).items() if k.startswith("torque_limit_Nm")]
-        if limits:
-            options["effort"] = float(limits[0])
-    except (ValueError, TypeError, AttributeError):
-        raise HandError(f"{path} is not a readable description of a hand; correct or remove it") from None
-    return options
+    files = {name: file.read_bytes() for name, file in files_of_hand(path).items()}
+    return path.resolve().stem, files, {} if path.is_dir() else {"file": path.name}
 
 
 __all__ = ["files_from_path", "find_mesh", "hand_from_path", "load_hand"]

@@ -1,4 +1,4 @@
-"""What a hand's `asset.json` may say beside the URDF: the facts that a URDF cannot hold or often holds wrongly."""
+"""What may be said of a hand beside its URDF: the facts that a URDF cannot hold or often holds wrongly."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ Vector = tuple[Finite, Finite, Finite]
 
 #: Position gain of the joints, Kp [N m/rad], where nothing is said: the value of the DexGraspBench protocol.
 DEFAULT_STIFFNESS: Final = 5.0
-#: Torque limit [N m] in place of a placeholder (0, or 5 and more): what FRoGGeR uses for the Allegro hand.
+#: Torque limit [N m] where the URDF gives none or 0: what FRoGGeR uses for the Allegro hand.
 DEFAULT_EFFORT: Final = 0.7
-PLACEHOLDER_EFFORT: Final = 5.0
 
 
 class _Options(BaseModel):
@@ -66,19 +65,53 @@ class HandOptions(_Options):
 
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> HandOptions:
-    """Options of the hand in `files`, with `extra` over what its `asset.json` says.
+    """Options of the hand in `files`: what its `hand.json` notes, over it its `asset.json`, over both `extra`.
 
     Raises:
-        HandError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it.
+        HandError: one of them is not JSON, or a key is unknown or wrong; the message names it.
     """
+    stated = {**_asset_json(files), **(extra or {})}
     try:
-        stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
-        if not isinstance(stated, dict):
-            raise HandError("asset.json must hold a JSON object")
-    except (ValueError, RecursionError):
-        raise HandError('asset.json is not JSON; write an object such as {"file": "hand.urdf"}') from None
-    try:
-        return HandOptions.model_validate({**stated, **(extra or {})})
+        return HandOptions.model_validate({**_hand_json(files, stated.get("file")), **stated})
     except ValidationError as error:
         first = error.errors()[0]
-        raise HandError(f"asset.json: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        place = "asset.json" if first["loc"][0] in stated else "hand.json"
+        raise HandError(f"{place}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def _asset_json(files: Mapping[str, bytes]) -> dict[str, Any]:
+    try:
+        stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
+    except (ValueError, RecursionError):
+        raise HandError('asset.json is not JSON; write an object such as {"file": "hand.urdf"}') from None
+    if not isinstance(stated, dict):
+        raise HandError("asset.json must hold a JSON object")
+    return stated
+
+
+def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
+    """Options from the notes of a collection of hands: palm link and normal, fingertip links, torque limit.
+
+    Args:
+        urdf: name of the hand's URDF where it is known; notes on another one say nothing.
+    """
+    if "hand.json" not in files:
+        return {}
+    options: dict[str, Any] = {}
+    try:
+        notes = json.loads(files["hand.json"])
+        noted = notes.get("urdf", urdf)
+        if noted is not None and (noted not in files or noted != (urdf or noted)):
+            return {}
+        if "palm_link" in notes:
+            options["palm"] = {"link": notes["palm_link"], "approach": notes.get("palm_normal_in_palm_link")}
+            # Forearm and wrist carry no grasp: what lies above the palm is left out.
+            options["root"] = notes["palm_link"]
+        if notes.get("fingertips"):
+            options["fingertips"] = list(dict(notes["fingertips"]).values())
+        limits = [value for key, value in notes.get("physical", {}).items() if key.startswith("torque_limit_Nm")]
+        if limits:
+            options["effort"] = float(limits[0])
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        raise HandError("hand.json is not a readable description of a hand; correct or remove it") from None
+    return options

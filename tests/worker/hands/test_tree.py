@@ -111,12 +111,14 @@ def test_an_option_that_cannot_be_is_named(options: dict[str, Any], named: str) 
         load(chain(*THREE), **options)
 
 
-def test_a_placeholder_effort_is_replaced_and_a_real_one_kept() -> None:
-    limits = [f'<limit lower="0" upper="1" effort="{effort}" velocity="1"/>' for effort in (0, 10, 1.2)]
+def test_an_effort_is_assumed_only_where_the_urdf_gives_none() -> None:
     joints = [
-        joint(f"j{i}", p, c, limit=x) for i, (p, c, x) in enumerate(zip(["palm", "a", "b"], "abc", limits, strict=True))
+        joint(f"j{i}", p, c, limit=f'<limit lower="0" upper="1" {said} velocity="1"/>')
+        for i, (p, c, said) in enumerate(
+            [("palm", "a", 'effort="0"'), ("a", "b", ""), ("b", "c", 'effort="5.0"'), ("c", "d", 'effort="100"')]
+        )
     ]
-    np.testing.assert_allclose(load(chain(*joints)).effort, [0.7, 0.7, 1.2])
+    np.testing.assert_allclose(load(chain(*joints, links="abcd")).effort, [0.7, 0.7, 5.0, 100.0])
 
 
 def test_a_continuous_joint_turns_one_way_round() -> None:
