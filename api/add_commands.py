@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.add_sets import add_set, files_of_set, name_of_set, one_of_set, sweep
+from api.add_sets import add_set, name_of_set, one_of_set, sweep
 from api.hand_files import upload_of
 from api.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
@@ -34,6 +34,7 @@ from service.asset_options import (
 from service.cli import JsonFlag, reporting_errors
 from service.domain import AssetKind
 from service.errors import InputError
+from service.object_sets import files_of_set
 
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]

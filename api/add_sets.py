@@ -13,33 +13,14 @@ import typer
 from api.client import Client
 from api.dataset_client import DatasetClient
 from api.reports import open_client
-from api.uploads import UNPACK_FACTOR, name_of_upload
+from api.uploads import name_of_upload
 from service.asset_summary import verdict_line
 from service.assets import pack
-from service.cli import emit, load_settings
+from service.cli import emit
 from service.descriptions import json_object
 from service.domain import AssetKind
 from service.errors import InputError
-from service.object_sets import SUFFIXES, object_set, read_set
-
-Objects = dict[str, dict[str, bytes]]
-
-
-def files_of_set(path: Path) -> Objects | None:
-    """Names and files of the objects in a folder, or in a ZIP of several; None if the path is one object.
-
-    Raises:
-        InputError: no mesh in the folder, or no readable ZIP.
-        LimitError: more than the service would take in one ZIP.
-    """
-    if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
-        return None
-    files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
-    # A description at the top speaks of one object, however many meshes lie around it.
-    if path.is_file() and "asset.json" in files:
-        return None
-    found = object_set(files)
-    return found if path.is_dir() or len(found) > 1 else None
+from service.object_sets import SUFFIXES, Objects
 
 
 def one_of_set(path: Path, name: str | None) -> Objects:

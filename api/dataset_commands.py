@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
-from api.add_sets import Objects, files_of_set, name_of_set, upload_set
+from api.add_sets import name_of_set, upload_set
 from api.client import Client
 from api.dashboard.filters import count, percent, size
 from api.dataset_client import DatasetClient
@@ -26,6 +26,7 @@ from service.datasets.spec import DatasetRequest, Matrix
 from service.domain import State
 from service.errors import InputError, TaskError
 from service.index.dataset_views import DatasetView
+from service.object_sets import Objects, files_of_set
 
 app = typer.Typer(no_args_is_help=True)
 group = typer.Typer(no_args_is_help=True, help="Hands x objects as one dataset: cost, status, snapshots, files.")

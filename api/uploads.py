@@ -9,7 +9,7 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
 from typing import IO, Final
 
-from service.assets import ZipFiles, asset_json, check_path
+from service.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from service.descriptions import json_object
 from service.domain import AssetKind
 from service.errors import InputError, LimitError
@@ -18,8 +18,6 @@ MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: (".urdf", ".xml"),
     AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off"),
 }
-#: A small archive may unpack to much more: robot meshes compress about four to one, so this refuses only bombs.
-UNPACK_FACTOR: Final = 8
 _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 
 

@@ -28,6 +28,8 @@ MAX_FILES: Final = 2000
 #: Of one name, and of all together: they stand in every list of hands or objects.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
+#: A small archive may unpack to much more: robot meshes compress about four to one, so this refuses only bombs.
+UNPACK_FACTOR: Final = 8
 _PIECE_BYTES: Final = 1 << 16
 
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from service.assets import MAX_FILES, unpack
+from service.assets import MAX_FILES, UNPACK_FACTOR, unpack
+from service.cli import load_settings
 from service.errors import InputError, LimitError
 
 #: Meshes by their file names.
@@ -16,6 +17,27 @@ SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Folders inside an object's folder that say how the mesh was made, not what it shows.
 _INNER: Final = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds", "meshes", "mesh", "visual")
+
+
+#: Name -> files of each object.
+Objects = dict[str, dict[str, bytes]]
+
+
+def files_of_set(path: Path) -> Objects | None:
+    """Names and files of the objects in a folder, or in a ZIP of several; None if the path is one object.
+
+    Raises:
+        InputError: no mesh in the folder, or no readable ZIP.
+        LimitError: more than the service would take in one ZIP.
+    """
+    if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
+        return None
+    files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
+    # A description at the top speaks of one object, however many meshes lie around it.
+    if path.is_file() and "asset.json" in files:
+        return None
+    found = object_set(files)
+    return found if path.is_dir() or len(found) > 1 else None
 
 
 def object_set(files: Mapping[str, bytes]) -> dict[str, dict[str, bytes]]:

@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 from api import add_sets
 from api.add_commands import add_object
-from api.add_sets import files_of_set
 from api.client import Client
 from service.asset_options import sizes_of
 from service.assets import pack
 from service.domain import AssetKind
 from service.errors import InputError
+from service.object_sets import files_of_set
 
 STL = b"solid box\nendsolid box\n"
 

@@ -35,6 +35,30 @@ def test_a_built_in_is_accepted_with_exit_code_0(kind: str, name: str) -> None:
     assert report["verdict"] == "accept" and report["repairs"] == [] and report["message"] and report["facts"]
 
 
+def test_a_folder_of_objects_gets_a_verdict_each_and_exit_code_2_if_one_is_refused(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    for source, name in (("quads_and_ngons.obj", "prism"), ("inverted_normals.stl", "mug"), ("garbage.stl", "noise")):
+        folder = tmp_path / "set" / name
+        folder.mkdir(parents=True)
+        (folder / source).write_bytes((shared_data / "bad" / source).read_bytes())
+    code, report = check("objects", "check", str(tmp_path / "set"))
+    assert code == 2 and report["refused"] == ["noise"]
+    said = {one["name"]: one["verdict"] for one in report["objects"]}
+    assert said == {"mug": "repair", "noise": "refuse", "prism": "accept"}
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "set")])
+    assert [line.split()[0] for line in told.stdout.splitlines()] == ["repair", "refuse", "accept"]
+    assert "1 of 3 objects were refused: noise" in told.stderr
+    (tmp_path / "set" / "noise" / "garbage.stl").unlink()
+    code, report = check("objects", "check", str(tmp_path / "set"))
+    assert code == 0 and report["refused"] == []
+
+
+def test_a_folder_without_a_mesh_is_a_mistake(tmp_path: Path) -> None:
+    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path)])
+    assert told.exit_code == 2 and "no mesh" in told.stderr
+
+
 @pytest.mark.parametrize(
     ("file", "options", "verdict"),
     [

@@ -1,13 +1,12 @@
-"""DexGraspBench's layout: one pickled dictionary a grasp, `graspdata/<object>/<scale and pose>/<number>.npy`.
+"""DexGraspBench's layout: one pickled dictionary a grasp, and the files that its evaluator needs to judge it.
 
 Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
-position, root quaternion w x y z, joints. Root and object stand in one world frame. The hand's root is that of the
-model which a benchmark's configuration names: read with the URDF that the grasps were written with.
+position, root quaternion w x y z, joints. Root and object stand in one world frame. Root and order of the joints are
+those of the model that a benchmark's configuration names; a mapping beside the grasps says how ours lie in it.
 """
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +17,11 @@ from numpy.typing import NDArray
 
 from service.errors import InputError
 from service.transforms import IDENTITY_POSE, compose, invert
-from worker.exchange.imported import Imported
-from worker.exchange.objects import mesh_file, scaled_object
+from worker.exchange.bench_hand import joint_order, write_hand
+from worker.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
+from worker.exchange.bench_object import SCALE, write_object
+from worker.exchange.imported import Imported, plain_name
+from worker.exchange.objects import scaled_object
 from worker.exchange.pickles import load_npy
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
@@ -29,7 +31,8 @@ from worker.objects.model import ObjectModel
 Floats = NDArray[np.float64]
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-_FOLDER: Final = "graspdata"
+#: Prefix of the configurations of our hands, and name of the experiment that the grasps are.
+NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
@@ -37,50 +40,67 @@ def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
 
     Args:
         path: a file, or a folder searched whole.
-        hand: URDF or built-in hand whose root and order of joints the files have.
+        hand: URDF or built-in hand; without a mapping beside the grasps, the one whose root and joints they have.
         obj: mesh or built-in object at scale 1.
 
     Raises:
-        InputError: no such files, or they do not fit the hand.
+        InputError: no such files, grasps for several models of a hand, or they do not fit the hand.
     """
-    files = [path] if path.is_file() else sorted(path.rglob("*.npy"))
+    # Descriptions of scenes are pickled dictionaries too.
+    files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
         raise InputError(f"{path} has no .npy files; DexGraspBench has one for each grasp")
+    mappings = {mapping_of(file) for file in files}
+    if len(mappings) > 1:
+        names = ", ".join(sorted(one.config if one else "another" for one in mappings))
+        raise InputError(f"{path} holds grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
     by_scale: dict[float, list[dict[str, Any]]] = defaultdict(list)
     for file in files:
         row = _row(file)
         by_scale[_scale(row)].append(row)
-    model = hand_from_path(hand)
-    return [_set(path, model, scaled_object(obj, scale), rows, scale) for scale, rows in sorted(by_scale.items())]
+    model, mapping = hand_from_path(hand), mappings.pop()
+    return [
+        _set(path, model, scaled_object(obj, scale), rows, scale, mapping) for scale, rows in sorted(by_scale.items())
+    ]
 
 
 def write(hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path) -> list[Path]:
-    """Write grasps in this layout, the object at scale 1 in the origin, with its mesh and a note on the hand's root.
+    """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
+
+    The object stands at scale 1 in the origin. The hand goes with it as a model of our own; where the benchmark has a
+    model of the same hand, the grasps are written for that one as well.
 
     Returns:
-        the files, one for each grasp.
+        the files of the grasps, one each, for our model of the hand.
+
+    Raises:
+        MeshError: the object's convex pieces are no picture of it.
     """
-    out = folder / _FOLDER / obj.name / "scale100_pose000"
-    out.mkdir(parents=True, exist_ok=True)
-    meshes = folder / "assets" / "object" / obj.name
-    meshes.mkdir(parents=True, exist_ok=True)
-    mesh = mesh_file(obj, meshes / "mesh.obj")
-    note = {
-        "hand": hand.name, "root_link": hand.root_link, "joint_names": list(hand.joint_names), "unit": "m, rad",
-        "quaternion": "w x y z", "object_frame": "mesh.obj",
-    }  # fmt: skip
-    (folder / f"hand_{hand.name}.json").write_text(json.dumps(note, indent=1) + "\n")
-    paths = []
-    for row in rows:
-        record: dict[str, Any] = {
-            "obj_path": str(mesh.parent.relative_to(folder)), "obj_scale": 1.0, "obj_pose": IDENTITY_POSE.copy(),
-        }  # fmt: skip
-        for name in POSTURES:
-            posture: Posture = getattr(grasps, name)
-            record[f"{name}_qpos"] = np.concatenate([posture.hand_pose[row], posture.joint_positions[row]])
-        path = out / f"{row}.npy"
-        np.save(path, np.array(record, dtype=object), allow_pickle=True)
-        paths.append(path)
+    name, config = plain_name(obj.name), f"{NAME}_{plain_name(hand.name)}"
+    obj_path, scene = write_object(obj, name, folder)
+    model = write_hand(hand, config, folder)
+    order = joint_order(folder / model)
+    ours = HandMapping(
+        hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), tuple((j, j) for j in order),
+        link_names(hand),
+    )  # fmt: skip
+    paths: list[Path] = []
+    for mapping in filter(None, (ours, of_the_benchmark(hand))):
+        out = folder / "output" / f"{NAME}_{mapping.config}"
+        place = out / GRASPS / name / f"{SCALE}_pose000"
+        place.mkdir(parents=True, exist_ok=True)
+        mapping.write(out)
+        written = [place / f"{row}.npy" for row in rows]
+        for row, file in zip(rows, written, strict=True):
+            record: dict[str, Any] = {
+                "obj_path": obj_path.as_posix(), "obj_scale": 1.0, "obj_pose": IDENTITY_POSE.copy(),
+                "scene_path": scene.as_posix(),
+            }  # fmt: skip
+            for posture in POSTURES:
+                found: Posture = getattr(grasps, posture)
+                record[f"{posture}_qpos"] = mapping.qpos(hand, found.hand_pose[row], found.joint_positions[row])
+            np.save(file, np.array(record, dtype=object), allow_pickle=True)
+        paths = paths or written
     return paths
 
 
@@ -97,16 +117,20 @@ def _scale(row: dict[str, Any]) -> float:
     return float(np.ravel(row.get("obj_scale", 1.0))[0])
 
 
-def _set(path: Path, hand: HandModel, obj: ObjectModel, rows: list[dict[str, Any]], scale: float) -> Imported:
+def _set(
+    path: Path, hand: HandModel, obj: ObjectModel, rows: list[dict[str, Any]], scale: float, mapping: HandMapping | None
+) -> Imported:
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
-    parts = {name: _posture(path, hand, name, rows, pose) for name in POSTURES}
+    parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
     name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
     return Imported(hand, obj, grasps, name, scale, published)
 
 
-def _posture(path: Path, hand: HandModel, name: str, rows: list[dict[str, Any]], obj_pose: Floats) -> Posture:
+def _posture(
+    path: Path, hand: HandModel, name: str, rows: list[dict[str, Any]], obj_pose: Floats, mapping: HandMapping | None
+) -> Posture:
     try:
         qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)
     except ValueError as error:
@@ -116,4 +140,5 @@ def _posture(path: Path, hand: HandModel, name: str, rows: list[dict[str, Any]],
             f"{path}: {name}_qpos has {qpos.shape[1]} numbers, {hand.name} needs 7 + {len(hand.joint_names)}; "
             "is --hand the right hand?"
         )
-    return Posture(compose(invert(obj_pose), qpos[:, :7]), qpos[:, 7:])
+    root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
+    return Posture(compose(invert(obj_pose), root), joints)

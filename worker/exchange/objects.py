@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +28,13 @@ def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
 
 def mesh_file(obj: ObjectModel, path: Path) -> Path:
     """The object's prepared mesh as an OBJ file, for readers that have no other."""
-    lines = [f"# {obj.name}, metres"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in obj.vertices]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in obj.faces]
+    return write_obj(path, obj.vertices, obj.faces, f"{obj.name}, metres")
+
+
+def write_obj(path: Path, vertices: Any, faces: Any, comment: str = "metres") -> Path:
+    """Write a triangle mesh (V, 3), (F, 3) as an OBJ file."""
+    lines = [f"# {comment}"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
     path.write_text("\n".join(lines) + "\n")
     return path

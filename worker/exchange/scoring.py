@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from service.domain import AssetKind, JobRequest
 from service.errors import InputError
 from service.shards import Attribute, json_attribute, write_shard
 from worker.certified import scored
-from worker.exchange.imported import Imported, Origin
+from worker.exchange.imported import Imported, Origin, plain_name
 from worker.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
 from worker.stages.synthesize import postures
@@ -66,11 +65,6 @@ def write_scored(
     columns: dict[str, Any] = {**postures(made.grasps), **made.columns}
     path.write_bytes(write_shard("base", columns, attributes))
     return path
-
-
-def plain_name(name: str) -> str:
-    """A name fit for files and addresses."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:64] or "unnamed"
 
 
 def _digest(mesh: Path) -> str:

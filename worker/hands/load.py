@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from service.assets import builtin_files, builtin_names, unpack
+from service.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from service.digests import digest_files, digest_variant
 from service.domain import AssetKind
 from service.errors import HandError, NotFoundError
@@ -181,7 +181,7 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         known = ", ".join(builtin_names(AssetKind.HAND))
         raise NotFoundError(f"{path} is neither a file nor a built-in hand ({known})")
     if path.suffix.lower() == ".zip":
-        return path.stem, unpack(path.read_bytes(), limit_bytes=8 * Settings().max_upload_bytes), {}
+        return path.stem, unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes), {}
     files = {name: file.read_bytes() for name, file in files_of_hand(path).items()}
     return path.resolve().stem, files, {} if path.is_dir() else {"file": path.name}
 

@@ -16,10 +16,12 @@ from service.asset_options import (
     UnitsOption,
     object_options,
 )
-from service.asset_summary import say_check
+from service.asset_summary import say_check, verdict_line
+from service.assets import builtin_names
 from service.cli import JsonFlag, emit, reporting_errors
 from service.domain import AssetKind
 from service.errors import GraspdError, InputError
+from service.object_sets import Objects, files_of_set
 from worker.objects.check import check_object
 from worker.objects.prepare import files_from_path, object_from_path
 
@@ -29,7 +31,9 @@ app = typer.Typer(add_completion=False)
 @app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
 @reporting_errors
 def check(
-    file: Annotated[str, typer.Argument(help="A mesh (STL, OBJ, PLY, OFF, GLB), a ZIP, or the name of a built-in.")],
+    file: Annotated[
+        str, typer.Argument(help="A mesh (STL, OBJ, PLY, OFF, GLB), a built-in; or a folder or ZIP of one or many.")
+    ],
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
@@ -43,6 +47,11 @@ def check(
     options = object_options(
         units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
     )
+    if several := _several(file):
+        if picture:
+            raise InputError(f"--picture draws one object; {file} holds {len(several)}")
+        _check_set(several, options, json=json)
+        return
     report = report_object(file, options)
     if picture and report["verdict"] != "refuse":
         from worker.rendering.portraits import object_portrait, write_png
@@ -54,6 +63,32 @@ def check(
         say_check(AssetKind.OBJECT, report)
     if report["verdict"] == "refuse":
         raise typer.Exit(InputError.exit_code)
+
+
+def _several(file: str) -> Objects | None:
+    """The objects of a folder or of a ZIP of several; None for one object, readable or not."""
+    if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
+        return None
+    try:
+        return files_of_set(Path(file))
+    except InputError:
+        if Path(file).is_dir():
+            raise
+        return None
+
+
+def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None:
+    """A line for each object; what is refused does not stop the others."""
+    reports = []
+    for name, files in objects.items():
+        reports.append({"name": name, **check_object(files, name, **options)})
+        if not json:
+            typer.echo(verdict_line(reports[-1]))
+    refused = [str(one["name"]) for one in reports if one["verdict"] == "refuse"]
+    if json:
+        emit({"objects": reports, "refused": refused})
+    if refused:
+        raise InputError(f"{len(refused)} of {len(reports)} objects were refused: {', '.join(refused[:5])}")
 
 
 def report_object(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:

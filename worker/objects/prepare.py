@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from service.assets import builtin_files, builtin_names, unpack
+from service.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from service.digests import digest_files, digest_variant
 from service.domain import AssetKind
 from service.errors import GraspdError, MeshError, NotFoundError
@@ -143,7 +143,7 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         known = ", ".join(builtin_names(AssetKind.OBJECT))
         raise NotFoundError(f"{path} is neither a file nor a built-in object ({known})")
     if path.suffix.lower() == ".zip":
-        return path.stem, unpack(path.read_bytes(), limit_bytes=8 * Settings().max_upload_bytes), {}
+        return path.stem, unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes), {}
     files = {path.name: path.read_bytes()}
     beside = path.parent / "asset.json"
     if beside.is_file():

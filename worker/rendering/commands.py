@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 import typer
@@ -27,6 +27,10 @@ from worker.scenes.commands import INHERITED
 from worker.scenes.sources import hand_of_shard, neighbours_of_shard, object_of_shard
 
 app = typer.Typer(add_completion=False)
+
+#: Edge of a grasp's picture [px]. What tracing costs goes with the pixels: three small ones cost less than a large one.
+ALONE: Final = 300
+SIDE_OF_THREE: Final = 160
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")]
@@ -104,7 +108,9 @@ def pictures(
     grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=400, help="How many of the best grasps.")] = 12,
     three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
-    size: Annotated[int, typer.Option(min=32, max=2048, help="Edge of one picture [px].")] = 300,
+    size: Annotated[
+        int | None, typer.Option(min=32, max=2048, help="Edge of one picture [px]; 300, with --three-sides 160.")
+    ] = None,
     hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
     object: _Object = None,
     device: _Device = "auto",
@@ -119,7 +125,8 @@ def pictures(
     rows = best(base.arrays, count)
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     sides = THREE_SIDES if three else THREE_SIDES[:1]
-    drawn = grasp_pictures(model, obj, poses, joints, (size, size), sides, device=Device(device).resolve())
+    edge = size or (SIDE_OF_THREE if three else ALONE)
+    drawn = grasp_pictures(model, obj, poses, joints, (edge, edge), sides, device=Device(device).resolve())
     title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
     valid = int(np.asarray(base["quality/valid"]).sum())
     subtitle = f"{len(rows)} of {len(base['quality/valid'])} grasps, {valid} valid, by epsilon at 5 mm"

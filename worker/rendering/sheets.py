@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -100,20 +100,25 @@ def three_sides_sheet(
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
-    """PNG of a views shard: per placement the left and right picture, depth, segmentation and boxes."""
-    rgb, eye = np.asarray(views["image/rgb"], np.uint8), np.asarray(views["camera/eye"])
-    first = np.flatnonzero(eye != 2)
-    stereo = bool((eye == 2).any())
-    height, width = rgb.shape[1:3]
-    heads = (["left", "right"] if stereo else ["colour"]) + ["depth", "segmentation", "boxes"]
+    """PNG of a views shard: per placement left and right picture, depth, segmentation, boxes and, if there, hand."""
+    eye = np.asarray(views["camera/eye"])
+    stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
+    columns: dict[str, Callable[[int], Image.Image]] = {
+        "left" if stereo else "colour": lambda view: _colours(views, "image/rgb", view),
+        "right": lambda view: _colours(views, "image/rgb", view + 1),
+        "depth": lambda view: _depth(views, view),
+        "segmentation": lambda view: _segments(views, view),
+        "boxes": lambda view: _boxes(views, view),
+        "hand": lambda view: _colours(views, "image/rgb_hand", view),
+    }
+    heads = [head for head in columns if (stereo or head != "right") and (head != "hand" or "image/rgb_hand" in views)]
+    height, width = np.asarray(views["image/rgb"]).shape[1:3]
     page, draw, top = _page(len(heads), len(first), width, height, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
-        type_.text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, type_.QUIET)
-    for row, view in enumerate(first.tolist()):
-        colours = [rgb[view], rgb[view + 1]] if stereo else [rgb[view]]
-        cells = [*map(Image.fromarray, colours), _depth(views, view), _segments(views, view), _boxes(views, view)]
-        for column, cell in enumerate(cells):
-            page.paste(cell, (MARGIN + column * (width + GAP), top + row * (height + GAP)))
+        x = MARGIN + column * (width + GAP)
+        type_.text(draw, (x, top - 10), head, 15, type_.QUIET)
+        for row, view in enumerate(first.tolist()):
+            page.paste(columns[head](view), (x, top + row * (height + GAP)))
     return type_.png(page)
 
 
@@ -171,6 +176,10 @@ def _caption(
     for k, (label, value) in enumerate(pairs):
         type_.text(draw, (left + k * step, y + 18), label, 11, type_.QUIET)
         type_.text(draw, (left + k * step, y + 35), value, 14, type_.INK)
+
+
+def _colours(views: Arrays, path: str, view: int) -> Image.Image:
+    return Image.fromarray(np.asarray(views[path][view], np.uint8))
 
 
 def _depth(views: Arrays, view: int) -> Image.Image:

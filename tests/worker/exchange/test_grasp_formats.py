@@ -53,7 +53,7 @@ def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
-    (back,) = dexgraspbench.read(tmp_path / "graspdata", hand="barrett", obj="block")
+    (back,) = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     np.testing.assert_allclose(back.grasps.squeeze.hand_pose, grasps.squeeze.hand_pose, atol=TINY)
     np.testing.assert_array_equal(back.grasps.pregrasp.joint_positions, grasps.pregrasp.joint_positions)
     ours, theirs = (judge(hand, block, some).success for some in (grasps, back.grasps))
@@ -80,7 +80,7 @@ def test_dexgraspbench_scales_become_sets_of_their_own(
 ) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
     np.save(paths[0], np.array(load_npy(paths[0]) | {"obj_scale": 0.5}, dtype=object), allow_pickle=True)
-    sets = dexgraspbench.read(tmp_path / "graspdata", hand="barrett", obj="block")
+    sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     assert [one.scale for one in sets] == [0.5, 1.0]
     assert np.ptp(sets[0].obj.vertices, axis=0) == pytest.approx(np.ptp(block.vertices, axis=0) / 2, rel=1e-6)
 
@@ -90,7 +90,7 @@ def test_dexgraspbench_of_another_hand_is_told(
 ) -> None:
     dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     with pytest.raises(InputError, match="is --hand the right hand"):
-        dexgraspbench.read(tmp_path / "graspdata", hand="allegro", obj="block")
+        dexgraspbench.read(tmp_path, hand="allegro", obj="block")
 
 
 def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_imported_grasps_are_scored_and_say_where_they_come_from(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
-    (found,) = dexgraspbench.read(tmp_path / "bench" / "graspdata", hand="barrett", obj="block")
+    (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     path = write_scored(
         found, Origin("dexgraspbench", "a test", "CC0-1.0"), tmp_path / "out", referee="screen", friction=1
     )

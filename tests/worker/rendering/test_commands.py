@@ -14,6 +14,7 @@ from service.shards import json_attribute, read_shard, write_shard
 from worker.exchange.commands import app as exchange
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
+from worker.rendering import commands
 from worker.rendering.commands import app as rendering
 from worker.scenes.commands import app as scenes
 
@@ -129,6 +130,20 @@ def test_render_writes_the_channels_cameras_and_hand_that_are_asked_for(base, sc
     # The hand of the base shard is high above the table: its best grasp by epsilon is the last.
     kept = read_shard(scene_shard, kind="scene")["grasp/base_index"][views["camera/hand_grasp"]]
     assert kept.tolist() == [2, 2]
+
+
+def test_three_sides_of_a_grasp_trace_fewer_pixels_than_one_large_picture(base, monkeypatch):
+    traced = []
+
+    def count(hand, obj, pose, joints, size, sides, **options):
+        traced.append(len(sides) * size[0] * size[1])
+        return np.zeros((len(pose), len(sides), size[1], size[0], 3), np.uint8)
+
+    monkeypatch.setattr(commands, "grasp_pictures", count)
+    for arguments in ([], ["--three-sides"], ["--three-sides", "--size", "300"]):
+        output = str(base.with_name("sheet.png"))
+        assert CliRunner().invoke(rendering, ["pictures", str(base), "-o", output, *arguments]).exit_code == 0
+    assert traced[1] < traced[0] and traced[2] == 3 * traced[0]
 
 
 def test_neighbours_travel_from_the_scene_to_the_labels_of_the_exported_pictures(base):

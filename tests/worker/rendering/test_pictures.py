@@ -12,7 +12,7 @@ from PIL import Image
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.rendering import render
 from worker.rendering.pictures import THREE_SIDES, grasp_pictures, three_sides
-from worker.rendering.sheets import best, contact_sheet, figures, three_sides_sheet, views_page
+from worker.rendering.sheets import GAP, MARGIN, best, contact_sheet, figures, three_sides_sheet, views_page
 from worker.rendering.typography import PAPER, depth_colours
 
 HAND = two_finger_hand()
@@ -103,6 +103,17 @@ def test_a_views_page_has_a_row_per_placement(block, stereo, cells):
     page = opened(views_page(views, title="block"))
     assert page.shape[1] > cells * 64
     assert page.shape[0] > 2 * 48
+
+
+def test_a_views_page_shows_the_pictures_with_a_hand_where_there_are_any(block):
+    pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
+    views = render(block, pose, views=1, stereo=False, width=64, height=48, seed=0, device="cpu", samples=2)
+    without = opened(views_page(views, title="block"))
+    views["image/rgb_hand"] = np.full((1, 48, 64, 3), [255, 0, 255], np.uint8)
+    page = opened(views_page(views, title="block"))
+    assert page.shape[1] == without.shape[1] + 64 + GAP
+    shown = (page == [255, 0, 255]).all(axis=-1)
+    assert shown.sum() == 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
 
 
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():

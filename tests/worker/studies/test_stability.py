@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +105,14 @@ def test_a_long_run_does_not_drift(pair: Pair) -> None:
     drift = descents.descend(pair, state, FIDELITIES["draft"], iterations=1500).drift
     # float32: a normalised quaternion is off by a few units in the last place, 6e-8, and never by nothing at all.
     assert 0 < drift < 1e-6
+
+
+@pytest.mark.slow
+def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
+    started = time.process_time()
+    found = studies.run(STUDIES, "allegro", "block", quick=True, long=False, threads=0, say=lambda line: None)
+    assert time.process_time() - started < 60  # CPU seconds: others may keep the machine busy
+    assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 
 
 def test_what_is_no_number_is_broken() -> None:

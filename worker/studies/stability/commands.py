@@ -28,9 +28,7 @@ def stability(
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(STUDIES)}; several times.")] = None,
     hand: Annotated[str, typer.Option(help="A URDF or a built-in hand.")] = "allegro",
     object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "block",
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few cells of each map: a minute, not a quarter of an hour.")
-    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Few cells of each map: under a minute of CPU time.")] = False,
     long: Annotated[bool, typer.Option("--long", help="Runs of 100,000 iterations as well.")] = False,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,

@@ -82,6 +82,8 @@ DEFECTS: Final[dict[str, tuple[Callable[[], Any], dict[str, Any]]]] = {
     "inside out": (_inverted, {}),
     "every other face inside out": (_half_inverted, {}),
 }
+#: Those that ingest refuses or closes.
+CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not options)
 
 
 def shape_map(
