@@ -19,7 +19,7 @@ from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
 from worker.rendering.given import SAMPLED, read_cameras
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pictures import THREE_SIDES, grasp_pictures
+from worker.rendering.pictures import SAMPLES, THREE_SIDES, grasp_pictures
 from worker.rendering.sheets import best, best_kept, contact_sheet, figures, three_sides_sheet, views_page
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
@@ -28,9 +28,9 @@ from worker.scenes.sources import hand_of_shard, neighbours_of_shard, object_of_
 
 app = typer.Typer(add_completion=False)
 
-#: Edge of a grasp's picture [px]. What tracing costs goes with the pixels: three small ones cost less than a large one.
-ALONE: Final = 300
-SIDE_OF_THREE: Final = 160
+#: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
+ALONE: Final = (300, SAMPLES)
+OF_THREE: Final = (160, 8)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")]
@@ -125,8 +125,11 @@ def pictures(
     rows = best(base.arrays, count)
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     sides = THREE_SIDES if three else THREE_SIDES[:1]
-    edge = size or (SIDE_OF_THREE if three else ALONE)
-    drawn = grasp_pictures(model, obj, poses, joints, (edge, edge), sides, device=Device(device).resolve())
+    edge, samples = OF_THREE if three else ALONE
+    edge = size or edge
+    drawn = grasp_pictures(
+        model, obj, poses, joints, (edge, edge), sides, device=Device(device).resolve(), samples=samples
+    )
     title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
     valid = int(np.asarray(base["quality/valid"]).sum())
     subtitle = f"{len(rows)} of {len(base['quality/valid'])} grasps, {valid} valid, by epsilon at 5 mm"
