@@ -22,6 +22,7 @@ from api.metrics import Metrics
 from api.rates import Rates
 from api.routes import datasets, grasps, jobs, shards, system
 from api.routes.assets import asset_router
+from api.turns import FORMS, UPLOADS, Turns
 from api.turnstile import Turnstile
 from service.domain import AssetKind
 from service.embedded import redis_url
@@ -68,6 +69,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     app.state.keys = keys
     app.state.catalog = Catalog(opened)
     app.state.metrics = Metrics()
+    app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     problems.install(app, problem_page)
     for routes in (jobs, grasps, shards, system):
         app.include_router(routes.router)

@@ -42,7 +42,9 @@ def submit_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
 async def submit(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
     """Submit what the form says, after the upload of a hand or a mesh if there is one."""
     async with request.form(max_files=2, max_fields=24) as fields:
-        return await run_in_threadpool(_submit, request, catalog, fields)
+        has_upload = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
+        run = request.app.state.forms.run if has_upload else run_in_threadpool
+        return await run(_submit, request, catalog, fields)
 
 
 @router.post("/jobs/{job_id}/cancel", dependencies=[Depends(may_submit)])

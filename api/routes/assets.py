@@ -14,6 +14,7 @@ from api.conditions import is_known
 from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
 from api.problems import responses
+from api.turns import UPLOADS, Turns
 from api.uploads import files_of_upload, name_of_upload
 from service import names
 from service.domain import AssetKind, Name
@@ -22,7 +23,7 @@ from service.index.views import AssetView, Page
 
 _GLB: Final = "model/gltf-binary"
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.
-_AT_ONCE: Final = BoundedSemaphore(4)
+_AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 
@@ -83,7 +84,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         responses=responses(400, 401, 403, 409, 413, 422, 503),
         name=f"add_{kind}",
     )
-    def add_asset(
+    async def add_asset(
         file: UploadFile,
         response: Response,
         request: Request,
@@ -95,7 +96,8 @@ def asset_router(kind: AssetKind) -> APIRouter:
     ) -> AssetView:
         """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
         limit = request.app.state.settings.max_upload_bytes
-        asset = store_upload(catalog, kind, file, name, limit_bytes=limit, options=options)
+        uploads: Turns = request.app.state.uploads
+        asset = await uploads.run(store_upload, catalog, kind, file, name, limit_bytes=limit, options=options)
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         response.headers["Retry-After"] = "1"
         return asset

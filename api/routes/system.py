@@ -28,8 +28,8 @@ def get_stats(catalog: CatalogOf) -> Stats:
 
 
 @router.get("/healthz")
-def healthz() -> dict[str, bool]:
-    """This process answers."""
+async def healthz() -> dict[str, bool]:
+    """This process answers. No thread is needed for that."""
     return {"ok": True}
 
 
