@@ -147,7 +147,13 @@ class Keeper:
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
+    def _announce(self) -> None:
+        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+
     def _look_after_queue(self) -> None:
+        # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
+        # first, and nobody's silence is judged.
+        self._announce()
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._parts.queue.waiting()
         leases = self._parts.queue.leases()

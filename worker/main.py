@@ -11,9 +11,11 @@ import os
 import secrets
 import signal
 import socket
+import time
 from collections.abc import Collection, Mapping
 from typing import Any, Final
 
+from redis.exceptions import ResponseError
 from rq import SimpleWorker
 from rq.exceptions import InvalidJobOperation
 from rq.serializers import JSONSerializer
@@ -25,7 +27,7 @@ from service.embedded import redis_url
 from service.errors import QueueUnavailable
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.port import Event, EventKind, WorkerBeat
-from service.queue.rq_queue import RqQueue, open_queue, queue_names
+from service.queue.rq_queue import RqQueue, open_queue, queue_names, worker_key
 from service.settings import Settings
 from service.store import Store, open_store
 from service.version import PACKAGE_VERSION
@@ -44,6 +46,7 @@ log = logging.getLogger(__name__)
 _PATIENCE: Final = 60
 #: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
 _WORKER_TTL_S: Final = 20
+_REFUSED_PAUSE_S: Final = 0.5
 
 
 class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
@@ -160,6 +163,20 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def _run_task(self, message: dict[str, Any]) -> None:
         assert self._context is not None
         self._outcome = self._runner.run(message, self._context)
+        self._wait_for_writes()
+
+    def _wait_for_writes(self) -> None:
+        """Until Redis takes writes: on a full disk it refuses them, RQ could not close its books, and would end."""
+        told = False
+        while not self._stop_requested:
+            try:
+                self.connection.expire(worker_key(self.name), max(2, round(self._surroundings.settings.lease_s)))
+                return
+            except ResponseError as error:
+                if not told:
+                    log.warning("Redis takes no writes, and the end of a task waits for it: %s", error)
+                told = True
+                time.sleep(_REFUSED_PAUSE_S)
 
     def reorder_queues(self, reference_queue: Any) -> None:
         """RQ calls this after each task it took: which lane comes first for the next one."""

@@ -134,6 +134,25 @@ def test_time_in_which_the_keeper_did_not_look_is_no_silence(bench: Bench) -> No
     assert len(bench.queue.leases()) == 1
 
 
+def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline.submit(bench.parts, request())
+    held = bench.take()
+    bench.pass_time(2, beating=held)
+
+    def full(part: str, seconds: float) -> None:
+        raise QueueUnavailable("Redis does not answer (MISCONF: the disk is full)")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.queue, "announce", full)
+        for _ in range(10 * round(bench.parts.settings.lease_s)):
+            bench.clock.now += 1.0
+            with pytest.raises(QueueUnavailable):
+                bench.keeper.round()
+    bench.pass_time(2, beating=held)
+    assert [lease.key for lease in bench.queue.leases()] == [held.key]
+    assert bench.parts.index.attempts() == []
+
+
 def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) -> None:
     job, _ = pipeline.submit(bench.parts, request())
     slow = bench.take()
