@@ -19,7 +19,7 @@ from api.models import Job
 from api.reports import UrlOption, job_request, open_client, show_asset, show_job, watch
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service import tracing
-from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
+from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
 from service.domain import AssetKind, State
 from service.errors import InputError
 
@@ -237,6 +237,7 @@ def api(
 
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")
+    keep_private(settings)
     tracing.set_up("api")
     serve(settings)
 

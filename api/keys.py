@@ -223,7 +223,7 @@ class KeyFile:
     def _changing(self) -> Iterator[_Document]:
         """A copy of the document that replaces the file at the end; two commands at once take turns."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 document = self._read().model_copy(deep=True)

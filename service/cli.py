@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
+import stat
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar
@@ -66,6 +68,18 @@ def load_settings(**overrides: Any) -> Settings:
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
     """Log lines of this process: JSON, or text on a terminal."""
     logs.set_up(settings, process)
+
+
+def keep_private(settings: Settings) -> None:
+    """What this process and its children write is for their user alone; so is the data folder, if it was open before.
+
+    Its files hold requests, results and hashes of keys, and those of an older graspd could be read by everybody.
+    """
+    os.umask(0o077)
+    with contextlib.suppress(OSError):
+        status = settings.data_dir.stat()
+        if status.st_uid == os.getuid() and stat.S_IMODE(status.st_mode) != 0o700:
+            settings.data_dir.chmod(0o700)
 
 
 def validation_line(error: ValidationError) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from service.cli import JsonFlag, emit, load_settings, log_to_stderr, reporting_errors
+from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
 from service.errors import IndexDamaged, UnavailableError
 from service.settings import Settings
 
@@ -40,6 +40,7 @@ def up(
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
     log_to_stderr(settings, "up")
+    keep_private(settings)
     stop = stop_on_signals()
     console = Console(stderr=True)
     supervisor = Supervisor(settings, workers=workers)
@@ -65,6 +66,7 @@ def keeper(
     """Reaper, delayed retries and indexer. One runs in a service; `graspd up` starts it."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "keeper")
+    keep_private(settings)
     if check:
         check_keeper(settings)
         return

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from service import tracing
-from service.cli import load_settings, log_to_stderr, reporting_errors
+from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
 from service.domain import Stage
 from service.errors import InputError, UnavailableError
 from service.settings import Settings
@@ -37,6 +37,7 @@ def worker(
     """One worker on one device: takes tasks from the queue until it is told to stop."""
     settings = load_settings(device=device, threads=threads, data_dir=data_dir)
     log_to_stderr(settings, "worker")
+    keep_private(settings)
     if check:
         check_worker(settings)
         return
