@@ -35,10 +35,11 @@ def print_estimate(found: Estimate, console: Console) -> None:
         markup=False,
         soft_wrap=True,
     )
-    table = Table("workers", "time", "network", "on average", box=None, header_style="bold")
+    table = Table("workers", "time", "from", "to", "network", "on average", box=None, header_style="bold")
     for plan in found.plans:
         rate = f"{size(round(plan.network_bytes_per_s))}/s"
-        table.add_row(str(plan.workers), duration(plan.seconds), size(plan.network_bytes), rate)
+        times = (plan.seconds, plan.seconds_low, plan.seconds_high)
+        table.add_row(str(plan.workers), *map(duration, times), size(plan.network_bytes), rate)
     console.print(table)
     kinds = ", ".join(f"{kind} {size(stored)}" for kind, stored in found.storage_by_kind.items())
     console.print(f"storage {size(found.storage_bytes)} ({kinds})", markup=False)

@@ -16,7 +16,8 @@ from api import dataset_quota
 from api.auth import NotYours
 from api.catalog import Catalog
 from api.dashboard import matrix
-from api.dashboard.forms import asset_choices, first_message
+from api.dashboard.form_uploads import asset_choices
+from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
 from api.dependencies import CatalogOf, may_read, may_submit
 from service.datasets import actions

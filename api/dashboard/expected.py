@@ -34,6 +34,9 @@ class Expected:
     words: str
     seconds: float | None
     """One worker's time for the whole job [s]; None: not known."""
+    low: float | None
+    high: float | None
+    """Interval of the seconds [s]."""
     valid_yield: float | None
     origin: str
 
@@ -54,10 +57,10 @@ class Expectations:
             matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
             cost = estimate(self._index, matrix)
         except (ValidationError, GraspdError):
-            return Expected(name, WORDS[name], None, None, "")
+            return Expected(name, WORDS[name], None, None, None, None, "")
         rate = cost.rates[0] if cost.rates else None
         share, origin = (rate.valid_yield, rate.origin) if rate else (None, "")
-        return Expected(name, WORDS[name], cost.seconds, share, origin)
+        return Expected(name, WORDS[name], cost.seconds, cost.seconds_low, cost.seconds_high, share, origin)
 
 
 class _Remembering(Index):

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import time
 from typing import Any, Final
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import FormData, UploadFile
+from starlette.datastructures import FormData
 
 from api.catalog import Catalog
+from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen
 from api.dashboard.rendering import render
 from api.dependencies import CatalogOf, may_read, may_submit
-from api.routes.assets import store_upload
 from service.domain import AssetKind, JobRequest
-from service.errors import GraspdError, InputError
-from service.index.views import AssetView
+from service.errors import InputError
 
 router = APIRouter(include_in_schema=False)
-
-_CHECK_WAIT_S: Final = 15.0
-UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
 
 DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
@@ -71,57 +65,31 @@ def first_message(error: ValueError) -> str:
     return str(error)
 
 
-def asset_choices(catalog: Catalog, kind: AssetKind) -> list[tuple[str, str]]:
-    """Names to choose from, with a word on those that cannot be used now."""
-    try:
-        assets = catalog.assets(kind, limit=200).items
-    except GraspdError:
-        return []
-    notes = {"refuse": " (refused)", None: " (being checked)"}
-    # Of several versions of a name the newest is meant.
-    newest = {asset.name: asset for asset in reversed(assets)}
-    return [(name, name + ("" if one.builtin else notes.get(one.verdict, ""))) for name, one in sorted(newest.items())]
-
-
 def _submit(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
     form: dict[str, Any] = {
-        name: fields[name] for name in DEFAULTS if isinstance(fields.get(name), str) and fields[name] != ""
+        name: fields[name]
+        for name in DEFAULTS
+        if name not in ("hand", "object") and isinstance(fields.get(name), str) and fields[name] != ""
     }
     form["stereo"] = fields.get("stereo") == "true"
-    shown = DEFAULTS | form
+    things = {kind: chosen(request, catalog, fields, kind) for kind in FILE_FIELDS}
+    # Without a default: a form that names no object gets none.
+    form |= {kind.value: one.name for kind, one in things.items()}
+    shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
+    refused = {one.field(kind): one.refused for kind, one in things.items() if one.refused}
     try:
-        body = JobRequest.model_validate(form)
+        named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
+        body = JobRequest.model_validate(form | named)
     except ValidationError as error:
-        return _form(request, catalog, shown, errors=_by_field(error), status=422)
+        return _form(request, catalog, shown, things=things, errors=refused | _by_field(error), status=422)
+    if refused:
+        return _form(request, catalog, shown, things=things, errors=refused, status=422)
     try:
-        for kind, field in ((AssetKind.HAND, "hand_file"), (AssetKind.OBJECT, "file")):
-            if (asset := _upload(request, catalog, fields, kind, field)) is not None:
-                shown |= {kind.value: asset.name}
-                body = body.model_copy(update={kind.value: asset.name})
-                _await_check(catalog, asset)
         job = catalog.submit(body)
     except InputError as error:
         problem = {"title": error.title, "detail": str(error)}
-        return _form(request, catalog, shown, problem=problem, status=error.status)
+        return _form(request, catalog, shown, things=things, problem=problem, status=error.status)
     return RedirectResponse(f"/jobs/{job.id}", status_code=303)
-
-
-def _upload(request: Request, catalog: Catalog, fields: FormData, kind: AssetKind, field: str) -> AssetView | None:
-    file = fields.get(field)
-    if not isinstance(file, UploadFile) or not file.filename:
-        return None
-    units = fields.get("units")
-    options = json.dumps({"units": units}) if kind is AssetKind.OBJECT and units in dict(UNITS) and units != "m" else ""
-    limit = request.app.state.settings.max_upload_bytes
-    return store_upload(catalog, kind, file, None, limit_bytes=limit, options=options)
-
-
-def _await_check(catalog: Catalog, asset: AssetView) -> None:
-    """Give a worker a moment to check an upload, so that one press of the button is enough."""
-    deadline = time.monotonic() + _CHECK_WAIT_S
-    while asset.verdict is None and time.monotonic() < deadline:
-        time.sleep(0.2)
-        asset = catalog.asset(asset.kind, asset.digest)
 
 
 def _by_field(error: ValidationError) -> dict[str, str]:
@@ -138,20 +106,23 @@ def _form(
     catalog: Catalog,
     form: dict[str, Any],
     *,
+    things: dict[AssetKind, Chosen] | None = None,
     errors: dict[str, str] | None = None,
     problem: dict[str, str] | None = None,
     status: int = 200,
 ) -> HTMLResponse:
+    things = things or {kind: Chosen(name=str(form[kind.value])) for kind in FILE_FIELDS}
     return render(
         request,
         "submit.html",
         status=status,
         page="/submit",
-        form=form,
+        form={"units": "m"} | form,
         errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
         problem=problem,
-        hands=asset_choices(catalog, AssetKind.HAND),
-        objects=asset_choices(catalog, AssetKind.OBJECT),
+        hands=choices(catalog, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
+        objects=choices(catalog, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
+        held={kind.value: one.held for kind, one in things.items()},
         expected=request.app.state.expectations.of(form),
         units=UNITS,
         max_upload=request.app.state.settings.max_upload_bytes,

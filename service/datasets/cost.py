@@ -4,8 +4,8 @@
     seconds of a cell  = tries x seconds per try + batches x scenes x seconds per scene + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-The rates come from `service.datasets.rates`. A worker is one process of `graspd worker` on a device like those that
-were measured.
+The rates, each with an interval, come from `service.datasets.rates`; intervals add, as if all were off together. A
+worker is one process of `graspd worker` on a device like those that were measured.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Final
 
 from pydantic import Field
 
-from service.datasets.rates import Rate, Rates, StageRate, picture_rate, scene_rate
+from service.datasets.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate
 from service.datasets.records import request_of
 from service.datasets.spec import MAX_CELLS, Matrix
 from service.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
@@ -40,6 +40,8 @@ class WorkersPlan(View):
 
     workers: int
     seconds: float = Field(description="expected time until the dataset is done [s]")
+    seconds_low: float = Field(description="the same if all goes quickly [s]")
+    seconds_high: float = Field(description="the same if all goes slowly [s]")
     network_bytes: int = Field(description="between workers, store and Redis, if these are other machines")
     network_bytes_per_s: float = Field(description="the same, on average over that time")
 
@@ -65,6 +67,11 @@ class Estimate(View):
     valid: int = Field(description="valid grasps to be expected")
     tasks: int
     seconds: float
+    seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
+    seconds_high: float = Field(description="its upper end [s]")
+    machine_factor: float | None = Field(
+        description="this machine's seconds over the stored ones, which scales these; None: nothing was measured here"
+    )
     seconds_by_stage: dict[Stage, float]
     seconds_per_valid: float | None
     storage_bytes: int
@@ -81,6 +88,9 @@ class _Sums:
     kept: float = 0.0
     valid: float = 0.0
     seconds: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+    machine: Machine = field(default_factory=Machine)
     base_bytes: float = 0.0
     cells: dict[tuple[str, Rate], int] = field(default_factory=lambda: defaultdict(int))
 
@@ -116,6 +126,7 @@ def estimate(index: Index, matrix: Matrix, resolve: Callable[[JobRequest], JobRe
             chosen = resolve(request_of(options, hand, obj))
             if chosen.knobs.name not in rates:
                 rates[chosen.knobs.name] = Rates(costs, chosen, devices)
+            sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
     return _estimate(index, matrix.hands, objects, options, sums)
 
@@ -127,7 +138,10 @@ def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
     sums.tried += tried
     sums.valid += min(valid, options.grasps)
     sums.kept += kept
-    sums.seconds += tried * rate.seconds_per_try
+    seconds = tried * rate.seconds_per_try
+    sums.seconds += seconds
+    sums.low += seconds * rate.spread[0]
+    sums.high += seconds * rate.spread[1]
     sums.base_bytes += kept * rate.bytes_per_grasp
     sums.cells[hand, rate] += 1
 
@@ -143,17 +157,21 @@ def _estimate(index: Index, hands: Sequence[str], objects: Sequence[str], option
     cells = len(hands) * len(objects)
     batches = cells * -(-options.grasps // BATCH_SIZE)
     stages = stages_of(options)
-    scene, picture = _later_rates(index, options)
+    scene, picture = _later_rates(index, options, sums.machine)
     pixels = batches * _pictures(options) * options.width * options.height / 1e6
     seconds = {Stage.SYNTHESIZE: sums.seconds}
+    ends = {Stage.SYNTHESIZE: (sums.low, sums.high)}
     storage = {"base": sums.base_bytes}
     if Stage.SCENE in stages:
         seconds[Stage.SCENE] = batches * options.scenes * scene.seconds
+        ends[Stage.SCENE] = _ends(seconds[Stage.SCENE], scene)
         storage["scene"] = sums.kept * options.scenes * scene.size_bytes
     if Stage.RENDER in stages:
         seconds[Stage.RENDER] = pixels * picture.seconds
+        ends[Stage.RENDER] = _ends(seconds[Stage.RENDER], picture)
         storage["views"] = pixels * picture.size_bytes
     total = sum(seconds.values())
+    low, high = (sum(found) for found in zip(*ends.values(), strict=True))
     read = sum(storage[kind] for kind in list(storage)[:-1])
     network = sum(storage.values()) + read + batches * len(stages) * _MESSAGE_BYTES
     assets, unknown = _assets(index, hands, objects)
@@ -164,33 +182,45 @@ def _estimate(index: Index, hands: Sequence[str], objects: Sequence[str], option
         valid=round(sums.valid),
         tasks=batches * len(stages),
         seconds=total,
+        seconds_low=low,
+        seconds_high=high,
+        machine_factor=sums.machine.factor if sums.machine.batches else None,
         seconds_by_stage=seconds,
         seconds_per_valid=total / sums.valid if sums.valid else None,
         storage_bytes=round(sum(storage.values())),
         storage_by_kind={kind: round(size) for kind, size in storage.items()},
-        plans=[_plan(workers, total, batches, cells, network, assets) for workers in WORKERS],
+        plans=[_plan(workers, (total, low, high), batches, cells, network, assets) for workers in WORKERS],
         rates=_used(sums),
         measured_share=sum(n for (_, rate), n in sums.cells.items() if rate.batches) / cells,
         unknown=unknown,
     )
 
 
-def _plan(workers: int, total: float, batches: int, cells: int, network: float, assets: float) -> WorkersPlan:
+def _ends(seconds: float, rate: StageRate) -> tuple[float, float]:
+    return seconds * rate.spread[0], seconds * rate.spread[1]
+
+
+def _plan(
+    workers: int, totals: tuple[float, float, float], batches: int, cells: int, network: float, assets: float
+) -> WorkersPlan:
     """A batch is one worker's from its first stage to its last, so a round takes as long as a batch."""
-    seconds = max(total / workers, math.ceil(batches / workers) * total / batches)
+    share = max(1 / workers, math.ceil(batches / workers) / batches)
+    seconds, low, high = (total * share for total in totals)
     # Each worker that meets a cell reads its hand and object, and keeps them while it stays there.
     moved = network + assets * min(workers, max(1, batches // cells))
     return WorkersPlan(
         workers=workers,
         seconds=seconds,
+        seconds_low=low,
+        seconds_high=high,
         network_bytes=round(moved),
         network_bytes_per_s=moved / seconds if seconds else 0.0,
     )
 
 
-def _later_rates(index: Index, options: JobOptions) -> tuple[StageRate, StageRate]:
-    scene = scene_rate(index.batch_costs(Stage.SCENE) if options.scenes else [])
-    return scene, picture_rate(index.batch_costs(Stage.RENDER) if options.views else [], options)
+def _later_rates(index: Index, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
+    scene = scene_rate(index.batch_costs(Stage.SCENE) if options.scenes else [], machine)
+    return scene, picture_rate(index.batch_costs(Stage.RENDER) if options.views else [], options, machine)
 
 
 def _pictures(options: JobOptions) -> int:

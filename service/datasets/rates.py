@@ -2,14 +2,18 @@
 
 The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; each at the same
 method, fidelity and referee and on the same kind of device. What is stored stands in `STORED` and `STORED_METHODS`,
-with its origin.
+with its origin; as soon as anything was measured here, one factor, this machine's seconds over the stored ones, scales
+all of it, so that two fidelities are never compared by two machines' clocks.
+
+Every rate has an interval: of a measured one, what its batches scatter; of a stored one, how far it was seen to be off.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Hashable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import median, quantiles
 from typing import Final
 
 from service.domain import BATCH_SIZE, JobOptions
@@ -27,6 +31,32 @@ class Rate:
     origin: str
     batches: int
     """Finished batches it was measured on; 0: stored."""
+    spread: tuple[float, float]
+    """The interval of the seconds, as factors of them."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How this machine compares with the one of the stored numbers."""
+
+    factor: float = 1.0
+    """Its seconds over the stored ones: the median of its batches, of whatever fidelity and method."""
+    spread: tuple[float, float] = (1.0, 1.0)
+    """Of single batches, as factors of that."""
+    batches: int = 0
+    """Finished batches that say so; 0: nothing is known of it."""
+
+    @property
+    def stored_spread(self) -> tuple[float, float]:
+        """The interval of a stored number on this machine, as factors of it."""
+        low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
+        return low * self.spread[0], high * self.spread[1]
+
+    def scaled(self, origin: str) -> str:
+        """The origin of a stored number with what was done to it."""
+        if not self.batches:
+            return origin
+        return f"{origin}, x {self.factor:.2g} as {self.batches} batches took here"
 
 
 @dataclass(frozen=True)
@@ -37,8 +67,16 @@ class StageRate:
     size_bytes: float
     origin: str
     batches: int
+    spread: tuple[float, float] = (1.0, 1.0)
+    """The interval of the seconds, as factors of them."""
 
 
+#: Interval of a measured rate at least: what another run of the same batches differs by.
+MEASURED_SPREAD: Final = (0.8, 1.25)
+#: Interval of a stored rate on a machine whose factor is known: fidelities and methods differ from machine to machine.
+SCALED_SPREAD: Final = (0.5, 2.0)
+#: Interval of a stored rate on an unknown machine: ten times as long was seen on a small one that others used too.
+STORED_SPREAD: Final = (1 / 3, 10.0)
 #: Where the stored numbers come from: the CPU times and sizes of docs/scaling.md, for a worker with two cores that is
 #: busy nine tenths of its time.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/scaling.md"
@@ -74,8 +112,10 @@ class Rates:
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
-        for batch in batches:
-            if batch.tried and recipe_of(batch.request) == recipe and (not devices or batch.device in devices):
+        here = [batch for batch in batches if batch.tried and (not devices or batch.device in devices)]
+        self.machine = machine_of(here)
+        for batch in here:
+            if recipe_of(batch.request) == recipe:
                 for key in ((batch.hand, batch.object), batch.hand, ()):
                     self._groups[key].append(batch)
         self._known: dict[Hashable, Rate] = {}
@@ -103,18 +143,53 @@ class Rates:
                 bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
                 origin=f"measured here: {words}, {devices}",
                 batches=len(batches),
+                spread=_spread([batch.seconds / batch.tried for batch in batches], MEASURED_SPREAD),
             )
         return self._known[key]
 
     def _stored(self) -> Rate:
-        method, name = self._options.method, self._options.knobs.name
-        if method in STORED_METHODS:
-            return Rate(*STORED_METHODS[method], _BYTES_PER_GRASP, f"{ORIGIN}, {method}", 0)
-        seconds, share = STORED.get(name, STORED["standard"])
-        origin = ORIGIN if name in STORED else f"{ORIGIN}, of standard for want of {name}"
-        if method != "fast_graspd":
-            origin = f"{ORIGIN}, of fast_graspd for want of {method}"
-        return Rate(seconds, share, _BYTES_PER_GRASP, origin, 0)
+        seconds, share, origin = _stored_of(self._options)
+        machine = self.machine
+        return Rate(seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled(origin), 0, machine.stored_spread)
+
+
+def _stored_of(options: JobOptions) -> tuple[float, float, str]:
+    """Stored seconds per try, yield and origin."""
+    method, name = options.method, options.knobs.name
+    if method in STORED_METHODS:
+        return *STORED_METHODS[method], f"{ORIGIN}, {method}"
+    origin = ORIGIN if name in STORED else f"{ORIGIN}, of standard for want of {name}"
+    if method != "fast_graspd":
+        origin = f"{ORIGIN}, of fast_graspd for want of {method}"
+    return *STORED.get(name, STORED["standard"]), origin
+
+
+def machine_of(batches: Iterable[BatchCost]) -> Machine:
+    """How the machine that made these batches of `synthesize` compares with the stored numbers.
+
+    Only batches that have a stored number of their own count: as offered, without options.
+    """
+    comparable = [batch for batch in batches if batch.tried and _is_stored(batch.request)]
+    ratios = [
+        batch.seconds / batch.tried / _stored_of(batch.request)[0] for batch in _whole(comparable) if batch.seconds > 0
+    ]
+    if not ratios:
+        return Machine()
+    return Machine(median(ratios), _spread(ratios, (1.0, 1.0)), len(ratios))
+
+
+def _is_stored(request: JobOptions) -> bool:
+    if request.options:
+        return False
+    return request.method in STORED_METHODS or (request.method == "fast_graspd" and request.knobs.name in STORED)
+
+
+def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
+    """Middle eight tenths of the values over their median, and no narrower than `least`."""
+    if len(values) < 2 or (middle := median(values)) <= 0:
+        return least
+    tenths = quantiles(values, n=10, method="inclusive")
+    return min(least[0], tenths[0] / middle), max(least[1], tenths[-1] / middle)
 
 
 def _whole(batches: list[BatchCost]) -> list[BatchCost]:
@@ -134,23 +209,32 @@ def recipe_of(options: JobOptions) -> Hashable:
     )
 
 
-def scene_rate(batches: Iterable[BatchCost]) -> StageRate:
+def _on(machine: Machine, stored: StageRate) -> StageRate:
+    """A stored rate as this machine takes it."""
+    seconds = stored.seconds * machine.factor
+    return replace(stored, seconds=seconds, origin=machine.scaled(stored.origin), spread=machine.stored_spread)
+
+
+def scene_rate(batches: Iterable[BatchCost], machine: Machine) -> StageRate:
     """Seconds per batch and scene, bytes per grasp and scene."""
     found = [batch for batch in batches if batch.request.scenes]
     rows = sum(batch.count for batch in found)
     if not rows:
-        return STORED_SCENE
+        return _on(machine, STORED_SCENE)
     scenes = sum(batch.request.scenes for batch in found)
     seconds = sum(batch.seconds for batch in found) / scenes
-    return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found))
+    spread = _spread([batch.seconds / batch.request.scenes for batch in found], MEASURED_SPREAD)
+    return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found), spread)
 
 
-def picture_rate(batches: Iterable[BatchCost], options: JobOptions) -> StageRate:
+def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
     """Seconds and bytes per million pixels, of pictures with the same channels where there are any."""
     found = [batch for batch in batches if batch.count]
     found = [batch for batch in found if batch.request.channels == options.channels] or found
     pixels = sum(batch.count * batch.request.width * batch.request.height for batch in found) / 1e6
     if not pixels:
-        return STORED_PICTURE
+        return _on(machine, STORED_PICTURE)
     seconds = sum(batch.seconds for batch in found) / pixels
-    return StageRate(seconds, sum(batch.size_bytes for batch in found) / pixels, "measured here", len(found))
+    each = [batch.seconds / (batch.count * batch.request.width * batch.request.height) for batch in found]
+    sizes = sum(batch.size_bytes for batch in found) / pixels
+    return StageRate(seconds, sizes, "measured here", len(found), _spread(each, MEASURED_SPREAD))

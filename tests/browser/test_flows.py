@@ -128,8 +128,48 @@ def test_an_upload_is_checked_at_once_shown_and_a_bad_one_says_why(real_page: An
     page.set_input_files("#file", bad)
     page.wait_for_selector("[data-thing=object] [data-found][data-state=bad]", timeout=CHECK_MS)
     assert "broken.stl" in page.inner_text("[data-thing=object] [data-found]")
+    assert page.is_disabled("text=Submit the job")
     page.set_input_files("#file", good)
     page.wait_for_selector("[data-thing=object] [data-found][data-state=good]", timeout=CHECK_MS)
     assert "60 x 50 x 80 mm" in page.inner_text("[data-thing=object] [data-found]")
     page.wait_for_selector("[data-thing=object] figure[data-state=ready]", timeout=SHOWN_MS)
     assert page.input_value("#object") == "wedge"
+
+
+def test_a_refused_file_stays_holds_the_button_and_runs_once_its_units_are_right(
+    real_page: Any, tmp_path: Path
+) -> None:
+    page = real_page
+    mesh = trimesh.creation.box((60.0, 40.0, 50.0))
+    file = tmp_path / "in millimetres.stl"
+    file.write_bytes(mesh.export(file_type="stl"))
+    page.goto("/submit?hand=barrett&object=mug&grasps=1&fidelity=draft")
+    page.set_input_files("#file", file)
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=bad]", timeout=CHECK_MS)
+    assert page.is_disabled("text=Submit the job")
+    assert "was refused" in page.inner_text("#blocked")
+    assert page.input_value("#object") == ""
+    assert page.get_attribute("[data-thing=object] figure", "data-state") == "none"
+    page.select_option("#units", "mm")
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=good]", timeout=CHECK_MS)
+    assert "60 x 40 x 50 mm" in page.inner_text("[data-thing=object] [data-found]")
+    assert page.input_value("#object") == "in-millimetres"
+    page.wait_for_selector("[data-thing=object] figure[data-state=ready]", timeout=SHOWN_MS)
+    page.click("text=Submit the job")
+    page.wait_for_url("**/jobs/*")
+    assert "in-millimetres" in page.inner_text("main")
+    page.click("button:has-text('Cancel')")
+    page.wait_for_selector("#head .cancelled")
+
+
+def test_choosing_a_known_object_takes_a_refused_file_away(real_page: Any, tmp_path: Path) -> None:
+    page = real_page
+    bad = tmp_path / "empty.stl"
+    bad.write_bytes(b"solid empty\nendsolid empty\n")
+    page.goto("/submit")
+    page.set_input_files("#file", bad)
+    page.wait_for_selector("[data-thing=object] [data-found][data-state=bad]", timeout=CHECK_MS)
+    page.select_option("#object", "block")
+    assert page.input_value("#file") == ""
+    assert page.is_enabled("text=Submit the job")
+    page.wait_for_selector("[data-thing=object] figure[data-state=ready]", timeout=SHOWN_MS)

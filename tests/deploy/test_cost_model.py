@@ -102,3 +102,15 @@ def test_every_input_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     (found,) = json.loads(capsys.readouterr().out)["estimates"]
     assert found["money_compute"] == found["money_service"] == 0
     assert found["core_hours"] > 3200 * 2 / 3600
+
+
+def test_every_page_gives_a_million_grasps_the_same_cost() -> None:
+    hours = f"{estimate(Work(grasps=1_000_000), Measured(), Prices()).core_hours:,.0f}"
+    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    cited = {
+        (page.name, number)
+        for page in pages
+        for number in re.findall(r"\ba million\b[^.|]*?\b([\d,]+) core hours", page.read_text(), re.DOTALL)
+    }
+    assert cited == {("README.md", hours), ("datasets.md", hours)}
+    assert f"| core hours | {hours} |" in PAGE

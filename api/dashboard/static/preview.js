@@ -9,7 +9,8 @@ const stages = new Map();
 async function show(figure) {
   const address = figure.dataset.model;
   const said = figure.querySelector("[data-say]");
-  if (!address || figure.dataset.shown === address) return;
+  if (!address) return clear(figure);
+  if (figure.dataset.shown === address) return;
   figure.dataset.shown = address;
   figure.dataset.state = "loading";
   try {
@@ -29,6 +30,18 @@ async function show(figure) {
     figure.dataset.state = "failed";
     said.textContent = error.message;
   }
+}
+
+/** An empty stage: what stands there must not look like what is chosen. */
+function clear(figure) {
+  const stage = stages.get(figure);
+  if (stage?.shown) {
+    stage.scene.remove(stage.shown);
+    stage.shown = null;
+    stage.invalidate();
+  }
+  delete figure.dataset.shown;
+  figure.dataset.state = "none";
 }
 
 /** Where one sees the palm of a hand that stands in its own frame. */

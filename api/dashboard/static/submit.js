@@ -1,11 +1,15 @@
 // Uploads are sent and checked as soon as they are chosen, so that one sees what graspd made of them before submitting.
+// A file that was refused stays, is checked again when its units change, and holds the button: a form runs what it shows.
 // Without this script the form sends the files itself.
 (() => {
   "use strict";
   const POLL_MS = 400;
   const PATIENCE_MS = 60000;
   const form = document.getElementById("job");
+  const button = form.querySelector("button.primary");
+  const blocked = document.getElementById("blocked");
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  const waiting = new Map();
 
   async function document_(answer) {
     const body = await answer.json().catch(() => ({}));
@@ -13,14 +17,14 @@
     return body;
   }
 
-  async function check(kind, file, units) {
+  async function check(kind, file, units, name) {
     const data = new FormData();
     data.append("file", file);
+    if (name) data.append("name", name);
     if (kind === "object" && units && units !== "m") data.append("options", JSON.stringify({ units }));
     let asset = await document_(await fetch(`/v1/${kind}s`, { method: "POST", body: data }));
     const until = Date.now() + PATIENCE_MS;
-    while (asset.verdict === null) {
-      if (Date.now() > until) throw new Error("no worker has checked it yet; start one, or submit and let it wait");
+    while (asset.verdict === null && Date.now() < until) {
       await pause(POLL_MS);
       asset = await document_(await fetch(`/v1/${kind}s/${asset.digest}`));
     }
@@ -28,12 +32,11 @@
     return asset;
   }
 
-  function choose(thing, kind, asset) {
-    const select = thing.querySelector(`select[name=${kind}]`);
-    if (![...select.options].some((option) => option.value === asset.name)) select.add(new Option(asset.name, asset.name));
-    select.value = asset.name;
-    thing.querySelector("figure").dataset.model = `/v1/${kind}s/${asset.digest}/model`;
-    form.dispatchEvent(new Event("picked"));
+  /** Say why the button is held, or let it go. */
+  function hold(thing, why) {
+    if (why) waiting.set(thing, why); else waiting.delete(thing);
+    button.disabled = waiting.size > 0;
+    blocked.textContent = [...waiting.values()][0] ?? "";
   }
 
   function wire(thing) {
@@ -41,31 +44,73 @@
     const input = thing.querySelector("input[type=file]");
     const units = thing.querySelector("select[name=units]");
     const said = thing.querySelector("[data-found]");
+    const select = thing.querySelector(`select[name=${kind}]`);
+    const figure = thing.querySelector("figure");
+    // The file that the form means, whether or not its check has ended; and what it was accepted as.
+    let held = null;
+    let accepted = null;
+    let round = 0;
     const say = (text, state) => { said.textContent = text; said.dataset.state = state; };
-    thing.querySelector(`select[name=${kind}]`).addEventListener("change", (event) => {
-      thing.querySelector("figure").dataset.model = `/v1/${kind}s/${encodeURIComponent(event.target.value)}/model`;
-      say("", "");
-    });
+
+    function show(value, text, model) {
+      for (const own of select.querySelectorAll("option[data-own], option[value='']")) own.remove();
+      if (![...select.options].some((option) => option.value === value)) {
+        const option = new Option(text, value);
+        option.dataset.own = "";
+        select.add(option, 0);
+      }
+      select.value = value;
+      figure.querySelector("[data-say]").textContent = model ? "" : text;
+      figure.dataset.model = model;
+      form.dispatchEvent(new Event("picked"));
+    }
+
     async function upload() {
-      const file = input.files[0];
-      if (!file) return;
+      if (!held) return;
+      const [file, mine] = [held, ++round];
+      const unit = units?.value ?? "m";
+      // Once a file was accepted, its name stands for those units.
+      const name = accepted && accepted.unit !== unit ? `${accepted.name}-${unit}` : "";
       say(`Checking ${file.name}`, "busy");
-      input.disabled = true;
+      show("", `${file.name} (being checked)`, "");
+      hold(thing, `${file.name} is being checked.`);
       try {
-        const asset = await check(kind, file, units?.value);
-        // The form must not send it a second time.
+        const asset = await check(kind, file, unit, name);
+        if (mine !== round) return;
+        accepted ??= { name: asset.name, unit };
+        // It is in the store: the form need not send it a second time.
         input.value = "";
-        choose(thing, kind, asset);
-        say(asset.message, "good");
+        show(asset.name, asset.name, `/v1/${kind}s/${asset.digest}/model`);
+        say(asset.verdict ? asset.message : "no worker has checked it yet; start one before you submit", "good");
+        hold(thing, "");
       } catch (error) {
-        input.value = "";
+        if (mine !== round) return;
+        show("", `${file.name} (refused)`, "");
         say(error.message, "bad");
-      } finally {
-        input.disabled = false;
+        hold(thing, `${file.name} was refused: mend that, or choose a known ${kind}.`);
       }
     }
-    input.addEventListener("change", upload);
+
+    input.addEventListener("change", () => {
+      // A dialog that was cancelled empties the field; the file stays what the form means.
+      if (!input.files[0]) return;
+      [held, accepted] = [input.files[0], null];
+      upload();
+    });
+    units?.addEventListener("change", upload);
+    select.addEventListener("change", () => {
+      round += 1;
+      [held, accepted, input.value] = [null, null, ""];
+      select.querySelector("option[data-own]:not(:checked)")?.remove();
+      figure.querySelector("[data-say]").textContent = "";
+      figure.dataset.model = select.value ? `/v1/${kind}s/${encodeURIComponent(select.value)}/model` : "";
+      say("", "");
+      hold(thing, "");
+    });
+    // Browsers put back what was chosen when one goes back to a page; the picture must follow.
+    window.addEventListener("pageshow", (event) => { if (event.persisted && !held) select.dispatchEvent(new Event("change")); });
   }
 
   document.querySelectorAll("[data-thing]").forEach(wire);
+  form.addEventListener("submit", (event) => { if (waiting.size) event.preventDefault(); });
 })();

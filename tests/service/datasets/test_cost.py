@@ -6,8 +6,10 @@ import pytest
 
 from service.datasets import actions
 from service.datasets.cost import Estimate, estimate
-from service.datasets.rates import ORIGIN, STORED
+from service.datasets.rates import ORIGIN, STORED, STORED_METHODS, machine_of
+from service.domain import JobRequest
 from service.errors import LimitError, NotFoundError
+from service.index.cost_queries import BatchCost
 from service.parts import Parts
 from tests.service.datasets.makers import finish, jobs_of, plan_all, wanted
 
@@ -80,7 +82,60 @@ def test_another_recipe_is_not_measured_by_this_one(parts: Parts) -> None:
     run(parts)
     for changes in ({"fidelity": "draft"}, {"referee": "screen"}, {"want": "raw"}):
         found = estimate(parts.index, wanted(**changes))
-        assert {rate.origin for rate in found.rates} == {ORIGIN} and found.measured_share == 0
+        assert all(rate.origin.startswith(ORIGIN) for rate in found.rates) and found.measured_share == 0
+
+
+def test_what_was_measured_at_one_fidelity_scales_the_stored_rates_of_all(parts: Parts) -> None:
+    done = run(parts)
+    factor = done.rates[0].seconds_per_try / STORED["standard"][0]
+    assert done.machine_factor == pytest.approx(factor)
+    for name in ("draft", "fine"):
+        (rate,) = {rate.seconds_per_try for rate in estimate(parts.index, wanted(fidelity=name)).rates}
+        assert rate == pytest.approx(factor * STORED[name][0])
+    (rate,) = {rate.seconds_per_try for rate in estimate(parts.index, wanted(method="graspit")).rates}
+    assert rate == pytest.approx(factor * STORED_METHODS["graspit"][0])
+
+
+def test_fidelities_stand_in_the_order_of_their_cost_whichever_was_measured(parts: Parts) -> None:
+    run(parts, fidelity="standard")
+    draft, standard, fine = (
+        estimate(parts.index, wanted(fidelity=name)).seconds for name in ("draft", "standard", "fine")
+    )
+    assert draft < standard < fine
+
+
+def test_scenes_and_pictures_that_nobody_measured_are_scaled_too(parts: Parts) -> None:
+    fresh = estimate(parts.index, wanted(scenes=2, views=2)).seconds_by_stage
+    factor = run(parts).machine_factor or 0.0
+    scaled = estimate(parts.index, wanted(scenes=2, views=2)).seconds_by_stage
+    for stage in ("scene", "render"):
+        assert scaled[stage] == pytest.approx(factor * fresh[stage])  # type: ignore[index]
+
+
+def test_an_interval_holds_the_estimate_and_shrinks_with_what_is_known(parts: Parts) -> None:
+    unknown = estimate(parts.index, wanted(fidelity="fine"))
+    assert unknown.machine_factor is None
+    run(parts)
+    scaled, measured = estimate(parts.index, wanted(fidelity="fine")), estimate(parts.index, wanted())
+    widths = []
+    for found in (unknown, scaled, measured):
+        for one in (found, *found.plans):
+            assert one.seconds_low < one.seconds < one.seconds_high
+        widths.append(found.seconds_high / found.seconds_low)
+    assert widths == sorted(widths, reverse=True) and len(set(widths)) == 3
+
+
+def test_batches_that_differ_widen_the_interval() -> None:
+    even, uneven = (
+        machine_of([batch_of(seconds) for seconds in times]) for times in ((5.0, 5.0, 5.0), (1.0, 5.0, 25.0))
+    )
+    assert even.factor == uneven.factor
+    assert uneven.stored_spread[0] < even.stored_spread[0] < even.stored_spread[1] < uneven.stored_spread[1]
+
+
+def batch_of(seconds: float) -> BatchCost:
+    options = JobRequest(hand="claw", object="cube")
+    return BatchCost("claw", "cube", "cpu", options, seconds, 32, 32, 32, 1000)
 
 
 def test_knobs_without_a_measurement_say_what_stands_in(parts: Parts) -> None:
