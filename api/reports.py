@@ -13,18 +13,24 @@ from api.client import Client
 from api.dashboard.filters import count, duration, metric, percent
 from api.models import JobDetail
 from api.watching import JobDisplay
+from service.address import recorded_address
 from service.asset_summary import summary
 from service.cli import emit, load_settings
 from service.domain import AssetKind, JobRequest, State
 from service.errors import InputError, TaskError
 
-UrlOption = Annotated[str | None, typer.Option("--url", help="Where the API answers; default GRASPD_API_URL.")]
+UrlOption = Annotated[
+    str | None,
+    typer.Option("--url", help="Where the API answers; default GRASPD_API_URL, or the service of the data folder."),
+]
 
 
 def open_client(url: str | None) -> Client:
-    """A client of the API that the settings or the option name."""
+    """A client of the API that the option or the settings name, or else that serves the data folder."""
     settings = load_settings()
     key = settings.api_key.get_secret_value() if settings.api_key else None
+    if url is None and "api_url" not in settings.model_fields_set:
+        url = recorded_address(settings.data_dir)
     return Client(url or settings.api_url, key=key)
 
 

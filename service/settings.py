@@ -25,7 +25,10 @@ class Settings(BaseSettings):
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address the API binds")
     port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
-    api_url: str = Field("http://127.0.0.1:8000", description="where the client commands find the API")
+    api_url: str = Field(
+        "http://127.0.0.1:8000",
+        description="where the client commands find the API; unset: the service of data_dir, if it runs",
+    )
     api_key: SecretStr | None = Field(None, description="key the client commands send")
     keys_file: Path | None = Field(None, description="file of the API keys; unset: keys.json in data_dir")
     metrics_need_key: bool = Field(True, description="whether /metrics asks for a key once there are keys")

@@ -10,10 +10,12 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import IO, Final, Self
 
 import httpx
 
+from service.address import forget_address, record_address
 from service.children import Child, end_leftovers
 from service.embedded import find_server, lock_file, own_redis, redis_url, server_command
 from service.errors import BusyError, GraspdError, InputError, UnavailableError
@@ -92,6 +94,7 @@ class Supervisor:
             self._settle()
             open_store(self.settings.resolved_store_url)
             self._children = self._plan()
+            self._record(folder)
         except GraspdError:
             self._release()
             raise
@@ -199,7 +202,17 @@ class Supervisor:
     def _named(self, *prefixes: str) -> list[Child]:
         return [child for child in self._children if child.name.startswith(prefixes)]
 
+    def _record(self, folder: Path) -> None:
+        if not self._api:
+            return
+        try:
+            record_address(folder, self.api_url)
+        except OSError as error:
+            log.warning("where the API answers cannot be noted in %s: %s", folder, error.strerror)
+
     def _release(self) -> None:
+        if self._locks and self._api:
+            forget_address(self._wanted.data_dir.resolve())
         for lock in self._locks:
             lock.close()
         self._locks = []
