@@ -9,6 +9,8 @@
   const button = form.querySelector("button.primary");
   const blocked = document.getElementById("blocked");
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  // A key that may only read has no button, whatever was uploaded.
+  const readonly = button.disabled;
   const waiting = new Map();
 
   async function document_(answer) {
@@ -35,7 +37,7 @@
   /** Say why the button is held, or let it go. */
   function hold(thing, why) {
     if (why) waiting.set(thing, why); else waiting.delete(thing);
-    button.disabled = waiting.size > 0;
+    button.disabled = readonly || waiting.size > 0;
     blocked.textContent = [...waiting.values()][0] ?? "";
   }
 
