@@ -16,7 +16,7 @@ from starlette.datastructures import FormData, UploadFile
 
 from api.catalog import Catalog
 from api.routes.assets import store_upload
-from api.uploads import json_object
+from service.descriptions import json_object
 from service.domain import AssetKind
 from service.errors import GraspdError, InputError
 from service.index.views import AssetView

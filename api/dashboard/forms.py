@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import FormData
+from starlette.datastructures import FormData, UploadFile
 
 from api.catalog import Catalog
 from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen
@@ -36,7 +36,9 @@ def submit_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
 async def submit(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
     """Submit what the form says, after the upload of a hand or a mesh if there is one."""
     async with request.form(max_files=2, max_fields=24) as fields:
-        has_upload = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
+        sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
+        # A file that the form holds is read and awaited like one that was sent.
+        has_upload = sent or any(fields.get(f"{kind.value}_held") for kind in FILE_FIELDS)
         run = request.app.state.forms.run if has_upload else run_in_threadpool
         return await run(_submit, request, catalog, fields)
 
