@@ -44,6 +44,18 @@ def quat_from_axis_angle(axis: Floats, angle: Floats) -> Floats:
     return np.concatenate([np.cos(half), np.asarray(axis, float) * np.sin(half)], axis=-1)
 
 
+def slerp(a: Floats, b: Floats, share: float) -> Floats:
+    """Unit quaternion (4,) `share` of the way from a to b at an even rate, along the shorter arc."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    cosine = float(a @ b)
+    b, cosine = (-b, -cosine) if cosine < 0 else (b, cosine)
+    angle = float(np.arccos(min(cosine, 1.0)))
+    # Nearly parallel: the chord is the arc.
+    weights = (1 - share, share) if angle < 1e-6 else np.sin([(1 - share) * angle, share * angle]) / np.sin(angle)
+    turned = weights[0] * a + weights[1] * b
+    return np.asarray(turned / np.linalg.norm(turned))
+
+
 def quat_from_matrix(matrix: Floats) -> Floats:
     """Unit quaternion (..., 4) with w >= 0 of rotation matrices (..., 3, 3), by Shepperd (1978)."""
     m = np.asarray(matrix, float)

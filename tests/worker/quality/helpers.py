@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import trimesh
 
@@ -50,3 +52,14 @@ def plate_hand(size: tuple[float, float, float] = (0.05, 0.05, 0.01)) -> HandMod
             "masses": np.array([0.3, 0.1, 0.1]),
         }
     )
+
+
+def pad_hand() -> HandModel:
+    """`plate_hand` with round pads that touch where its plates would.
+
+    Of two flat faces that meet the referee's engine keeps one point, anywhere on the face.
+    """
+    plates, radius = plate_hand(), 0.01
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    pads = tuple(piece(body, ball, "sphere", (radius,), (0, 0, 0.005 - radius)) for body in (1, 2))
+    return dataclasses.replace(plates, name="pads", digest="9ad5" * 8, pieces=(plates.pieces[0], *pads))

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.worker.quality.test_referee import BOX, PLATES, WHOLE, grasp_of
+from tests.worker.quality.test_referee import BOX, PADS, WHOLE, grasp_of
 from worker.mujoco_warnings import void
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
@@ -26,7 +26,7 @@ class Exploding(Test):
 
 @pytest.mark.parametrize("level", ["letter", "certificate"])
 def test_a_blown_up_push_is_not_held(level: str) -> None:
-    test = Exploding(build(PLATES, BOX, WHOLE, Physics()))
+    test = Exploding(build(PADS, BOX, WHOLE, Physics()))
     trial = test.letter(grasp_of(), 0) if level == "letter" else test.certificate(grasp_of(), 0)
     assert trial.outcomes[0] is Outcome.DIVERGED
     assert not trial.success
@@ -35,7 +35,7 @@ def test_a_blown_up_push_is_not_held(level: str) -> None:
 
 
 def test_the_next_grasp_is_judged_afresh() -> None:
-    test = Exploding(build(PLATES, BOX, WHOLE, Physics()))
+    test = Exploding(build(PADS, BOX, WHOLE, Physics()))
     test.certificate(grasp_of(), 0)
     assert void(test.data)
     Test._start(test, grasp_of(), 0)
@@ -52,7 +52,7 @@ def test_a_screen_that_blew_up_asks_the_certificate(monkeypatch: pytest.MonkeyPa
             self.data.qvel[0] = np.inf
 
     monkeypatch.setattr(Test, "_push", poisoned)
-    assert judge(PLATES, BOX, grasp_of(), level="screen", pieces=WHOLE).success.tolist() == [1]
+    assert judge(PADS, BOX, grasp_of(), level="screen", pieces=WHOLE).success.tolist() == [1]
 
 
 def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,10 +63,10 @@ def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.Mo
         step(model, data, nstep=nstep)
 
     monkeypatch.setattr(mujoco, "mj_step", poisoned)
-    assert np.isnan(simulated_displacement_cm(PLATES, BOX, grasp_of().grasp, pieces=WHOLE)[0])
+    assert np.isnan(simulated_displacement_cm(PADS, BOX, grasp_of().grasp, pieces=WHOLE)[0])
 
 
 def test_warnings_leave_no_file_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Exploding(build(PLATES, BOX, WHOLE, Physics())).certificate(grasp_of(), 0)
+    Exploding(build(PADS, BOX, WHOLE, Physics())).certificate(grasp_of(), 0)
     assert list(tmp_path.iterdir()) == []

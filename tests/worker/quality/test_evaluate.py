@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from service.errors import InputError, NotFoundError
 from service.transforms import apply, invert
 from tests.worker.models import object_from_mesh
-from tests.worker.quality.helpers import plate_hand, posture
+from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet
 from worker.hands.kinematics import body_poses
 from worker.hands.surface import piece_distance
@@ -29,7 +29,7 @@ CONTRACT = {
     "diversity",
 }  # fmt: skip
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-HAND = plate_hand()
+HAND = pad_hand()
 
 
 def plates_case(**kwargs: object) -> Case:

@@ -17,7 +17,7 @@ import trimesh
 
 from service.errors import InputError, MeshError, TaskCancelled
 from tests.worker.models import object_from_mesh, two_finger_hand
-from tests.worker.quality.helpers import plate_hand, posture
+from tests.worker.quality.helpers import pad_hand, plate_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -27,56 +27,56 @@ from worker.quality.referee import protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose, union_volume
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from worker.quality.referee.model import OBJECT_MASS, Physics, build
+from worker.quality.referee.model import OBJECT_MASS, Physics, blend, build
 from worker.quality.referee.protocol import Outcome, Test
 from worker.quality.referee.robustness import robustness
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
-PLATES = plate_hand()
+PADS = pad_hand()
 CONTACT = posture(((0, 0, 0), (0.065, 0.065)))
 
 
-def grasp_of(hand: HandModel = PLATES, contact: Posture = CONTACT, force: float = 20.0) -> GraspSet:
+def grasp_of(hand: HandModel = PADS, contact: Posture = CONTACT, force: float = 20.0) -> GraspSet:
     """Open by 10 mm, touch, press."""
     command = squeeze(hand, BOX, contact, total_normal_force=force)
     return GraspSet(contact, pregrasp(hand, BOX, contact), command, np.full(len(contact), np.nan))
 
 
 def many_grasps() -> GraspSet:
-    """Plates that hold the box ever nearer to its edge, from firm to none at all."""
+    """Pads that hold the box ever nearer to its edge, from firm to none at all."""
     rows = [((0, 0, z), (0.065, 0.065)) for z in np.linspace(0.0, 0.055, 8)]
     return grasp_of(contact=posture(*rows))
 
 
-def test_a_box_between_pressing_plates_is_held() -> None:
-    verdict = judge(PLATES, BOX, grasp_of(), level="letter", pieces=WHOLE)
+def test_a_box_between_pressing_pads_is_held() -> None:
+    verdict = judge(PADS, BOX, grasp_of(), level="letter", pieces=WHOLE)
     assert verdict.reasons == ["held"]
     assert verdict.success.tolist() == [1]
     assert (verdict.outcome == Outcome.HELD).all()
 
 
 def test_the_same_box_slips_at_friction_0_04() -> None:
-    # Two plates of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
-    scene = build(PLATES, BOX, WHOLE, Physics(friction=(0.04, 0.001)))
+    # Two pads of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
+    scene = build(PADS, BOX, WHOLE, Physics(friction=(0.04, 0.001)))
     trial = Test(scene).letter(grasp_of(), 0)
     assert trial.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
 
 
 def test_the_same_box_holds_at_friction_0_06() -> None:
     # 1.2 N of friction against 1 N.
-    scene = build(PLATES, BOX, WHOLE, Physics(friction=(0.06, 0.001)))
+    scene = build(PADS, BOX, WHOLE, Physics(friction=(0.06, 0.001)))
     assert Test(scene).letter(grasp_of(), 0).success
 
 
 def test_a_free_object_falls() -> None:
     away = posture(((0, 0, -0.5), (0.0, 0.0)))
-    verdict = judge(PLATES, BOX, grasp_of(contact=away), pieces=WHOLE)
+    verdict = judge(PADS, BOX, grasp_of(contact=away), pieces=WHOLE)
     assert verdict.reasons == ["displaced under +x"]
 
 
 def test_a_free_object_moves_as_newton_says() -> None:
-    test = Test(build(PLATES, BOX, WHOLE, Physics()))
+    test = Test(build(PADS, BOX, WHOLE, Physics()))
     away = grasp_of(contact=posture(((0, 0, -0.5), (0.0, 0.0))))
     test._close(away, 0)
     test._push(2)
@@ -89,19 +89,69 @@ def test_a_free_object_moves_as_newton_says() -> None:
 
 def test_a_deep_start_is_refused_as_penetration() -> None:
     deep = posture(((0, 0, 0), (0.08, 0.08)))
-    verdict = judge(PLATES, BOX, grasp_of(contact=deep), pieces=WHOLE)
+    closed = GraspSet(deep, deep, deep, np.full(1, np.nan))
+    verdict = judge(PADS, BOX, closed, pieces=WHOLE)
     assert verdict.reasons == ["penetration"]
     assert verdict.penetration_depth_mm[0] > 10
 
 
-def test_penetration_depth_is_that_of_the_pressed_plates() -> None:
+@pytest.mark.parametrize("level", ["letter", "certificate", "screen"])
+def test_penetration_counts_at_the_pregrasp_where_the_simulation_starts(level: str) -> None:
+    deep, clear = posture(((0, 0, 0), (0.08, 0.08))), posture(((0, 0, 0), (0.06, 0.06)))
+    from_outside = GraspSet(deep, clear, deep, np.full(1, np.nan))
+    from_inside = GraspSet(clear, deep, clear, np.full(1, np.nan))
+    verdicts = [judge(PADS, BOX, g, level=level, pieces=WHOLE) for g in (from_outside, from_inside)]
+    assert verdicts[0].penetration_depth_mm[0] > 10
+    assert [v.reasons for v in verdicts] == [["held"], ["penetration"]]
+
+
+def test_joints_have_the_damping_of_the_protocol_and_no_armature_nor_dry_friction() -> None:
+    model = build(PADS, BOX, WHOLE, Physics()).model
+    fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
+    assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness)
+    assert not model.dof_armature.any()
+    assert not model.dof_frictionloss.any()
+
+
+def test_a_pair_of_convex_pieces_has_one_contact_as_in_the_engine_that_the_protocol_pins() -> None:
+    scene = build(plate_hand(), BOX, WHOLE, Physics())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 1e-3)
+    mujoco.mj_forward(scene.model, data)
+    # A plate's face lies flat on the box: with multi-contact each of the two would have four points.
+    assert len(data.contact.dist) == 2
+
+
+def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
+    mesh = trimesh.creation.box((0.06, 0.04, 0.05))
+    mesh.apply_translation([0.3, 0, 0])
+    far = object_from_mesh(mesh)
+    scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), Physics())
+    test = Test(scene)
+    scene.place(test.data, np.array([0, 0, -0.5, 1.0, 0, 0, 0]), np.zeros(2))
+    assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
+    angle = 0.2
+    turned = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+    test.data.qpos[scene.object_qpos + 3 : scene.object_qpos + 7] = turned
+    # Turned about its centre the box stays; the mesh's origin, 0.3 m away, does not.
+    assert test._motion() == (pytest.approx(2 * 0.3 * np.sin(angle / 2)), pytest.approx(angle))
+
+
+def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
+    half = np.array([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, 0, 0, 0, 0, 1.0]])
+    a, b = (Posture(row[None], np.zeros((1, 2))) for row in half)
+    turns = [2 * np.arctan2(*blend(a, b, 0, share)[0][[6, 3]]) for share in (0.1, 0.5, 0.9)]
+    assert turns == pytest.approx([0.1 * np.pi, 0.5 * np.pi, 0.9 * np.pi])
+
+
+def test_penetration_depth_is_that_of_the_pressed_pads() -> None:
     pressed = posture(((0, 0, 0), (0.068, 0.067)))
-    verdict = judge(PLATES, BOX, grasp_of(contact=pressed), pieces=WHOLE)
+    verdict = judge(PADS, BOX, grasp_of(contact=pressed), pieces=WHOLE)
     assert verdict.penetration_depth_mm[0] == pytest.approx(3.0, abs=0.01)
 
 
 def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
-    grasps, test = many_grasps(), Test(build(PLATES, BOX, WHOLE, Physics()))
+    grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, Physics()))
     ends = []
     for anew in (False, True):
         test._close(grasps, 3)
@@ -121,8 +171,8 @@ def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
 @pytest.mark.parametrize("level", ["certificate", "screen"])
 def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
     grasps = many_grasps()
-    letter = judge(PLATES, BOX, grasps, level="letter", pieces=WHOLE)
-    cheap = judge(PLATES, BOX, grasps, level=level, pieces=WHOLE)
+    letter = judge(PADS, BOX, grasps, level="letter", pieces=WHOLE)
+    cheap = judge(PADS, BOX, grasps, level=level, pieces=WHOLE)
     assert 0 < letter.success.sum() < len(grasps), "the set must hold both kinds"
     assert cheap.success.tolist() == letter.success.tolist()
     assert cheap.steps < 0.5 * letter.steps
@@ -130,13 +180,13 @@ def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
 
 def test_hard_holds_no_more_than_normal() -> None:
     grasps = many_grasps()
-    normal, hard = (judge(PLATES, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
+    normal, hard = (judge(PADS, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
     assert (hard.success <= normal.success).all()
     assert normal.key != hard.key
 
 
 def test_verdicts_do_not_depend_on_threads() -> None:
-    one, two = (judge(PLATES, BOX, many_grasps(), threads=n, pieces=WHOLE) for n in (1, 2))
+    one, two = (judge(PADS, BOX, many_grasps(), threads=n, pieces=WHOLE) for n in (1, 2))
     assert np.array_equal(one.margin, two.margin)
     assert one.key == two.key
 
@@ -160,44 +210,44 @@ def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> No
 
 def test_everything_that_moves_a_verdict_is_in_its_key() -> None:
     grasps = grasp_of()
-    keys = {judge(PLATES, BOX, grasps, pieces=WHOLE).key}
-    keys.add(judge(PLATES, BOX, grasp_of(force=10.0), pieces=WHOLE).key)
-    keys.add(judge(dataclasses.replace(PLATES, stiffness=np.full(2, 90.0)), BOX, grasps, pieces=WHOLE).key)
-    keys.add(judge(PLATES, BOX, grasps, pieces=dataclasses.replace(WHOLE, digest="other")).key)
-    keys.add(judge(PLATES, BOX, grasps, level="letter", pieces=WHOLE).key)
+    keys = {judge(PADS, BOX, grasps, pieces=WHOLE).key}
+    keys.add(judge(PADS, BOX, grasp_of(force=10.0), pieces=WHOLE).key)
+    keys.add(judge(dataclasses.replace(PADS, stiffness=np.full(2, 90.0)), BOX, grasps, pieces=WHOLE).key)
+    keys.add(judge(PADS, BOX, grasps, pieces=dataclasses.replace(WHOLE, digest="other")).key)
+    keys.add(judge(PADS, BOX, grasps, level="letter", pieces=WHOLE).key)
     assert len(keys) == 5
 
 
 def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    terms = verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE)
-    assert judge(PLATES, BOX, grasp_of(force=10.0), level="letter", pieces=WHOLE).terms == terms
-    heavier = dataclasses.replace(PLATES, masses=PLATES.masses * 2)
+    terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
+    assert judge(PADS, BOX, grasp_of(force=10.0), level="letter", pieces=WHOLE).terms == terms
+    heavier = dataclasses.replace(PADS, masses=PADS.masses * 2)
     found = {
         terms,
-        verdict_key(PLATES, BOX, "letter", True, pieces=WHOLE),
-        verdict_key(PLATES, BOX, "screen", False, pieces=WHOLE),
+        verdict_key(PADS, BOX, "letter", True, pieces=WHOLE),
+        verdict_key(PADS, BOX, "screen", False, pieces=WHOLE),
         verdict_key(heavier, BOX, "letter", False, pieces=WHOLE),
-        verdict_key(PLATES, BOX, "letter", False, pieces=dataclasses.replace(WHOLE, digest="other")),
+        verdict_key(PADS, BOX, "letter", False, pieces=dataclasses.replace(WHOLE, digest="other")),
     }
     for constant in ("postures.TOTAL_NORMAL_FORCE", "referee.protocol.HOLD_S", "referee.model.FRICTION"):
         with monkeypatch.context() as patch:
             patch.setattr(f"worker.quality.{constant}", 1.5)
-            found.add(verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE))
+            found.add(verdict_key(PADS, BOX, "letter", False, pieces=WHOLE))
     assert len(found) == 8
 
 
 def test_a_constant_that_moves_no_verdict_moves_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    terms = verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE)
+    terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
     monkeypatch.setattr(protocol, "UNRELATED", 7, raising=False)
     monkeypatch.setattr(postures, "_CHUNK", 5)
-    assert verdict_key(PLATES, BOX, "letter", False, pieces=WHOLE) == terms
+    assert verdict_key(PADS, BOX, "letter", False, pieces=WHOLE) == terms
 
 
 def test_a_constant_of_one_level_moves_the_key_of_that_level_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     levels: tuple[Level, ...] = ("letter", "certificate", "screen")
 
     def terms() -> list[str]:
-        return [verdict_key(PLATES, BOX, level, False, pieces=WHOLE) for level in levels]
+        return [verdict_key(PADS, BOX, level, False, pieces=WHOLE) for level in levels]
 
     before = terms()
     monkeypatch.setattr(protocol, "SCREEN_BAND", (0.2, 4.0))
@@ -231,15 +281,15 @@ def test_joint_limits_reach_the_engine_in_radians() -> None:
 
 
 def test_object_weighs_100_grams_with_its_own_inertia() -> None:
-    model = build(PLATES, BOX, WHOLE, Physics()).model
+    model = build(PADS, BOX, WHOLE, Physics()).model
     body = model.body("object")
     assert body.mass[0] == pytest.approx(OBJECT_MASS)
     assert sorted(body.inertia) == pytest.approx(sorted(OBJECT_MASS * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
 
 
 def test_hand_masses_are_the_model_s() -> None:
-    model = build(PLATES, BOX, WHOLE, Physics()).model
-    assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PLATES.masses)
+    model = build(PADS, BOX, WHOLE, Physics()).model
+    assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PADS.masses)
 
 
 def test_forward_kinematics_agree_with_ours() -> None:
@@ -255,17 +305,17 @@ def test_forward_kinematics_agree_with_ours() -> None:
         assert abs(float(data.body(f"body{b}").xquat @ ours[b, 3:])) == pytest.approx(1.0, abs=1e-12)
 
 
-def coupled_plates() -> HandModel:
-    """One dof closes both plates, the right one at half the pace from an offset of 10 mm."""
+def coupled_pads() -> HandModel:
+    """One dof closes both pads, the right one at half the pace from an offset of 10 mm."""
     return dataclasses.replace(
-        PLATES, dof=np.array([-1, 0, 0], np.int32), multiplier=np.array([1.0, 1.0, 0.5]),
+        PADS, dof=np.array([-1, 0, 0], np.int32), multiplier=np.array([1.0, 1.0, 0.5]),
         offset=np.array([0.0, 0.0, 0.01]), dof_names=("grip",), lower=np.zeros(1), upper=np.full(1, 0.1),
         effort=np.full(1, 100.0), stiffness=np.full(1, 100.0), preshape=np.zeros(1), closing=np.ones(1),
     )  # fmt: skip
 
 
 def test_coupled_joints_stay_coupled_while_moving() -> None:
-    hand = coupled_plates()
+    hand = coupled_pads()
     scene = build(hand, BOX, WHOLE, Physics())
     assert scene.model.nu == 1
     data = mujoco.MjData(scene.model)
@@ -274,13 +324,12 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
     scene.command(data, far, hand.expand(np.array([0.06])))
     mujoco.mj_step(scene.model, data, nstep=500)
     joints = data.qpos[scene.joint_qpos]
-    # Dry friction of 0.01 N in each joint against 100 N/m leaves some 1e-4 m.
-    assert joints[0] == pytest.approx(0.06, abs=3e-4)
+    assert joints[0] == pytest.approx(0.06, abs=1e-5)
     assert joints[1] == pytest.approx(0.5 * joints[0] + 0.01, abs=1e-4)
 
 
 def test_actuators_never_exceed_the_effort() -> None:
-    weak = dataclasses.replace(PLATES, effort=np.array([2.0, 3.0]))
+    weak = dataclasses.replace(PADS, effort=np.array([2.0, 3.0]))
     scene = build(weak, BOX, WHOLE, Physics())
     data = mujoco.MjData(scene.model)
     scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0])
@@ -290,28 +339,28 @@ def test_actuators_never_exceed_the_effort() -> None:
 
 
 def test_a_firm_grasp_survives_noise_and_a_grazing_one_does_not_gain() -> None:
-    share = robustness(PLATES, BOX, many_grasps(), repeats=2, pieces=WHOLE)
+    share = robustness(PADS, BOX, many_grasps(), repeats=2, pieces=WHOLE)
     assert share[0] == 1.0
     assert share[-1] == 0.0
 
 
 def test_only_grasps_that_held_are_tried_with_noise() -> None:
     grasps = many_grasps()
-    all_of_them = robustness(PLATES, BOX, grasps, repeats=2, pieces=WHOLE)
+    all_of_them = robustness(PADS, BOX, grasps, repeats=2, pieces=WHOLE)
     held = np.array([1, 0, 1, 0, -1, 0, 0, 0], np.int8)
-    share = robustness(PLATES, BOX, grasps, held=held, repeats=2, pieces=WHOLE)
+    share = robustness(PADS, BOX, grasps, held=held, repeats=2, pieces=WHOLE)
     assert np.isfinite(share).tolist() == (held == 1).tolist()
     assert np.array_equal(share[held == 1], all_of_them[held == 1]), "noise must not depend on what else is tried"
 
 
 def test_unknown_level_is_refused() -> None:
     with pytest.raises(InputError, match="letter, certificate, screen"):
-        judge(PLATES, BOX, grasp_of(), level="quick", pieces=WHOLE)
+        judge(PADS, BOX, grasp_of(), level="quick", pieces=WHOLE)
 
 
 def test_cancelled_referee_stops() -> None:
     with pytest.raises(TaskCancelled):
-        judge(PLATES, BOX, grasp_of(), pieces=WHOLE, cancelled=lambda: True)
+        judge(PADS, BOX, grasp_of(), pieces=WHOLE, cancelled=lambda: True)
 
 
 def test_convex_object_is_its_own_single_piece(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 Level = Literal["letter", "certificate", "screen"]
 
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
-REVISION: Final = 3
+REVISION: Final = 4
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "LOST_ROTATION")
 #: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
@@ -31,8 +31,8 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "DIRECTIONS", "PUSH", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S",
     ),
     model: (
-        "OBJECT_MASS", "FRICTION", "HARD", "ARMATURE", "FRICTION_LOSS", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF",
-        "COUPLING_SOLREF", "COUPLING_SOLIMP", "_BARE_RADIUS", "_MIN_MASS",
+        "OBJECT_MASS", "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
+        "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
     ),
     postures: (
         "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "OPENING_STEPS", "JAM_M", "WAY",

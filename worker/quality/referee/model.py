@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.transforms import slerp
 from worker.grasps import Posture
 from worker.hands.model import ConvexPiece, HandModel, JointType
 from worker.mujoco_warnings import ARENA
@@ -21,8 +22,6 @@ OBJECT_MASS: Final = 0.1
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (0.6, 0.02)
 HARD: Final = (0.5, 0.1)
-ARMATURE: Final = 2e-4
-FRICTION_LOSS: Final = 0.01
 #: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
 DAMPING_TIME: Final = 0.02
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
@@ -30,6 +29,9 @@ HAND_SOLREF: Final = (0.005, 1.0)
 #: Couplings are stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's floor.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
+#: What the engine does by default today and did not in 3.3.2, the version that DexGraspBench pins: several contacts for
+#: a pair of convex pieces, and a solver for each island of contacts.
+NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
 #: Inertia of a body without geometry: that of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
 _MIN_MASS: Final = 1e-3
@@ -106,7 +108,7 @@ def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Phys
     option.impratio = 10.0
     option.noslip_iterations = physics.noslip_iterations
     spec.memory = ARENA
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | NOT_IN_3_3_2
     friction = [*physics.friction, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
     add_object(spec, obj, pieces, friction, OBJECT_MASS)
@@ -175,8 +177,6 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
         range=ends,
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         damping=[DAMPING_TIME * float(hand.stiffness[d]), 0, 0],
-        armature=ARMATURE,
-        frictionloss=FRICTION_LOSS,
     )
 
 
@@ -287,9 +287,7 @@ def add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list
 
 
 def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
-    """Posture `share` of the way from a to b: positions and joints linearly, rotation along the shorter arc."""
+    """Posture `share` of the way from a to b: positions and joints linearly, the root's turn at an even rate."""
     start, end = a.hand_pose[row], b.hand_pose[row]
-    sign = -1.0 if float(start[3:] @ end[3:]) < 0 else 1.0
-    rotation = (1 - share) * start[3:] + share * sign * end[3:]
-    pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], rotation / np.linalg.norm(rotation)])
+    pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]

@@ -1,7 +1,7 @@
 """The DexGraspBench force-closure test of one grasp, at three levels of cost (research: what each shortcut changes).
 
 letter: as published; each of the 6 pushes starts from the closed hand as if it had closed anew and is held for 2 s.
-certificate: the same physics, but a push ends as soon as linear extrapolation to 2 s stays inside the limits.
+certificate: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside the limits.
 screen: coarser physics (fixed root, 6 ms); where the margin is not clear, the certificate decides.
 """
 
@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.grasps import GraspSet
+from worker.grasps import GraspSet, Posture
 from worker.mujoco_warnings import void
 from worker.quality.referee.model import OBJECT_MASS, Scene, blend
 
@@ -133,12 +133,16 @@ class Test:
     def _start(self, grasps: GraspSet, row: int) -> Trial:
         self._steps = 0
         trial = Trial()
-        self.scene.place(self.data, grasps.grasp.hand_pose[row], grasps.grasp.joint_positions[row])
-        mujoco.mj_forward(self.scene.model, self.data)
-        trial.penetration_m, trial.self_penetration_m = self.penetration()
-        if max(trial.penetration_m, trial.self_penetration_m) > MAX_PENETRATION_M:
+        trial.penetration_m, trial.self_penetration_m = self._depths(grasps.grasp, row)
+        # As published: what counts is where the simulation starts. The depth at the grasp is only told.
+        if max(self._depths(grasps.pregrasp, row)) > MAX_PENETRATION_M:
             return trial.fail(Outcome.PENETRATION)
         return trial
+
+    def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
+        self.scene.place(self.data, posture.hand_pose[row], posture.joint_positions[row])
+        mujoco.mj_forward(self.scene.model, self.data)
+        return self.penetration()
 
     def penetration(self) -> tuple[float, float]:
         """Deepest hand-object and hand-hand penetration of the present state [m]."""
@@ -198,9 +202,11 @@ class Test:
         self._steps += steps
 
     def _offset(self) -> Floats:
-        """(3,) displacement of the centre of mass since the start [m]."""
+        """(3,) displacement since the start of the object's own frame, the mesh's, as published [m]."""
         at = self.scene.object_qpos
-        return np.array(self.data.qpos[at : at + 3]) - self.scene.centre
+        turned = np.empty(3)
+        mujoco.mju_rotVecQuat(turned, self.scene.centre, self.data.qpos[at + 3 : at + 7])
+        return np.asarray(self.data.qpos[at : at + 3] - turned)
 
     def _motion(self) -> tuple[float, float]:
         """Displacement [m] and rotation [rad] of the object since the start."""
