@@ -40,10 +40,10 @@ def evaluate_command(
     level: Annotated[str, typer.Option(help="letter, certificate or screen: what a verdict costs.")] = "certificate",
     hard: Annotated[bool, typer.Option("--hard", help="Half the friction, a tenth of the torsional.")] = False,
     hand: Annotated[
-        str | None, typer.Option(help="The hand's file; default: what the file says, or the built-in.")
+        str | None, typer.Option(help="The hand's file; default: what the file says, found by its digest.")
     ] = None,
     object: Annotated[
-        str | None, typer.Option(help="The object's file; default: what the file says, or the built-in.")
+        str | None, typer.Option(help="The object's file; default: what the file says, found by its digest.")
     ] = None,
     friction: Annotated[
         float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
@@ -75,7 +75,8 @@ def evaluate_command(
             rows.append({"file": str(file), **row})
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
-        emit(whole | {"files": rows})
+        verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
+        emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
     else:
         Console().print(_table(rows, whole))
         for row in rows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import Verdicts, judge
 from worker.quality.referee.key import Level
+from worker.quality.referee.protocol import Outcome
 from worker.quality.sources import Case
 from worker.quality.table import DEFAULT_FRICTION, measure
 
@@ -44,7 +46,7 @@ def evaluate(
     Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
     making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
-    the first principal component.
+    the first principal component. verdicts, where somebody judged: see `told`.
     """
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(
@@ -85,12 +87,28 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
         "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
+        "verdicts": told(verdicts),
         "agreement_published": None,
     }
     if case.published is not None and (known := case.published >= 0).any():
         row["published"] = int(known.sum())
         row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
     return row
+
+
+def told(verdicts: Verdicts) -> list[dict[str, Any]]:
+    """Of each grasp: row, held, outcomes of the six pushes, margin (None: it blew up), reason."""
+    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, strict=True)
+    return [
+        {
+            "row": row,
+            "held": bool(held),
+            "outcomes": [Outcome(int(one)).name.lower() for one in outcomes],
+            "margin": _plain(margin) if math.isfinite(margin) else None,
+            "reason": reason,
+        }
+        for row, (held, outcomes, margin, reason) in enumerate(rows)
+    ]
 
 
 def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64] | None) -> dict[str, Any]:

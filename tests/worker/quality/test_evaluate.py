@@ -213,3 +213,13 @@ def test_wrong_choice_is_the_caller_s_mistake(option: list[str], tmp_path: Path)
 def test_pickle_in_this_file_is_dangerous_without_the_guard() -> None:
     """The refusal above is worth something only if the exploit works on a trusting reader."""
     assert pickle.loads(pickle.dumps(Exploit())) == 0
+
+
+def test_each_grasp_has_its_verdict_with_the_reason(tmp_path: Path) -> None:
+    verdicts = evaluate(plates_case(), cache=tmp_path)["verdicts"]
+    assert [one["row"] for one in verdicts] == [0, 1, 2]
+    assert [one["held"] for one in verdicts] == [True, True, False]
+    assert all(set(one) == {"row", "held", "outcomes", "margin", "reason"} for one in verdicts)
+    assert verdicts[0]["outcomes"] == ["held"] * 6 and verdicts[0]["margin"] < 1
+    assert verdicts[2]["outcomes"] == ["displaced"] + ["not_tried"] * 5 and verdicts[2]["margin"] > 1
+    assert verdicts[2]["reason"] == "displaced under +x"

@@ -203,7 +203,7 @@ def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> No
         time.sleep(0.02)  # long enough for another thread to come in, if it may
         alone.release()
 
-    judge(PLATES, BOX, many_grasps(), level="screen", threads=4, pieces=WHOLE, progress=progress)
+    judge(PADS, BOX, many_grasps(), level="screen", threads=4, pieces=WHOLE, progress=progress)
     assert overlaps == 0
     assert told == list(range(1, len(many_grasps()) + 1))
 
