@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -23,6 +23,9 @@ from worker.objects.normals import corner_normals
 from worker.objects.options import ObjectOptions, parse_options
 from worker.objects.repair import Repaired, repair
 from worker.objects.simplify import simplify
+
+#: Names of files that say nothing of what is in them: the objects of such a set differ by their folders.
+PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")
 
 
 def load_object(
@@ -148,5 +151,10 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
     beside = path.parent / "asset.json"
     if beside.is_file():
         files["asset.json"] = beside.read_bytes()
-        return path.stem, files, {"file": path.name}
-    return path.stem, files, {}
+        return name_of(path), files, {"file": path.name}
+    return name_of(path), files, {}
+
+
+def name_of(path: Path) -> str:
+    """Name of the object in a mesh file: the file's, or its folder's where files of all objects are called the same."""
+    return path.resolve().parent.name if path.stem.lower() in PLAIN_STEMS else path.stem

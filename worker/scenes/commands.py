@@ -25,8 +25,8 @@ app = typer.Typer(add_completion=False)
 def scene(
     grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
     scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
-    object: Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")] = None,
     with_: Annotated[
         list[str] | None, typer.Option("--with", help="Another object on the table: file or built-in; several times.")
     ] = None,
@@ -51,6 +51,7 @@ def scene(
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
     if others:
         attributes |= {"neighbours": [o.name for o in others], "neighbour_digests": [o.digest for o in others]}
+        attributes["neighbour_sources"] = [str(Path(n).resolve()) if Path(n).is_file() else "" for n in with_ or []]
     output.write_bytes(write_shard("scene", result, attributes))
     valid, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     reasons = count_rejections(result["grasp/rejection"])
@@ -66,7 +67,10 @@ def scene(
 
 
 #: What every later shard says about the job it comes from.
-INHERITED: Final = ("hand", "hand_digest", "object", "object_digest", "method", "fidelity", "batch", "root_link")
+INHERITED: Final = (
+    "hand", "hand_digest", "hand_source", "object", "object_digest", "object_source", "object_options", "method",
+    "fidelity", "batch", "root_link",
+)  # fmt: skip
 
 
 def _posture(base: Shard, name: str) -> Posture:

@@ -135,20 +135,15 @@ def known_fidelities(names: Sequence[str]) -> list[str]:
 
 
 def _things(objects: Sequence[str]) -> list[Any]:
-    from worker.objects.prepare import object_from_path
+    from worker.objects.prepare import name_of, object_from_path
     from worker.studies.chart.chart import Thing
-
-    def name(text: str) -> str:
-        path = Path(text)
-        # Sets of objects name the folder and call every mesh alike.
-        return path.parent.name if path.stem in ("clean", "mesh", "model", "textured") else path.stem
 
     def load(text: str, error: float) -> Any:
         return object_from_path(text, face_error_m=error)
 
     for text in objects:
         load(text, 1e-3)  # a wrong file is told before an hour of work
-    return [Thing(name(text), partial(load, text)) for text in objects]
+    return [Thing(name_of(Path(text)), partial(load, text)) for text in objects]
 
 
 def _publish(result: dict[str, Any], data_dir: Path | None) -> None:
