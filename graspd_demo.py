@@ -17,6 +17,7 @@ from api.dashboard.filters import count, duration, metric
 from api.models import GraspQuery, JobDetail
 from api.reports import job_request, job_summary, means_of, yield_of
 from api.watching import JobDisplay
+from service import standing
 from service.assets import builtin_files
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.domain import AssetKind, JobRequest, State
@@ -167,7 +168,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     hand = load_hand(hand_files, name=job.hand, digest=job.hand_digest)
     error_m = job.request.knobs.face_error_m
     obj = load_object(object_files, name=job.object, digest=job.object_digest, face_error_m=error_m)
-    rows = best(base.arrays, _SHOWN_GRASPS)
+    rows = best(base.arrays, _SHOWN_GRASPS, standing.valid(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The sheet's typeface has neither Greek letters nor a multiplication sign.

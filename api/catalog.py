@@ -275,15 +275,17 @@ class Catalog:
             found.add_index(read_index(self._parts.index))
         return found
 
-    def histograms(self, job_id: str, valid: int, *, bins: int = 20) -> list[Histogram]:
-        """Distribution of each metric over a job's valid grasps.
+    def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:
+        """Distribution of each metric over a job's valid grasps, or over all that it kept where nobody judged them.
 
-        Args:
-            valid: how many there are; while that stays, the answer does.
+        While their number stays, the answer does.
         """
-        key = (job_id, valid)
+        judged = job.request.referee != "none"
+        key = (job.id, count := job.valid if judged else job.grasps)
+        if not count:
+            return []
         if (found := self._histograms.get(key)) is None:
-            where = GraspFilter(job=job_id, valid=True)
+            where = GraspFilter(job=job.id, valid=True if judged else None)
             index = self._parts.index
             found = [
                 Histogram(
@@ -324,7 +326,7 @@ class Catalog:
         return self._parts.queue.now(lease_s=max(2, round(self._parts.settings.lease_s)))
 
     def _detail(self, job: JobView) -> JobDetail:
-        mean = {data.metric: data.mean for data in self.histograms(job.id, job.valid)} if job.valid else {}
+        mean = {data.metric: data.mean for data in self.histograms(job)}
         return JobDetail(
             **self._job(job, self._running(job.id)).model_dump(),
             request=job.request,

@@ -31,7 +31,7 @@ class Job(BaseModel):
     fidelity: str
     requested: int = Field(description="grasps asked for")
     grasps: int = Field(description="grasps kept so far")
-    valid: int = Field(description="of these, past the geometric gate, and the referee where it judged")
+    valid: int = Field(description="of these, past the geometric gate and judged to hold; 0 where nobody judges")
     tried: int = Field(0, description="grasps planned for them, kept or not")
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")

@@ -105,9 +105,10 @@ def show_asset(asset: dict[str, Any], *, json: bool) -> None:
 def yield_of(job: JobDetail) -> str:
     """What was found among how many tries, and what the audit says, in a line."""
     level = job.request.referee
-    judged = "" if level == "none" else f", {level} level"
+    if level == "none":
+        return f"{count(job.grasps)} grasps kept in {count(job.tried)} tries; nobody judged them"
     audit = f"; {job.audit_held} of {job.audited} audited hold by the letter" if job.audited else ""
-    return f"{count(job.valid)} valid grasps in {count(job.tried)} tries{judged}{audit}"
+    return f"{count(job.valid)} valid grasps in {count(job.tried)} tries, {level} level{audit}"
 
 
 def means_of(job: JobDetail) -> str:

@@ -141,11 +141,13 @@ class JobOptions(Model):
     )
     friction: float = Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
     want: Literal["valid", "raw"] = Field(
-        "valid", description="whether `grasps` counts grasps that are valid, or all that were tried"
+        "valid",
+        description="whether `grasps` counts grasps that are valid (sound ones where the referee is none), or all that "
+        "were tried",
     )
     budget: float = Field(4.0, ge=1, le=100, description="grasps tried for each valid grasp wanted, at most")
     referee: Literal["letter", "certificate", "screen", "none"] = Field(
-        "certificate", description="level at which MuJoCo judges the grasps; none: valid means geometrically sound"
+        "certificate", description="level at which MuJoCo judges the grasps; none: nobody, grasps are sound at best"
     )
     audits: int = Field(8, ge=0, le=10_000, description="valid grasps of the job that are judged again by the letter")
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
@@ -201,6 +203,11 @@ class JobOptions(Model):
     def knobs(self) -> Fidelity:
         """What the fidelity's name stands for; ValueError for `auto`, which a chart has to resolve first."""
         return resolve_fidelity(self.fidelity)
+
+    @property
+    def counted(self) -> Literal["valid", "sound"]:
+        """What the kept grasps are of a job that does not want raw ones: valid, or sound where nobody judges."""
+        return "sound" if self.referee == "none" else "valid"
 
     def audits_of(self, batch: int) -> int:
         """Grasps of a batch that are audited: the first batches share the job's audits, so that a longer job has the

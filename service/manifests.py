@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service import names
+from service import names, standing
 from service.clock import timestamp
 from service.domain import Digest, JobRequest, Stage, TaskMessage
 from service.integrity import read_checked
@@ -158,7 +158,7 @@ def manifest_of(
 
 def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
     """The manifest's fields that follow from the shard's own columns and attributes."""
-    valid = arrays.get("quality/valid", arrays.get("grasp/valid"))
+    valid = standing.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
         audit = arrays.get("quality/audit", np.empty(0, np.int8))
@@ -179,7 +179,7 @@ def summarise(
     columns |= {name: _numbers(arrays[path]) for name, path in _PLAIN.items()}
     columns |= {name: _numbers(arrays[path]) for name, path in _OPTIONAL.items() if path in arrays}
     columns["contact_links"] = [int(v) for v in arrays["quality/contact_links"]]
-    columns["valid"] = [bool(v) for v in arrays["quality/valid"]]
+    columns["valid"] = standing.valid(arrays).tolist()
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
     level = (attributes or {}).get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]

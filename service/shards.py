@@ -84,8 +84,9 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/contact_links": Column("N", "i4", "1", "none", "hand bodies within 2 mm of the object"),
         "quality/stability_loss": Column("N", "f8", "1", "none", "planner's L_stable; nan: the planner has none"),
         "quality/valid": Column(
-            "N", "u1", "bool", "none", "1: passed the geometric gate, and the referee where it judged"
+            "N", "u1", "bool", "none", "1: sound, and the referee judged that it holds; 0 where nobody judged"
         ),
+        "quality/sound": Column("N", "u1", "bool", "none", "1: passed the geometric gate", optional=True),
         "quality/success": Column(
             "N",
             "i1",
@@ -288,6 +289,8 @@ class Shard:
     kind: ShardKind
     attributes: dict[str, Attribute]
     arrays: dict[str, NDArray[np.generic]]
+    path: Path | None = None
+    """The file it was read from."""
 
     def __getitem__(self, path: str) -> NDArray[np.generic]:
         return self.arrays[path]
@@ -312,7 +315,7 @@ def read_shard(
             raise InputError(f"{name} is a {found} shard; a {kind} shard is needed here")
         arrays = {p: read_column(file, p, name) for p in SCHEMAS[found] if p in file and p not in without}
         attributes = {k: _attribute(v) for k, v in file.attrs.items()}
-    return Shard(found, attributes, arrays)
+    return Shard(found, attributes, arrays, None if isinstance(source, bytes) else source)
 
 
 @contextmanager

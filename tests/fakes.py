@@ -49,7 +49,9 @@ def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
         "quality/self_penetration_depth_mm": rng.random(n),
         "quality/contact_links": rng.integers(0, 5, n),
         "quality/stability_loss": np.full(n, np.nan),
-        "quality/valid": rng.integers(0, 2, n),
+        "quality/valid": (valid := rng.integers(0, 2, n)),
+        "quality/sound": np.ones(n),
+        "quality/success": valid,
     }
     return Output({**postures, **quality}, {"joint_names": ["a", "b"]})
 

@@ -1,7 +1,8 @@
 """Grasps with their quality and verdict: planned in rounds until enough are valid or the budget ends.
 
-A grasp is valid if the referee says that it holds and it passes the geometric gate. The dear steps come last: a grasp
-that the referee drops is not measured.
+A grasp is sound if it passes the geometric gate, and valid if the referee says besides that it holds. Where nobody
+judges, sound ones are counted in their place and none is valid. The dear steps come last: a grasp that the referee
+drops is not measured.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.domain import BATCH_SIZE, JobRequest
+from service.domain import BATCH_SIZE, JobOptions
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -76,7 +77,7 @@ class _Round:
 def certified_grasps(
     hand: HandModel,
     obj: ObjectModel,
-    request: JobRequest,
+    request: JobOptions,
     *,
     count: int,
     batch: int = 0,
@@ -86,7 +87,8 @@ def certified_grasps(
     progress: Progress = lambda done, total, message: None,
     cancelled: Cancelled = lambda: False,
 ) -> Certified:
-    """A batch of a job: `count` valid grasps, or as many as the budget finds; or `count` grasps of any kind.
+    """A batch of a job: `count` valid grasps (sound ones where nobody judges), or as many as the budget finds; or
+    `count` grasps of any kind.
 
     Args:
         hand: the hand.
@@ -115,7 +117,7 @@ def scored(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
-    request: JobRequest,
+    request: JobOptions,
     *,
     threads: int = 0,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
@@ -159,7 +161,7 @@ class _Work:
     """One batch in the making."""
 
     def __init__(
-        self, hand: HandModel, obj: ObjectModel, request: JobRequest, batch: int, threads: int, device: str,
+        self, hand: HandModel, obj: ObjectModel, request: JobOptions, batch: int, threads: int, device: str,
         progress: Progress, cancelled: Cancelled,
     ) -> None:  # fmt: skip
         self.hand, self.obj, self.request, self.batch = hand, obj, request, batch
@@ -228,14 +230,16 @@ class _Work:
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
         columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps)
-        held = columns.get("quality/success", np.ones(len(rows)))
-        valid = (passes(columns) == 1) & (held == 1)
-        columns["quality/valid"] = valid.astype(np.uint8)
+        columns["quality/sound"] = passes(columns)
+        sound = columns["quality/sound"] == 1
+        held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
+        columns["quality/valid"] = (sound & held).astype(np.uint8)
         if not every:
+            wanted = sound if self.pieces is None else sound & held
             fates[np.delete(finite, rows)] = "dropped"
-            fates[finite[rows[~valid]]] = "gate"
-            grasps = grasps.take(np.flatnonzero(valid))
-            columns = {path: array if path == _THRESHOLDS else array[valid] for path, array in columns.items()}
+            fates[finite[rows[~wanted]]] = "gate"
+            grasps = grasps.take(np.flatnonzero(wanted))
+            columns = {path: array if path == _THRESHOLDS else array[wanted] for path, array in columns.items()}
         return _Round(grasps, columns, fates)
 
     def _judged(self, grasps: GraspSet) -> Arrays:

@@ -26,8 +26,10 @@ def job_page(request: Request, job_id: str, catalog: CatalogOf) -> HTMLResponse:
     job = catalog.job(job_id)
     pictures = _pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
-    rows = catalog.grasps(GraspQuery(job=job_id, valid=True), limit=_SHOWN_GRASPS).items if job.valid else []
-    where = {"job": job_id, "valid": "true"}
+    judged = job.request.referee != "none"
+    query = GraspQuery(job=job_id, valid=True if judged else None)
+    rows = catalog.grasps(query, limit=_SHOWN_GRASPS).items if (job.valid if judged else job.grasps) else []
+    where = {"job": job_id} | ({"valid": "true"} if judged else {})
     return render(
         request,
         "job.html",
@@ -35,8 +37,7 @@ def job_page(request: Request, job_id: str, catalog: CatalogOf) -> HTMLResponse:
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         histograms=[
-            (*shown[data.metric], data, charts.bars(data, "/grasps", where))
-            for data in (catalog.histograms(job_id, job.valid) if job.valid else [])
+            (*shown[data.metric], data, charts.bars(data, "/grasps", where)) for data in catalog.histograms(job)
         ],
         loss=_loss(catalog, job),
         pictures=pictures[:_SHOWN_PICTURES],

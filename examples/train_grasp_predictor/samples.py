@@ -71,7 +71,7 @@ def examples(shards: Shards, approach: NDArray[np.float64]) -> Iterator[Example]
         shards: base, scene and views shards.
         approach: (3,) unit direction in which the palm looks, in the frame of the hand's root link.
     """
-    for sample in Pictures(shards, clear=False, with_grasps_only=True):
+    for sample in Pictures(shards, clear=False, valid=False, with_grasps_only=True):
         crop, pose = crop_of(sample), np.asarray(sample["grasp/hand_pose"])
         towards = quat_rotate(pose[:, 3:], approach)[:, 2]
         seen = np.flatnonzero(towards > SEEN)

@@ -139,7 +139,7 @@ class Rates:
             devices = ", ".join(sorted({batch.device for batch in batches}))
             self._known[key] = Rate(
                 seconds_per_try=sum(batch.seconds for batch in batches) / tried,
-                valid_yield=sum(batch.valid for batch in batches) / tried,
+                valid_yield=sum(batch.kept for batch in batches) / tried,
                 bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
                 origin=f"measured here: {words}, {devices}",
                 batches=len(batches),

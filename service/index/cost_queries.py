@@ -31,6 +31,11 @@ class BatchCost:
     tried: int
     size_bytes: int
 
+    @property
+    def kept(self) -> int:
+        """Grasps that count towards those asked for: valid ones, or where nobody judged all that stayed."""
+        return self.valid if self.request.counted == "valid" else self.count
+
 
 class CostQueries(Database):
     """Reads on costs."""

@@ -51,7 +51,9 @@ class JobView(View):
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
     grasps: int = Field(0, description="grasps kept so far")
-    valid: int = Field(0, description="of these, valid: past the geometric gate, and the referee where it judged")
+    valid: int = Field(
+        0, description="of these, valid: past the geometric gate and judged to hold; 0 where nobody judges"
+    )
     tried: int = Field(0, description="grasps planned for them, kept or not")
     audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
     audit_held: int = Field(0, description="of these, grasps that held")
@@ -59,12 +61,13 @@ class JobView(View):
     @computed_field(description="what a reader of the numbers should know")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
-        """Says so where a job ended with fewer valid grasps than it was asked for."""
+        """Says so where a job ended with fewer valid (unjudged: sound) grasps than it was asked for."""
         request = self.request
-        if self.state is not State.SUCCEEDED or request.want != "valid" or self.valid >= request.grasps:
+        found = self.valid if request.counted == "valid" else self.grasps
+        if self.state is not State.SUCCEEDED or request.want != "valid" or found >= request.grasps:
             return None
         return (
-            f"found {self.valid} of {request.grasps} valid grasps in {self.tried} tries: the budget of "
+            f"found {found} of {request.grasps} {request.counted} grasps in {self.tried} tries: the budget of "
             f"{request.budget:g} tries for each ended first"
         )
 

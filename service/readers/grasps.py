@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service import standing
 from service.errors import InputError
 from service.readers.files import ShardFile, Shards
 from service.shards import SCHEMAS, open_shard, read_column
@@ -47,6 +48,7 @@ class Grasps(Sequence[dict[str, Any]]):
         columns: Sequence[str] = DEFAULT_COLUMNS,
         *,
         valid: bool = True,
+        unjudged: bool = False,
         where: Where | None = None,
     ) -> None:
         """Looks into every base shard once, for the rows to keep.
@@ -54,7 +56,8 @@ class Grasps(Sequence[dict[str, Any]]):
         Args:
             shards: see `open_shards`; scene and views shards among them are passed over.
             columns: what a sample holds.
-            valid: only valid grasps.
+            valid: only valid grasps: sound ones of which a referee said that they hold.
+            unjudged: instead of them only those that are sound and that nobody judged.
             where: keeps those of them for which it answers True.
 
         Raises:
@@ -63,7 +66,7 @@ class Grasps(Sequence[dict[str, Any]]):
         if unknown := set(columns) - set(SCHEMAS["base"]):
             raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
         self.shards, self.columns = shards, tuple(columns)
-        self._valid, self._where = valid, where
+        self._valid, self._unjudged, self._where = valid, unjudged, where
         self._files = shards.of("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
         self._rows = [self._kept(file) for file in self._files]
@@ -123,8 +126,11 @@ class Grasps(Sequence[dict[str, Any]]):
         return sample | {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row}
 
     def _kept(self, file: ShardFile) -> NDArray[np.intp]:
-        held = self._load(file, tuple(SCHEMAS["base"]) if self._where else ("quality/valid",), keep=False)
-        mask = held["quality/valid"] == 1 if self._valid else np.ones(len(held["quality/valid"]), bool)
+        held = self._load(file, tuple(SCHEMAS["base"]) if self._where else standing.COLUMNS, keep=False)
+        if self._valid or self._unjudged:
+            mask = standing.chosen(held, unjudged=self._unjudged)
+        else:
+            mask = np.ones(len(held["quality/valid"]), bool)
         if self._where is not None:
             found = np.asarray(self._where(held), bool)
             if found.shape != mask.shape:

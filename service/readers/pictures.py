@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import transforms
+from service import standing, transforms
 from service.errors import InputError
 from service.readers.files import ShardFile, Shards
 from service.shards import SCHEMAS, open_shard, read_shard
@@ -50,6 +50,8 @@ class Pictures(Sequence[dict[str, Any]]):
         *,
         grasp_quality: Sequence[str] = ("quality/epsilon",),
         clear: bool = True,
+        valid: bool = True,
+        unjudged: bool = False,
         with_grasps_only: bool = False,
     ) -> None:
         """
@@ -58,6 +60,8 @@ class Pictures(Sequence[dict[str, Any]]):
             columns: what a sample holds of its picture.
             grasp_quality: base columns of its grasps.
             clear: only grasps that are clear of the table, and of neighbours, in this scene.
+            valid: only valid grasps; False: all that the base shards hold.
+            unjudged: instead of valid ones only those that are sound and that nobody judged.
             with_grasps_only: leave out pictures of scenes without a grasp.
 
         Raises:
@@ -68,7 +72,8 @@ class Pictures(Sequence[dict[str, Any]]):
             raise InputError(f"views shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
         if unknown := set(grasp_quality) - set(SCHEMAS["base"]):
             raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
-        self.shards, self.columns, self._quality, self._clear = shards, tuple(columns), tuple(grasp_quality), clear
+        self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
+        self._which = {"clear": clear, "valid": valid, "unjudged": unjudged}
         self._scenes: OrderedDict[str, _Scenes] = OrderedDict()
         self._places: list[tuple[ShardFile, str, int, int]] = []
         for file in shards.of("views"):
@@ -100,7 +105,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def _scenes_of(self, shard: str) -> _Scenes:
         if shard not in self._scenes:
-            self._scenes[shard] = _Scenes(self.shards, shard, self._quality, clear=self._clear)
+            self._scenes[shard] = _Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)
         return self._scenes[shard]
@@ -109,11 +114,16 @@ class Pictures(Sequence[dict[str, Any]]):
 class _Scenes:
     """The scenes of one scene shard with their grasps."""
 
-    def __init__(self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool) -> None:
+    def __init__(
+        self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool, valid: bool, unjudged: bool
+    ) -> None:
         scene = read_shard(shards.path(shards.by_id(shard)), kind="scene")
         self._base_id = str(scene.attributes["base_shard"])
         base = read_shard(shards.path(shards.by_id(self._base_id)), kind="base")
-        kept = np.flatnonzero(np.asarray(scene["grasp/valid"]) == 1) if clear else slice(None)
+        mask = np.asarray(scene["grasp/valid"]) == 1 if clear else np.ones(len(scene["grasp/valid"]), bool)
+        if valid or unjudged:
+            mask &= standing.chosen(base.arrays, unjudged=unjudged)[np.asarray(scene["grasp/base_index"])]
+        kept = np.flatnonzero(mask)
         self._scene = np.asarray(scene["grasp/scene_index"])[kept]
         self._row = np.asarray(scene["grasp/base_index"])[kept]
         self._pose = np.asarray(scene["grasp/hand_pose"], float)[kept]

@@ -45,6 +45,7 @@ def valid(hand: HandModel, block: ObjectModel) -> Certified:
 def test_a_batch_of_valid_grasps_holds_nothing_else(valid: Certified) -> None:
     assert len(valid.grasps) == COUNT
     assert (valid.columns["quality/valid"] == 1).all()
+    assert (valid.columns["quality/sound"] == 1).all()
     assert (valid.columns["quality/success"] == 1).all()
     assert all(len(array) == COUNT for path, array in valid.columns.items() if path != "quality/thresholds_m")
 
@@ -94,6 +95,9 @@ def test_without_a_referee_nobody_judges(hand: HandModel, block: ObjectModel) ->
     found = certified_grasps(hand, block, wish(referee="none"), count=COUNT)
     assert found.verdict_key is None
     assert "quality/success" not in found.columns
+    assert len(found.grasps) == COUNT
+    assert (found.columns["quality/sound"] == 1).all(), "the budget is for sound grasps then"
+    assert not found.columns["quality/valid"].any()
 
 
 def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -> None:

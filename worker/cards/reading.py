@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import names
+from service import names, standing
 from service.errors import NotFoundError
 from service.manifests import ShardManifest, load_manifest
 from service.readers import ShardFile
@@ -24,7 +24,7 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
         "grasp/hand_pose", "grasp/joint_positions", "quality/thresholds_m", "quality/contact_area_cm2",
         "quality/intersection_volume_cm3", "quality/epsilon", "quality/wrench_volume",
         "quality/simulated_displacement_cm", "quality/penetration_depth_mm", "quality/self_penetration_depth_mm",
-        "quality/contact_links", "quality/stability_loss", "quality/valid", "quality/audit", "quality/robustness",
+        "quality/contact_links", "quality/stability_loss", *standing.COLUMNS, "quality/audit", "quality/robustness",
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
     "views": (),

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service import standing
 from service.manifests import INDEX_THRESHOLD_M
 from service.transforms import quat_rotate
 from worker.cards.contents import AssetFacts, Contents, Pair
@@ -162,7 +163,7 @@ def _note(tally: Tally, cell: CellTally, piece: Piece) -> None:
 def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> Array:
     """Add a base shard; returns its mask (N,) of valid grasps."""
     columns = piece.columns
-    valid = columns["quality/valid"] == 1
+    valid = standing.valid(columns)
     cell.grasps += piece.rows
     cell.valid += int(valid.sum())
     cell.tried += int(piece.said.get("tried", piece.rows))

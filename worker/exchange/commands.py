@@ -9,9 +9,11 @@ from typing import Annotated, Any, Final
 import numpy as np
 import typer
 
+from service import standing
 from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
 from service.shards import read_shard
+from worker.choice import EveryOption, UnjudgedOption, choose
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -24,11 +26,12 @@ IMPORTS: Final = ("dexgraspbench", "dexgraspnet", "multidex", "ddgc", "reference
 def export(
     source: Annotated[Path, typer.Argument(help="A shard, or for webdataset a folder of shards.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
-    hand: Annotated[str | None, typer.Option(help="The shard's hand, where it is not built in.")] = None,
+    hand: Annotated[str | None, typer.Option(help="The shard's hand; default: found by its digest.")] = None,
     object_: Annotated[
-        str | None, typer.Option("--object", help="The shard's object, where it is not built in.")
+        str | None, typer.Option("--object", help="The shard's object; default: found by its digest.")
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Grasps that are not valid as well.")] = False,
+    unjudged: UnjudgedOption = False,
+    every: EveryOption = False,
     depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
     json: JsonFlag = False,
@@ -39,9 +42,9 @@ def export(
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
     if format_ == "webdataset":
-        written = _webdataset(source, output)
+        written = _webdataset(source, output, unjudged=unjudged, every=every)
     elif format_ == "dexgraspbench":
-        written = _bench(source, hand, object_, output, every=every)
+        written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
     else:
         written = _pictures(source, format_, depth, output)
     if json:
@@ -93,7 +96,8 @@ def import_(
         emit({"folder": str(output), "shards": found})
         return
     for one in found:
-        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['valid']} valid by our gate and referee ({referee})")
+        judged = "nobody judged them" if referee == "none" else f"{one['valid']} valid at level {referee}"
+        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['sound']} sound, {judged}")
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
@@ -135,27 +139,32 @@ def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str,
     return {"pictures": len(views["camera/eye"]), "files": len(written)}
 
 
-def _webdataset(source: Path, output: Path) -> dict[str, int]:
+def _webdataset(source: Path, output: Path, *, unjudged: bool, every: bool) -> dict[str, int]:
     from service.readers import Pictures, open_shards
     from worker.exchange import webdataset
 
     shards = open_shards(source)
-    written = webdataset.write(shards, output)
+    written = webdataset.write(shards, output, valid=not every, unjudged=unjudged)
     return {"pictures": len(Pictures(shards)), "files": len(written)}
 
 
-def _bench(source: Path, hand: str | None, obj: str | None, output: Path, *, every: bool) -> dict[str, int]:
+def _bench(
+    source: Path, hand: str | None, obj: str | None, output: Path, *, unjudged: bool, every: bool
+) -> dict[str, int]:
     from worker.exchange import dexgraspbench
     from worker.quality.sources import load_case
 
     case = load_case(source, hand=hand, obj=obj)
-    valid = np.asarray(read_shard(source, kind="base")["quality/valid"]) == 1
-    rows = np.arange(len(valid)) if every else np.flatnonzero(valid)
+    mask, _ = choose(read_shard(source, kind="base"), unjudged=unjudged, every=every)
+    rows = np.flatnonzero(mask)
     written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output)
     return {"grasps": len(written), "files": len(written)}
 
 
 def _summary(file: Path) -> dict[str, Any]:
     shard = read_shard(file, kind="base")
-    valid = np.asarray(shard["quality/valid"])
-    return {"file": str(file), "object": shard.attributes["object"], "grasps": len(valid), "valid": int(valid.sum())}
+    valid, sound = standing.valid(shard.arrays), standing.sound(shard.arrays)
+    return {
+        "file": str(file), "object": shard.attributes["object"], "grasps": len(valid), "valid": int(valid.sum()),
+        "sound": int(sound.sum()),
+    }  # fmt: skip

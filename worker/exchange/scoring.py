@@ -13,7 +13,7 @@ from worker.certified import scored
 from worker.exchange.imported import Imported, Origin, plain_name
 from worker.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
-from worker.stages.synthesize import postures
+from worker.stages.synthesize import postures, verdict_attributes
 
 
 def write_scored(
@@ -60,8 +60,7 @@ def write_scored(
         "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
         "batch": ordinal,
     }  # fmt: skip
-    if made.verdict_key is not None:
-        attributes |= {"verdict_level": referee, "verdict_key": made.verdict_key}
+    attributes |= verdict_attributes(referee, made.verdict_key)
     columns: dict[str, Any] = {**postures(made.grasps), **made.columns}
     path.write_bytes(write_shard("base", columns, attributes))
     return path

@@ -24,13 +24,17 @@ from worker.rendering.export import describe, export_exr, export_png
 _COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
 
 
-def write(shards: Shards, folder: Path, *, pictures_a_file: int = 1000) -> list[Path]:
+def write(
+    shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unjudged: bool = False
+) -> list[Path]:
     """Write `pictures-NNNNNN.tar` files.
 
     Args:
         shards: views shards with the scene and base shards they were made of.
         folder: where to; made if absent.
         pictures_a_file: samples in one tar file.
+        valid: only valid grasps; False: all of them.
+        unjudged: instead of valid ones those that are sound and that nobody judged.
 
     Returns:
         the files.
@@ -38,7 +42,9 @@ def write(shards: Shards, folder: Path, *, pictures_a_file: int = 1000) -> list[
     Raises:
         InputError: no picture in the shards, or tar files in the folder already.
     """
-    pictures = Pictures(shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"))
+    pictures = Pictures(
+        shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unjudged=unjudged
+    )
     if not len(pictures):
         raise InputError("the shards hold no picture; ask for views when you submit, or run graspd render")
     folder.mkdir(parents=True, exist_ok=True)

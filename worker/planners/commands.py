@@ -1,10 +1,12 @@
-"""`graspd synth`: grasps in one process, without a queue or a server."""
+"""`graspd synth`: the grasps of a job in one process, without a queue or a server."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import typer
@@ -12,23 +14,23 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from service.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
 from service.cli import JsonFlag, emit, reporting_errors
-from service.domain import BATCH_SIZE, FIDELITIES, Fidelity
+from service.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
 from service.errors import InputError
 from service.shards import Attribute, json_attribute, write_shard
-from worker.certified import joined_columns
+from worker.certified import Certified, certified_grasps, joined_columns
 from worker.devices import Device
-from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-from worker.planners import PLANNERS, planner, synthesize
+from worker.origin import remembered
+from worker.planners import PLANNERS, planner
 from worker.planners import Progress as Report
 from worker.planners.registry import parsed_options
-from worker.quality.gate import passes
-from worker.quality.table import measure
-from worker.stages.synthesize import postures
+from worker.quality.referee.key import Level
+from worker.stages.synthesize import postures, verdict_attributes
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -42,6 +44,11 @@ def synth(
     object_: Annotated[str, typer.Option("--object", help="a mesh (STL, OBJ, PLY, GLB, OFF) or a built-in object")],
     out: Annotated[Path, typer.Option("-o", "--out", help="HDF5 file to write")],
     grasps: Annotated[int, typer.Option("-n", "--grasps", help="number of grasps", min=1, max=100_000)] = 32,
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    budget: Annotated[float, typer.Option(help="Grasps tried for each one wanted, at most.", min=1.0, max=100.0)] = 4.0,
+    referee: Annotated[
+        str, typer.Option(help="letter, certificate, screen; none: nobody judges, grasps are sound, never valid.")
+    ] = "certificate",
     method: Annotated[
         str, typer.Option(help=f"planner: {', '.join(PLANNERS)}, or one that another package offers")
     ] = "fast_graspd",
@@ -54,22 +61,65 @@ def synth(
     friction: Annotated[
         float, typer.Option(help="Coulomb coefficient of the quality metrics", min=0.01, max=3.0)
     ] = 1.0,
+    units: UnitsOption = None,
+    scale_to: ScaleToOption = None,
+    keep_largest: KeepLargestOption = False,
+    allow_open: AllowOpenOption = False,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core", min=0)] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Synthesize grasps of one hand on one object into an HDF5 file."""
+    """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file."""
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
-    knobs = chosen_fidelity(fidelity, contact_solver)
-    options = parsed_options(option or [])
-    planner(method, options)  # a wrong name or option is told before the files are read
-    model, obj = hand_from_path(hand), object_from_path(object_, face_error_m=knobs.face_error_m)
+    request = _request(want, budget, referee).model_copy(
+        update={
+            "grasps": grasps, "method": method, "options": parsed_options(option or []), "seed": seed,
+            "friction": friction, "fidelity": chosen_fidelity(fidelity, contact_solver),
+        }
+    )  # fmt: skip
+    planner(method, request.options)  # a wrong name or option is told before the files are read
+    mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
+    model = hand_from_path(hand)
+    obj = object_from_path(object_, face_error_m=request.knobs.face_error_m, options=mesh)
     device = Device(device).resolve()
+    began = time.perf_counter()
+    with _bar(grasps, quiet=json) as report:
+        batches = [
+            certified_grasps(
+                model, obj, request, count=min(BATCH_SIZE, grasps - first), batch=first // BATCH_SIZE,
+                threads=threads, device=device, progress=report(first, min(BATCH_SIZE, grasps - first)),
+            )
+            for first in range(0, grasps, BATCH_SIZE)
+        ]  # fmt: skip
+    seconds = time.perf_counter() - began
+    arrays = joined_columns([{**postures(batch.grasps), **batch.columns} for batch in batches])
+    attributes = _attributes(model, obj, request, batches, device, seconds)
+    out.write_bytes(write_shard("base", arrays, attributes | remembered(hand, object_, mesh)))
+    found = summary(arrays, request, batches, out, seconds)
+    if json:
+        emit(found)
+    else:
+        typer.echo(_said(found))
+
+
+def _request(want: str, budget: float, referee: str) -> JobOptions:
+    """Options of a job with these; InputError for a word that is none."""
+    if want not in ("valid", "raw"):
+        raise InputError(f"unknown --want {want!r}; choose valid or raw")
+    if referee not in (*get_args(Level), "none"):
+        raise InputError(f"unknown referee {referee!r}; choose one of {', '.join(get_args(Level))} or none")
+    # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
+    return JobOptions(want=want, budget=budget, referee=referee, audits=0)
+
+
+@contextmanager
+def _bar(grasps: int, *, quiet: bool) -> Iterator[Any]:
+    """A progress bar; gives a function that makes the reporter of a batch from its first grasp and their number."""
     began = time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
+    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
         task = bar.add_task("starting", total=grasps, rate="")
 
         def report(first: int, count: int) -> Report:
@@ -80,30 +130,7 @@ def synth(
 
             return tell
 
-        parts = []
-        for first in range(0, grasps, BATCH_SIZE):
-            count = min(BATCH_SIZE, grasps - first)
-            parts.append(
-                _batch(
-                    model, obj, count=count, method=method, fidelity=knobs, options=options, seed=seed,
-                    batch=first // BATCH_SIZE, friction=friction, threads=threads, device=device,
-                    progress=report(first, count),
-                )
-            )  # fmt: skip
-    seconds = time.perf_counter() - began
-    arrays = joined_columns(parts)
-    attributes = _attributes(model, obj, method, knobs, seed, friction, device, seconds)
-    out.write_bytes(write_shard("base", arrays, attributes))
-    found = summary(arrays, out, seconds)
-    if json:
-        emit(found)
-    else:
-        mean = found["mean"]
-        typer.echo(
-            f"{out}: {found['valid']} of {found['grasps']} grasps valid, {found['grasps_per_second']:.1f} grasps/s; "
-            f"mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "
-            f"penetration {mean['penetration_depth_mm']:.2f} mm"
-        )
+        yield report
 
 
 def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
@@ -123,43 +150,64 @@ def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
         raise InputError(f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel") from None
 
 
-def _batch(
-    hand: HandModel, obj: ObjectModel, *, count: int, method: str, fidelity: Fidelity,
-    options: dict[str, str], seed: int, batch: int, friction: float, threads: int, device: str, progress: Report,
-) -> Arrays:  # fmt: skip
-    found: GraspSet = synthesize(
-        hand, obj, count=count, method=method, fidelity=fidelity, options=options, seed=seed, batch=batch,
-        threads=threads, device=device, progress=progress,
-    )  # fmt: skip
-    quality = measure(hand, obj, found, friction=friction, threads=threads)
-    return {**postures(found), **quality, "quality/valid": passes(quality)}
-
-
 def _attributes(
-    hand: HandModel, obj: ObjectModel, method: str, fidelity: Fidelity, seed: int, friction: float, device: str,
-    seconds: float,
-) -> dict[str, Attribute]:  # fmt: skip
-    return {
+    hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[Certified], device: str, seconds: float
+) -> dict[str, Attribute]:
+    attributes: dict[str, Attribute] = {
         "hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest,
-        "method": method, "fidelity": json_attribute(fidelity.model_dump(mode="json")), "seed": seed, "batch": 0,
-        "device": device, "seconds": round(seconds, 4), "mu": friction, "root_link": hand.root_link,
-        "joint_names": list(hand.joint_names),
+        "method": request.method, "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4), "mu": request.friction,
+        "root_link": hand.root_link, "joint_names": list(hand.joint_names), "want": request.want,
+        "tried": sum(batch.tried for batch in batches),
     }  # fmt: skip
+    return attributes | verdict_attributes(request.referee, batches[0].verdict_key)
 
 
-def summary(arrays: Arrays, out: Path, seconds: float) -> dict[str, Any]:
+def summary(arrays: Arrays, request: JobOptions, batches: list[Certified], out: Path, seconds: float) -> dict[str, Any]:
     """What a user wants to know first of a base shard."""
     column = int(np.argmin(np.abs(arrays["quality/thresholds_m"] - 0.005)))
+    count = len(arrays["quality/valid"])
+
+    def mean(name: str, digits: int) -> float | None:
+        values = arrays[f"quality/{name}"]
+        values = values[:, column] if values.ndim == 2 else values
+        known = values[np.isfinite(values)]
+        return round(float(known.mean()), digits) if len(known) else None
+
     return {
         "file": str(out),
-        "grasps": len(arrays["quality/valid"]),
+        "grasps": count,
+        "tried": sum(batch.tried for batch in batches),
         "valid": int(arrays["quality/valid"].sum()),
+        "sound": int(arrays["quality/sound"].sum()),
+        "referee": request.referee,
+        "want": request.want,
+        "wanted": request.grasps,
         "seconds": round(seconds, 3),
-        "grasps_per_second": round(len(arrays["quality/valid"]) / seconds, 2),
+        "grasps_per_second": round(count / seconds, 2),
         "mean": {
-            "epsilon": round(float(arrays["quality/epsilon"][:, column].mean()), 4),
-            "contact_area_cm2": round(float(arrays["quality/contact_area_cm2"][:, column].mean()), 2),
-            "intersection_volume_cm3": round(float(np.nanmean(arrays["quality/intersection_volume_cm3"])), 4),
-            "penetration_depth_mm": round(float(arrays["quality/penetration_depth_mm"].mean()), 3),
+            "epsilon": mean("epsilon", 4),
+            "contact_area_cm2": mean("contact_area_cm2", 2),
+            "intersection_volume_cm3": mean("intersection_volume_cm3", 4),
+            "penetration_depth_mm": mean("penetration_depth_mm", 3),
         },
     }
+
+
+def _said(found: dict[str, Any]) -> str:
+    """The summary as a line; the second one tells what is missing."""
+    judged, mean = found["referee"] != "none", found["mean"]
+    word = "valid" if judged else "sound"
+    lines = [
+        f"{found['file']}: {found[word]} {word} of {found['tried']} grasps tried"
+        f"{', judged at level ' + found['referee'] if judged else '; nobody judged them (--referee none)'}, "
+        f"{found['grasps_per_second']:.1f} grasps/s"
+    ]
+    if found["grasps"]:
+        lines[0] += (
+            f"; mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "
+            f"penetration {mean['penetration_depth_mm']:.2f} mm"
+        )
+    if found["want"] == "valid" and found["grasps"] < found["wanted"]:
+        lines.append(f"{found['wanted']} {word} ones were wanted: the budget of tries ended first; see --budget")
+    return "\n".join(lines)

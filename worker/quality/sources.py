@@ -87,7 +87,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
         path.name, model, thing, grasps,
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
-        judged="verdict_level" in said,
+        judged=said.get("verdict_level", "none") != "none",
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
 from service.shards import Shard, read_shard, write_shard
+from worker.choice import EveryOption, UnjudgedOption, choose
 from worker.devices import Device
 from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
@@ -33,7 +34,7 @@ ALONE: Final = (300, SAMPLES)
 OF_THREE: Final = (160, 8)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
-_Object = Annotated[str | None, typer.Option(help="The object's file; default: the built-in of that name.")]
+_Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
 
 
 @app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
@@ -54,7 +55,7 @@ def render(
     with_hand: Annotated[
         Path | None, typer.Option(help="The base shard: also pictures with each scene's best grasp.")
     ] = None,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
     with_: Annotated[
         list[str] | None, typer.Option("--with", help="A neighbour's file; default: the built-in of that name.")
     ] = None,
@@ -87,7 +88,7 @@ def render(
             progress=lambda done, total, message: bar.update(task, completed=done, total=total, description=message),
         )  # fmt: skip
     seconds = perf_counter() - started
-    inherited = (*INHERITED, "neighbours", "neighbour_digests")
+    inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
     kept = {key: scene.attributes[key] for key in inherited if key in scene.attributes}
     output.write_bytes(
         write_shard("views", result, {**kept, "seed": number, "device": used, "seconds": round(seconds, 4)})
@@ -111,18 +112,19 @@ def pictures(
     size: Annotated[
         int | None, typer.Option(min=32, max=2048, help="Edge of one picture [px]; 300, with --three-sides 160.")
     ] = None,
-    hand: Annotated[str | None, typer.Option(help="The hand's file; default: the built-in of that name.")] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
     object: _Object = None,
+    unjudged: UnjudgedOption = False,
+    every: EveryOption = False,
     device: _Device = "auto",
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("grasps.png"),
     json: JsonFlag = False,
 ) -> None:
-    """Draw the best grasps by epsilon with their figures on one sheet."""
+    """Draw the best valid grasps by epsilon with their figures on one sheet."""
     base = read_shard(grasps, kind="base")
-    if len(base["quality/valid"]) == 0:
-        raise InputError(f"{grasps} holds no grasps; there is nothing to draw")
+    chosen, word = choose(base, unjudged=unjudged, every=every)
     model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
-    rows = best(base.arrays, count)
+    rows = best(base.arrays, count, chosen)
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     sides = THREE_SIDES if three else THREE_SIDES[:1]
     edge, samples = OF_THREE if three else ALONE
@@ -131,17 +133,16 @@ def pictures(
         model, obj, poses, joints, (edge, edge), sides, device=Device(device).resolve(), samples=samples
     )
     title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
-    valid = int(np.asarray(base["quality/valid"]).sum())
-    subtitle = f"{len(rows)} of {len(base['quality/valid'])} grasps, {valid} valid, by epsilon at 5 mm"
+    subtitle = f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm"
     captions = figures(base.arrays, rows)
     if three:
         output.write_bytes(three_sides_sheet(drawn, captions, title=title, subtitle=subtitle))
     else:
         output.write_bytes(contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle))
     if json:
-        emit({"file": str(output), "grasps": len(rows), "rows": rows.tolist()})
+        emit({"file": str(output), "grasps": len(rows), "of": int(chosen.sum()), "kind": word, "rows": rows.tolist()})
     else:
-        typer.echo(f"{output}: the best {len(rows)} grasps")
+        typer.echo(f"{output}: the best {len(rows)} of {int(chosen.sum())} {word}")
 
 
 def _drawn(scene: Shard, base_file: Path, hand: str | None) -> DrawnHand:

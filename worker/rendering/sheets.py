@@ -31,10 +31,10 @@ _EDGES: Final = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & 
 Arrays = Mapping[str, NDArray[np.generic]]
 
 
-def best(quality: Arrays, count: int) -> NDArray[np.intp]:
-    """Rows of the `count` best grasps: valid ones first, then by epsilon."""
-    valid, epsilon = np.asarray(quality["quality/valid"], bool), _quoted(quality, "quality/epsilon")
-    return np.lexsort((-epsilon, ~valid))[:count]
+def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Rows of the `count` best grasps by epsilon among those of a mask (N,)."""
+    rows = np.flatnonzero(among)
+    return rows[np.argsort(-_quoted(quality, "quality/epsilon")[rows], kind="stable")][:count]
 
 
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:

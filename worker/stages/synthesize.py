@@ -47,9 +47,12 @@ def attributes_of(hand: HandModel, message: TaskMessage, found: Certified) -> di
         "want": request.want,
         "tried": found.tried,
     }
-    if found.verdict_key is not None:
-        attributes |= {"verdict_level": request.referee, "verdict_key": found.verdict_key}
-    return attributes
+    return attributes | verdict_attributes(request.referee, found.verdict_key)
+
+
+def verdict_attributes(level: str, key: str | None) -> dict[str, Attribute]:
+    """Who judged the grasps of a base shard: the level and its key, or none."""
+    return {"verdict_level": "none"} if key is None else {"verdict_level": level, "verdict_key": key}
 
 
 def postures(grasps: GraspSet) -> dict[str, Any]:

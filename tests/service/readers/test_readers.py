@@ -97,6 +97,10 @@ def test_a_picture_comes_with_its_scenes_grasps_in_the_camera_frame(folder: Path
     views = read_shard(shards.path(shards.by_id(picture["shard_id"])), kind="views")
     scene = read_shard(shards.path(shards.by_id(str(views.attributes["scene_shard"]))), kind="scene")
     here = (scene["grasp/scene_index"] == picture["scene"]) & (scene["grasp/valid"] == 1)
+    base = read_shard(shards.path(shards.by_id(str(scene.attributes["base_shard"]))), kind="base")
+    valid = base["quality/valid"][scene["grasp/base_index"]] == 1
+    assert (here & ~valid).any(), "some grasps that are clear must not be valid, or nothing is tested"
+    here &= valid
     table = np.asarray(scene["grasp/hand_pose"], float)[here]
     expected = compose(pose_from_matrix(picture["camera/extrinsics"]), table)
     np.testing.assert_allclose(picture["grasp/hand_pose"], expected, atol=1e-12)  # rounding of float64

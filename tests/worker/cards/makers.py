@@ -151,6 +151,7 @@ def _base(rng: np.random.Generator, hand: str, count: int, batch: int) -> dict[s
         columns[f"quality/{name}"] = rng.gamma(2.0, scale / 2, count)
     columns["quality/contact_links"] = rng.integers(2, 9, count).astype(np.int32)
     columns["quality/valid"] = np.ones(count, np.uint8)
+    columns["quality/success"] = np.ones(count, np.int8)
     if batch == 0:
         columns["quality/audit"] = np.where(np.arange(count) < 8, 1, -1).astype(np.int8)
     return columns

@@ -45,6 +45,7 @@ def base(tmp_path_factory) -> Path:
         "quality/thresholds_m": np.array([0.002, 0.005]),
         "quality/contact_links": np.full(GRASPS, 4),
         "quality/valid": np.ones(GRASPS, np.uint8),
+        "quality/success": np.ones(GRASPS, np.int8),
     }
     attributes = {
         "hand": "allegro", "hand_digest": hand.digest, "object": "block", "object_digest": obj.digest,

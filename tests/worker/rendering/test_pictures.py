@@ -64,13 +64,13 @@ def quality(count: int) -> dict[str, np.ndarray]:
         "quality/epsilon": epsilon,
         "quality/contact_area_cm2": epsilon,
         "quality/penetration_depth_mm": np.full(count, 0.25),
-        "quality/valid": np.array([1] * (count - 1) + [0], np.uint8),
     }
 
 
-def test_the_best_grasps_are_the_valid_ones_with_the_largest_epsilon():
-    assert best(quality(5), 3).tolist() == [3, 2, 1]
-    assert best(quality(5), 9).tolist() == [3, 2, 1, 0, 4]
+def test_the_best_grasps_are_those_with_the_largest_epsilon_among_the_chosen():
+    chosen = np.array([True, True, True, True, False])
+    assert best(quality(5), 3, chosen).tolist() == [3, 2, 1]
+    assert best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
 
 
 def test_captions_quote_the_metrics_at_five_millimetres():

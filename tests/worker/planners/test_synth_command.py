@@ -1,0 +1,185 @@
+"""`graspd synth`: judged as a job, called what it is, and a file that finds its hand and object again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from graspd import build
+from service.errors import ConflictError, NotFoundError
+from service.readers import Grasps, open_shards
+from service.shards import Shard, read_shard
+from worker.scenes.sources import object_of_shard
+
+
+def run(*words: str | Path) -> Any:
+    return CliRunner().invoke(build(), [str(word) for word in words])
+
+
+def synth(out: Path, *more: str | Path, obj: str | Path = "block") -> dict[str, Any]:
+    done = run(
+        "synth", "--hand", "allegro", "--object", obj, "-n", 3, "--fidelity", "draft", "--device", "cpu", "-o", out,
+        "--json", *more,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("synth")
+
+
+@pytest.fixture(scope="module")
+def judged(folder: Path) -> tuple[Path, dict[str, Any]]:
+    return folder / "judged.h5", synth(folder / "judged.h5", "--budget", "8")
+
+
+@pytest.fixture(scope="module")
+def unjudged(folder: Path) -> tuple[Path, dict[str, Any]]:
+    return folder / "unjudged.h5", synth(folder / "unjudged.h5", "--referee", "none")
+
+
+@pytest.fixture(scope="module")
+def own_mesh(folder: Path) -> Path:
+    """A box beside a small ball, in a folder that says what it is."""
+    (folder / "brick").mkdir()
+    box, ball = trimesh.creation.box((0.05, 0.06, 0.07)), trimesh.creation.icosphere(radius=0.005)
+    ball.apply_translation([0.1, 0, 0])
+    trimesh.util.concatenate([box, ball]).export(folder / "brick" / "clean.obj")
+    return folder / "brick" / "clean.obj"
+
+
+@pytest.fixture(scope="module")
+def of_own_mesh(folder: Path, own_mesh: Path) -> Path:
+    synth(folder / "own.h5", "--referee", "none", "--keep-largest", obj=own_mesh)
+    return folder / "own.h5"
+
+
+def test_grasps_called_valid_were_judged_as_in_a_job(judged: tuple[Path, dict[str, Any]]) -> None:
+    file, said = judged
+    shard = read_shard(file, kind="base")
+    assert (said["grasps"], said["valid"], said["sound"], said["referee"]) == (3, 3, 3, "certificate")
+    assert said["tried"] >= 3 and shard.attributes["tried"] == said["tried"]
+    assert (shard["quality/success"] == 1).all()
+    assert shard.attributes["verdict_level"] == "certificate" and "verdict_key" in shard.attributes
+
+
+def test_grasps_that_nobody_judged_are_sound_and_never_valid(unjudged: tuple[Path, dict[str, Any]]) -> None:
+    file, said = unjudged
+    shard = read_shard(file, kind="base")
+    assert (said["grasps"], said["valid"], said["sound"], said["referee"]) == (3, 0, 3, "none")
+    assert shard.attributes["verdict_level"] == "none" and "quality/success" not in shard.arrays
+    assert not shard["quality/valid"].any()
+
+
+def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(judged: tuple[Path, Any]) -> None:
+    done = run("evaluate", judged[0], "--json")
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == [
+        (str(judged[0]), row, True) for row in range(3)
+    ]
+    assert "verdicts" not in told["files"][0]
+
+
+def test_readers_take_grasps_that_nobody_judged_only_when_told(
+    judged: tuple[Path, Any], unjudged: tuple[Path, Any]
+) -> None:
+    both = open_shards([judged[0], unjudged[0]])
+    rows = [Grasps(both, columns=["quality/epsilon"], **wish) for wish in ({}, {"unjudged": True}, {"valid": False})]
+    assert [len(found) for found in rows] == [3, 3, 6]
+    assert {sample["shard_id"] for sample in rows[1]} == {str(unjudged[0].resolve())}
+
+
+@pytest.mark.parametrize("command", ["export", "pictures"])
+def test_export_and_pictures_take_grasps_that_nobody_judged_only_when_told(
+    unjudged: tuple[Path, Any], tmp_path: Path, command: str
+) -> None:
+    if command == "export":
+        words: list[str | Path] = ["export", unjudged[0], "--format", "dexgraspbench", "-o", tmp_path / "out"]
+    else:
+        words = ["pictures", unjudged[0], "-n", "1", "--size", "32", "--device", "cpu", "-o", tmp_path / "out.png"]
+    refused = run(*words)
+    assert refused.exit_code == 2 and "take them with --unjudged" in refused.output
+    assert not list(tmp_path.iterdir())
+    assert run(*words, "--unjudged").exit_code == 0
+
+
+def test_the_line_for_people_says_that_nobody_judged(tmp_path: Path) -> None:
+    done = run(
+        "synth", "--hand", "allegro", "--object", "block", "-n", 1, "--fidelity", "draft", "--device", "cpu",
+        "--referee", "none", "-o", tmp_path / "g.h5",
+    )  # fmt: skip
+    assert "1 sound of" in done.stdout and "nobody judged" in done.stdout
+    assert "valid" not in done.stdout
+
+
+@pytest.mark.parametrize("words", [("--want", "good"), ("--referee", "judge")])
+def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[str, str], tmp_path: Path) -> None:
+    done = run("synth", "--hand", "absent.urdf", "--object", "block", "-o", tmp_path / "g.h5", *words)
+    assert done.exit_code == 2
+    assert words[1] in done.output and "choose" in done.output
+
+
+def test_an_object_is_named_after_its_folder_where_the_file_says_nothing(of_own_mesh: Path) -> None:
+    assert read_shard(of_own_mesh).attributes["object"] == "brick"
+
+
+def test_keep_largest_leaves_the_rest_out(of_own_mesh: Path) -> None:
+    obj = object_of_shard(read_shard(of_own_mesh), None)
+    assert np.ptp(obj.vertices, axis=0) == pytest.approx([0.05, 0.06, 0.07])
+
+
+def elsewhere(file: Path, folder: Path) -> Shard:
+    """The shard in another folder, whose mesh is no longer where it was."""
+    moved = folder / "shard" / "own.h5"
+    moved.parent.mkdir()
+    moved.write_bytes(file.read_bytes())
+    shard = read_shard(moved)
+    shard.attributes["object_source"] = str(folder / "gone.obj")
+    return shard
+
+
+def test_a_shard_finds_its_object_in_its_own_folder(of_own_mesh: Path, own_mesh: Path, tmp_path: Path) -> None:
+    shard = elsewhere(of_own_mesh, tmp_path)
+    (tmp_path / "shard" / "brick").mkdir()
+    (tmp_path / "shard" / "brick" / "clean.obj").write_bytes(own_mesh.read_bytes())
+    assert object_of_shard(shard, None).digest == shard.attributes["object_digest"]
+
+
+def test_a_file_of_the_right_name_and_another_content_is_not_taken(
+    of_own_mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path / "data"))
+    shard = elsewhere(of_own_mesh, tmp_path)
+    trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "shard" / "clean.obj")
+    with pytest.raises(NotFoundError) as caught:
+        object_of_shard(shard, None)
+    for place in ("gone.obj", str(tmp_path / "data"), str(tmp_path / "shard"), "--object"):
+        assert place in str(caught.value)
+    assert not (tmp_path / "data").exists(), "to look makes nothing"
+
+
+def test_a_given_file_is_read_with_the_options_of_the_shard(of_own_mesh: Path, own_mesh: Path) -> None:
+    shard = read_shard(of_own_mesh)
+    assert object_of_shard(shard, str(own_mesh)).digest == shard.attributes["object_digest"]
+    with pytest.raises(ConflictError):
+        object_of_shard(shard, "mug")
+
+
+def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Path, tmp_path: Path) -> None:
+    scene = run("scene", of_own_mesh, "--scenes", 1, "-o", tmp_path / "s.h5")
+    assert scene.exit_code == 0, scene.output
+    views = run(
+        "render", tmp_path / "s.h5", "--views", 1, "--width", 32, "--height", 24, "--device", "cpu", "-o",
+        tmp_path / "v.h5",
+    )  # fmt: skip
+    assert views.exit_code == 0, views.output
