@@ -30,7 +30,7 @@ def add_asset(parts: Parts, kind: str, name: str, *, content: str = "", verdict:
 
 def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
     """Two hands x two objects, one batch each."""
-    given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "referee": "none"}
+    given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "referee": "certificate"}
     return DatasetRequest.model_validate({"name": name, **given, **changes})
 
 

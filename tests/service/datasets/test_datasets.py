@@ -63,7 +63,7 @@ def test_two_datasets_share_the_jobs_that_both_want(parts: Parts) -> None:
 
 
 def test_a_job_that_was_submitted_by_itself_is_a_cell(parts: Parts) -> None:
-    job, _ = pipeline.submit(parts, JobRequest(hand="claw", object="ball", grasps=32, referee="none"))
+    job, _ = pipeline.submit(parts, JobRequest(hand="claw", object="ball", grasps=32))
     actions.create(parts, wanted())
     assert jobs_of(parts, "grasps")[2] == job.id
 
