@@ -33,6 +33,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("keeper", "service.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
     ("worker", "worker.commands", "Parts of the service", "One worker on one device."),
     ("index", "service.commands", "Parts of the service", "Rebuild the index from the store."),
+    ("store", "service.store_commands", "Parts of the service", "Check the store, and mend it."),
     ("keys", "api.commands", "Parts of the service", "Make, list and revoke API keys."),
     ("synth", "worker.planners.commands", "Without a server", "Grasps of a hand file on an object file."),
     ("evaluate", "worker.quality.commands", "Without a server", "Quality of grasps, judged by an independent engine."),

@@ -147,7 +147,7 @@ def manifest_of(
         code_version=PACKAGE_VERSION,
         stage_revision=STAGE_REVISIONS[message.stage],
         shard_schema=f"graspd/{kind}@1",
-        created=timestamp(),
+        created=str(attributes.get("created") or timestamp()),
         device=device,
         seconds=round(seconds, 4),
         worker=worker,

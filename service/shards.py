@@ -8,7 +8,6 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,6 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from service.clock import timestamp
 from service.errors import DamagedShard, InputError
 from service.integrity import check_file
 from service.version import PACKAGE_VERSION
@@ -226,8 +226,8 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
     Args:
         kind: base, scene or views.
         arrays: one array for each column of `SCHEMAS[kind]`; optional columns may be absent.
-        attributes: root attributes besides `schema`, `created` and `code_version`; `joint_names` also goes to
-            the joint datasets.
+        attributes: root attributes besides `schema`; `created` and `code_version` where they are not those of now;
+            `joint_names` also goes to the joint datasets.
 
     Raises:
         InputError: a column is missing, unknown, of the wrong rank, or lengths clash.
@@ -235,10 +235,9 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
     check_columns(kind, arrays)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
-        file.attrs["schema"] = f"graspd/{kind}@1"
-        file.attrs["code_version"] = PACKAGE_VERSION
-        file.attrs["created"] = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        for name, value in attributes.items():
+        # Each is written once: HDF5 keeps the bytes of a text that was written over.
+        said = {"schema": f"graspd/{kind}@1", "code_version": PACKAGE_VERSION, "created": timestamp(), **attributes}
+        for name, value in said.items():
             file.attrs[name] = value
         for path, array in arrays.items():
             column = SCHEMAS[kind][path]

@@ -102,6 +102,14 @@ class Store:
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
+    def set_aside(self, key: str) -> None:
+        """Move a damaged object below `damaged/`, so that its name is free; one that is gone is no error."""
+        try:
+            with _mapped(key, self.url):
+                obstore.rename(self._backend, check_key(key), f"damaged/{key}", overwrite=True)
+        except NotFoundError:
+            return
+
     def stamp(self, key: str) -> Stamp:
         """What tells whether an object was exchanged or written over; NotFoundError if there is none."""
         with _mapped(key, self.url):

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from service import logs, names, tracing
 from service.clock import timestamp
 from service.domain import IngestMessage, Origin, Stage, TaskMessage
-from service.errors import DamagedError, InputError, TaskCancelled, TaskRefused, UnavailableError
-from service.manifests import publish_shard, shard_exists
+from service.errors import DamagedError, DamagedShard, InputError, TaskCancelled, TaskRefused, UnavailableError
+from service.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.queue.port import Event, EventKind, Message
 from service.records import AttemptRecord, put_record
 from service.version import STAGE_REVISIONS, TASK_SCHEMA
@@ -103,11 +103,19 @@ class Runner:
             raise TaskRefused(f"this worker does no {message.stage} tasks")
         self._publish(self._event(EventKind.STARTED, message))
         clock = time.perf_counter()
+        lost = self._lost(message, context)
         made = self._stages[message.stage](message, context)
         seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, TaskMessage):
             context.check()
-            manifest, data = shard_of(message, made, device=context.device, seconds=seconds, worker=self._worker)
+            manifest, data = shard_of(
+                message, made, device=context.device, seconds=seconds, worker=self._worker, lost=lost
+            )
+            if lost is not None and manifest.sha256 != lost.sha256:
+                raise DamagedShard(
+                    f"{lost.key} was made again and is not what it was: made on {lost.device} by graspd "
+                    f"{lost.code_version}, again on {context.device}; put a copy in its place"
+                )
             publish_shard(context.store, manifest, data)
         if self._fitness is not None:
             self._fitness.passed()
@@ -116,7 +124,14 @@ class Runner:
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):
             return context.store.exists(names.asset_check(message.kind, message.digest))
-        return shard_exists(context.store, message.stage, message.output)
+        done = shard_exists(context.store, message.stage, message.output)
+        return done and context.store.exists(names.shard_file(message.stage, message.output))
+
+    def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
+        """The manifest of a shard that was made before and whose file is gone."""
+        if isinstance(message, IngestMessage) or not shard_exists(context.store, message.stage, message.output):
+            return None
+        return load_manifest(context.store, message.stage, message.output)
 
     def _stopped(self, message: Message, context: TaskContext, started: str) -> Event | None:
         reason = context.stop_reason
@@ -147,6 +162,9 @@ class Runner:
 
     def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
         try:
+            if isinstance(message, TaskMessage) and shard_exists(context.store, message.stage, message.output):
+                # The task has succeeded already: another worker was faster, or a lost file could not be made again.
+                return self._event(EventKind.CANCELLED, message, message=attempt.reason)
             put_record(context.store, names.attempt(attempt.task_id, attempt.number), attempt)
         except UnavailableError as error:
             return self._event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.clock import timestamp
 from service.digests import digest_json
 from service.domain import TaskMessage
 from service.manifests import ShardManifest, manifest_of
 from service.names import SHARD_KINDS
 from service.shards import Attribute, check_columns, json_attribute, write_shard
+from service.version import PACKAGE_VERSION
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,18 @@ class Output:
 
 
 def shard_of(
-    message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str
+    message: TaskMessage,
+    output: Output,
+    *,
+    device: str,
+    seconds: float,
+    worker: str,
+    lost: ShardManifest | None = None,
 ) -> tuple[ShardManifest, bytes]:
     """The shard that a stage made: its manifest and its HDF5 bytes.
+
+    Args:
+        lost: manifest of the file that this one takes the place of: what tells when and by whom is then as it was.
 
     Raises:
         InputError: the columns do not fit the schema.
@@ -45,7 +56,9 @@ def shard_of(
         "seed": request.seed,
         "batch": message.batch,
         "device": device,
-        "seconds": round(seconds, 4),
+        "seconds": lost.seconds if lost is not None else round(seconds, 4),
+        "created": lost.created if lost is not None else timestamp(),
+        "code_version": lost.code_version if lost is not None else PACKAGE_VERSION,
         "shard_id": message.output,
         "inputs": list(message.inputs),
         **output.attributes,

@@ -1,0 +1,102 @@
+"""Looks through a store for what is not what it was: shards, manifests, records. Reads everything, changes nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from service import names
+from service.datasets.records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
+from service.domain import Asset, Stage
+from service.errors import DamagedError, NotFoundError
+from service.index.notes import Damage
+from service.manifests import ShardManifest
+from service.records import AttemptRecord, JobEvent, JobRecord, parse_record
+from service.store import Store
+
+#: What the key of a record looks like, and what it must hold.
+_RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
+    (r"assets/[^/]+/[^/]+/asset\.json", Asset),
+    (r"jobs/[^/]+/job\.json", JobRecord),
+    (r"jobs/[^/]+/events/[^/]+\.json", JobEvent),
+    (r"tasks/[^/]+/attempts/[^/]+\.json", AttemptRecord),
+    (r"datasets/[^/]+/dataset\.json", DatasetRecord),
+    (r"datasets/[^/]+/events/[^/]+\.json", DatasetEvent),
+    (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
+    (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
+)
+_FOLDERS: Final = (names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS)
+_SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
+STAGES: Final[dict[str, Stage]] = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
+
+MISSING: Final = "its file is gone"
+NO_MANIFEST: Final = "it has no manifest"
+BAD_MANIFEST: Final = "its manifest is damaged"
+FOREIGN: Final = "nothing that graspd put there"
+#: Told after each piece that was read: its bytes.
+Read = Callable[[int], None]
+
+
+def scan(store: Store, *, read: Read = lambda size: None) -> Iterator[tuple[str, Damage | None]]:
+    """Every object that can be checked, with what is wrong with it, None if nothing is.
+
+    Raises:
+        StoreUnavailable: the store does not answer.
+    """
+    for folder in _FOLDERS:
+        for entry in store.list(folder):
+            if folder == names.SHARDS or any(re.fullmatch(pattern, entry.key) for pattern, _ in _RECORDS):
+                yield entry.key, examine(store, entry.key, read=read)
+
+
+def examine(store: Store, key: str, *, read: Read = lambda size: None) -> Damage | None:
+    """What is wrong with one object; of a shard, its file is examined with its manifest."""
+    try:
+        if not key.startswith(f"{names.SHARDS}/"):
+            return _record(store, key)
+        if (match := _SHARD.fullmatch(key)) is None:
+            return Damage(key, FOREIGN)
+        kind, shard, ending = match.groups()
+        if ending == "json":
+            return _manifest(store, key, STAGES[kind], shard, read)
+        manifest = names.shard_manifest(STAGES[kind], shard)
+        # A worker puts the manifest last; it may have come since the file was listed.
+        orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
+        return Damage(key, NO_MANIFEST, shard) if orphan else None
+    except NotFoundError:
+        return None  # removed since it was listed
+
+
+def _record(store: Store, key: str) -> Damage | None:
+    model = next(model for pattern, model in _RECORDS if re.fullmatch(pattern, key))
+    try:
+        parse_record(model, store.get(key), key)
+    except (DamagedError, ValidationError) as error:
+        return Damage(key, str(error))
+    return None
+
+
+def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read) -> Damage | None:
+    try:
+        manifest = parse_record(ShardManifest, store.get(key), key)
+    except DamagedError:
+        return Damage(key, BAD_MANIFEST, shard)
+    file = names.shard_file(stage, shard)
+    if (manifest.shard_id, manifest.key) != (shard, file):
+        return Damage(key, BAD_MANIFEST, shard)
+    try:
+        if (size := store.size(file)) != manifest.size_bytes:
+            return Damage(file, f"it has {size} bytes, expected {manifest.size_bytes}", shard)
+        digest = hashlib.sha256()
+        for chunk in store.stream(file):
+            digest.update(chunk)
+            read(len(chunk))
+    except NotFoundError:
+        return Damage(file, MISSING, shard) if store.exists(key) else None
+    if digest.hexdigest() != manifest.sha256:
+        return Damage(file, f"its SHA-256 is {digest.hexdigest()[:12]}..., expected {manifest.sha256[:12]}...", shard)
+    return None
