@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from service import names
 from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
 from service.errors import IndexDamaged, UnavailableError
 from service.settings import Settings
@@ -88,16 +89,19 @@ def rebuild(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make the rows of the index anew from the store. With --check exit code 1 says that they differ."""
+    """Make the rows of the index anew from the store. With --check exit code 1: they differ, or a shard is damaged."""
     from service.index.index import Index
     from service.index.rebuild import differences
     from service.index.rebuild import rebuild as make
+    from service.scrub import scan
     from service.store import open_store
 
     settings = load_settings(data_dir=data_dir)
     store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
     try:
         found = differences(index, store)
+        if check:
+            found += [f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS) if wrong is not None]
         counts: dict[str, int] = {} if check else make(index, store)
     except IndexDamaged:
         if check:

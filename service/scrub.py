@@ -41,13 +41,13 @@ FOREIGN: Final = "nothing that graspd put there"
 Read = Callable[[int], None]
 
 
-def scan(store: Store, *, read: Read = lambda size: None) -> Iterator[tuple[str, Damage | None]]:
-    """Every object that can be checked, with what is wrong with it, None if nothing is.
+def scan(store: Store, *folders: str, read: Read = lambda size: None) -> Iterator[tuple[str, Damage | None]]:
+    """Every object that can be checked, of all folders or some, with what is wrong with it, None if nothing is.
 
     Raises:
         StoreUnavailable: the store does not answer.
     """
-    for folder in _FOLDERS:
+    for folder in folders or _FOLDERS:
         for entry in store.list(folder):
             if folder == names.SHARDS or any(re.fullmatch(pattern, entry.key) for pattern, _ in _RECORDS):
                 yield entry.key, examine(store, entry.key, read=read)

@@ -152,3 +152,19 @@ def test_the_command_tells_what_is_damaged_and_exits_with_1(
     assert {one["shard"] for one in said["damaged"]} | set(said["missing"]) == done.keys()
     assert said["missing"] == [shards[2].shard_id]
     assert parts.index.known_damage()[0] == 5
+
+
+def test_a_check_of_the_index_sees_damaged_shards_too(
+    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from typer.testing import CliRunner
+
+    from service.commands import app
+
+    monkeypatch.setenv("GRASPD_STORE_URL", parts.store.url)
+    command = ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    flip(parts.store, shards[0].key)
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 1
+    assert shards[0].key in told.output
