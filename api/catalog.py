@@ -32,7 +32,7 @@ from api.models import (
 )
 from api.progress import Paces, eta_of_job, progress_of_job, stage_statuses
 from api.quotas import Quotas
-from service import library, pipeline
+from service import deletion, library, pipeline
 from service.digests import digest_files
 from service.domain import AssetKind, JobRequest, Lane, Stage, State
 from service.embedded import redis_url
@@ -124,6 +124,39 @@ class Catalog:
             job = pipeline.cancel(self._parts, job_id)
             log.info("job cancelled")
         return self._detail(job)
+
+    def delete_job(self, job_id: str) -> None:
+        """Take a job away that has ended.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        must_own(self._parts.index.job(job_id).owner, f"job {job_id}")
+        with bind(job=job_id):
+            deletion.delete_job(self._parts, job_id, owner=_caller_id())
+            log.info("job deleted")
+
+    def delete_dataset(self, name: str) -> None:
+        """Take a dataset away that has ended.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        must_own(self._parts.index.dataset(name).owner, f"dataset {name!r}")
+        deletion.delete_dataset(self._parts, name, owner=_caller_id())
+        log.info("dataset %s deleted", name)
+
+    def delete_asset(self, kind: AssetKind, name: str) -> None:
+        """Take a hand or object away that nothing needs.
+
+        Raises:
+            NotYours: another key uploaded it.
+        """
+        asset = self._parts.index.asset(kind, name)
+        if not asset.builtin:
+            must_own(asset.owner, f"{kind.value} {name!r}")
+        deletion.delete_asset(self._parts, kind, asset.digest, owner=_caller_id())
+        log.info("%s %s deleted", kind, asset.name)
 
     def retry(self, job_id: str) -> JobDetail:
         """Run again what failed or was cancelled.
@@ -367,6 +400,11 @@ class Catalog:
 
     def _running(self, job_id: str) -> list[TaskView]:
         return self._parts.index.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
+
+
+def _caller_id() -> str:
+    key = caller.get()
+    return key.id if key else ""
 
 
 def grasp_filter(query: GraspQuery) -> GraspFilter:

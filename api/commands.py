@@ -16,7 +16,7 @@ from api.dashboard.filters import count, percent, size
 from api.dataset_client import DatasetClient
 from api.job_options import pairs
 from api.models import Job
-from api.reports import UrlOption, job_request, open_client, show_asset, show_job, watch
+from api.reports import UrlOption, job_request, open_client, say_deleted, show_asset, show_job, watch
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service import tracing
 from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
@@ -128,6 +128,16 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
         show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
 
 
+@app.command(epilog="graspd delete 3f2a")
+@reporting_errors
+def delete(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Take away a job that has ended; its shards follow after a grace time, unless another job needs them."""
+    with open_client(url) as client:
+        full = _full_id(client, job_id)
+        client.delete(f"/v1/jobs/{full}")
+    say_deleted("job", full, json=json)
+
+
 @app.command(epilog="graspd retry 3f2a --wait")
 @reporting_errors
 def retry(
@@ -167,7 +177,7 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
 
 def asset_commands(kind: AssetKind) -> typer.Typer:
     """`graspd hands ...` or `graspd objects ...`."""
-    group = typer.Typer(no_args_is_help=True, help=f"Check, add, list and show {kind.value}s.")
+    group = typer.Typer(no_args_is_help=True, help=f"Check, add, list, show and delete {kind.value}s.")
 
     @group.command("list")
     @reporting_errors
@@ -195,6 +205,18 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         with open_client(url) as client:
             asset = client.asset(kind, name)
         show_asset(asset.model_dump(mode="json"), json=json)
+
+    @group.command("delete", epilog=f"graspd {kind.value}s delete my_{kind.value}")
+    @reporting_errors
+    def delete_asset(
+        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """Take one away that no job, dataset or set of objects needs."""
+        with open_client(url) as client:
+            client.delete(f"/v1/{kind.value}s/{name}")
+        say_deleted(kind.value, name, json=json)
 
     return group
 

@@ -18,7 +18,7 @@ from api.dataset_client import DatasetClient
 from api.dataset_reports import print_cells, print_dataset, print_estimate, watch_dataset
 from api.dataset_specs import SpecOption, Wanted, wanted
 from api.job_options import validated, with_job_options
-from api.reports import UrlOption, open_client
+from api.reports import UrlOption, open_client, say_deleted
 from service.cli import JsonFlag, emit, reporting_errors
 from service.datasets.cost import Estimate
 from service.datasets.export import FORMATS
@@ -158,6 +158,15 @@ def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) ->
     """Stop a dataset; what is written stays."""
     with open_client(url) as client:
         _show(DatasetClient(client).cancel(name), json=json)
+
+
+@group.command(epilog="graspd datasets delete kitchen")
+@reporting_errors
+def delete(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Take away a dataset that has ended, its snapshots, and the jobs that were planned for it alone."""
+    with open_client(url) as client:
+        client.delete(f"/v1/datasets/{name}")
+    say_deleted("dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")

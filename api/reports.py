@@ -34,6 +34,14 @@ def open_client(url: str | None) -> Client:
     return Client(url or settings.api_url, key=key)
 
 
+def say_deleted(what: str, name: str, *, json: bool) -> None:
+    """Tell that a thing is gone."""
+    if json:
+        emit({"deleted": name, "kind": what})
+    else:
+        typer.echo(f"{what} {name} is deleted")
+
+
 def job_request(values: dict[str, Any]) -> JobRequest:
     """A job request; InputError names the first option that cannot be used."""
     try:

@@ -23,6 +23,7 @@ from service.pipeline import queue_tasks
 from service.planning import ingest_id, ingest_message
 from service.queue.port import Event, EventKind
 from service.reaper import Reaper
+from service.sweeper import Sweeper
 from service.turns import Turns
 
 log = logging.getLogger(__name__)
@@ -33,6 +34,7 @@ _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
 _LONGEST_PAUSE_S: Final = 5.0
+_SWEEP_EVERY_S: Final = 5.0
 
 
 class Keeper:
@@ -43,6 +45,7 @@ class Keeper:
         self._indexer = Indexer(parts)
         self._reaper = Reaper(parts, self._indexer, clock=clock)
         self._planner = Planner(parts, clock=clock)
+        self._sweeper = Sweeper(parts, clock=clock)
         self._has_plans = False
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
@@ -50,7 +53,7 @@ class Keeper:
         """Whether anything but progress came in since the queue was looked after."""
         self._started = False
         self._clock = clock
-        self._look_again = self._plan_again = self._tell_again = -math.inf
+        self._look_again = self._plan_again = self._tell_again = self._sweep_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -91,6 +94,10 @@ class Keeper:
             with _noted(away):
                 self._has_plans = self._planner.advance()
                 self._plan_again = now + self._parts.settings.keeper_interval_s
+        if now >= self._sweep_again:
+            with _noted(away):
+                is_left = self._sweeper.advance() or self._sweeper.collect()
+                self._sweep_again = now if is_left else now + _SWEEP_EVERY_S
         if now >= self._tell_again:
             with _noted(away):
                 self._parts.queue.tidy()

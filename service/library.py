@@ -72,9 +72,15 @@ def record_asset(store: Store, asset: Asset) -> Asset:
     """The second half of `publish_asset`: the record, from which on the asset counts.
 
     Raises:
-        ConflictError: the same content is known under another name.
+        ConflictError: the same content is known under another name, or is being removed.
     """
-    if store.put(names.asset_record(asset.kind, asset.digest), asset.model_dump_json().encode()):
+    record = names.asset_record(asset.kind, asset.digest)
+    new = store.put(record, asset.model_dump_json().encode())
+    if store.exists(names.deletion(asset.kind.value, asset.digest)):
+        if new:
+            store.delete(record)
+        raise ConflictError(f"the same {asset.kind.value} of before is still being removed; try again in a moment")
+    if new:
         return asset
     known = load_asset(store, asset.kind, asset.digest)
     if known.name != asset.name:
@@ -97,11 +103,12 @@ def publish_builtins(store: Store) -> list[Asset]:
 
 
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
-    """Kind and digest of every hand and object in the store."""
+    """Kind and digest of every hand and object in the store, but for those that were deleted."""
     records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
+    gone = {entry.key for entry in store.list(names.DELETIONS)}
     # Other files of an asset may lie deeper, such as an object's convex pieces.
-    is_record = (len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json" for key in records)
-    return [(AssetKind(key[1]), key[2]) for key, record in zip(records, is_record, strict=True) if record]
+    found = [key for key in records if len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json"]
+    return [(AssetKind(key[1]), key[2]) for key in found if names.deletion(key[1], key[2]) not in gone]
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:

@@ -12,6 +12,8 @@ TASKS: Final = "tasks"
 SHARDS: Final = "shards"
 DATASETS: Final = "datasets"
 OBJECT_SETS: Final = "object_sets"
+DELETIONS: Final = "deletions"
+RELEASED: Final = "released"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -110,3 +112,8 @@ def dataset_snapshot(dataset: str, digest: str) -> str:
 def object_set(name: str, digest: str) -> str:
     """One version of a named set of objects."""
     return f"{OBJECT_SETS}/{name}/{digest}.json"
+
+
+def deletion(what: str, name: str) -> str:
+    """What a user took away, until nothing of it is left: a hand or object by its digest, a job, a dataset."""
+    return f"{DELETIONS}/{what}/{name}.json"

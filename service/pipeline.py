@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 from service import charts, names
 from service.clock import timestamp
+from service.deletion import refuse_pending
 from service.digests import job_id
 from service.domain import AssetKind, JobRequest, Lane, Origin, State
-from service.errors import ConflictError, InputError, UnavailableError
+from service.errors import ConflictError, InputError, NotFoundError, UnavailableError
 from service.index.feed import ReadyTask
 from service.index.views import AssetView, JobView
 from service.logs import bound
@@ -64,16 +65,36 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owne
     )
 
 
-def enter(parts: Parts, record: JobRecord) -> tuple[JobView, bool]:
+def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
     """Keep a planned job and queue its first tasks.
+
+    Args:
+        keeps_assets: a dataset keeps the hand and the object from being deleted meanwhile.
 
     Returns:
         the job, and whether it is new.
+
+    Raises:
+        NotFoundError: the hand or the object was deleted meanwhile.
+        ConflictError: the same job was deleted, and its objects are still being removed.
     """
-    new = put_record(parts.store, names.job_record(record.id), record)
-    if not new:
-        record = read_record(JobRecord, parts.store, names.job_record(record.id))
-    parts.index.add_job(record)
+    key = names.job_record(record.id)
+    new = put_record(parts.store, key, record)
+    try:
+        refuse_pending(parts.store, "job", record.id)
+        if not new:
+            record = read_record(JobRecord, parts.store, key)
+        wanted = ((AssetKind.HAND, record.hand_digest), (AssetKind.OBJECT, record.object_digest))
+        with parts.index.writing() as connection:
+            if not new and not parts.store.exists(key):
+                raise ConflictError(f"job {record.id} was deleted just now; submit it again")
+            if not keeps_assets and (missing := parts.index.missing_assets(wanted, within=connection)):
+                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+            parts.index.add_job(record, within=connection)
+    except InputError:
+        if new:
+            parts.store.delete(key)
+        raise
     _start(parts, record.id)
     return parts.index.job(record.id), new
 

@@ -1,6 +1,6 @@
 """The object store: create-only puts of immutable objects, on a local folder, S3, Google Cloud, Azure, or memory.
 
-Only what every back end offers is used: put if absent, get, range, list; no overwrite, no compare-and-swap.
+Only what every back end offers is used: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
 """
 
 from __future__ import annotations
@@ -78,6 +78,14 @@ class Store:
             except AlreadyExistsError:
                 return False
             return True
+
+    def delete(self, key: str) -> None:
+        """Remove an object; nothing happens if there is none. Only the keeper does this, to what a user took away."""
+        try:
+            with _mapped(key, self.url):
+                obstore.delete(self._backend, check_key(key))
+        except NotFoundError:
+            return
 
     def get(self, key: str) -> bytes:
         """All bytes of an object; NotFoundError if there is none."""

@@ -100,15 +100,18 @@ async def act_on_cells(request: Request, name: str, catalog: CatalogOf) -> Redir
 
 @router.post("/{name}/{action}", dependencies=[Depends(may_submit)], response_model=None)
 def act(request: Request, name: str, action: str, catalog: CatalogOf) -> RedirectResponse | HTMLResponse:
-    """Cancel or retry a whole dataset, or take a snapshot of it."""
+    """Cancel, retry or delete a whole dataset, or take a snapshot of it."""
     do: dict[str, Callable[[], Any]] = {
         "cancel": lambda: dataset_quota.cancel(catalog, name),
         "retry": lambda: dataset_quota.retry(catalog, name),
         "snapshot": lambda: actions.snapshot(catalog.parts, name),
+        "delete": lambda: catalog.delete_dataset(name),
     }
     if action not in do:
-        raise InputError(f"a dataset has no action {action!r}; it can be cancelled, retried or taken as a snapshot")
+        raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
     do[action]()
+    if action == "delete":
+        return RedirectResponse("/datasets", status_code=303)
     return _redirect(f"/datasets/{name}", action, done=1)
 
 

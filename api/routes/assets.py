@@ -102,6 +102,17 @@ def asset_router(kind: AssetKind) -> APIRouter:
         response.headers["Retry-After"] = "1"
         return asset
 
+    @router.delete(
+        "/{name}",
+        status_code=204,
+        dependencies=[Depends(may_submit)],
+        responses=responses(401, 403, 404, 409, 503),
+        name=f"delete_{kind}",
+    )
+    def delete_asset(name: str, catalog: CatalogOf) -> None:
+        """Take it away; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
+        catalog.delete_asset(kind, name)
+
     return router
 
 

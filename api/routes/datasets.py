@@ -118,6 +118,17 @@ def retry_dataset(name: DatasetName, response: Response, catalog: CatalogOf) -> 
     return _placed(dataset_quota.retry(catalog, name), response)
 
 
+@router.delete(
+    "/{name}",
+    status_code=204,
+    dependencies=[Depends(may_submit)],
+    responses=responses(401, 403, 404, 409, 503),
+)
+def delete_dataset(name: DatasetName, catalog: CatalogOf) -> None:
+    """Take away a dataset that has ended, its snapshots, and those of its jobs that were planned for it alone."""
+    catalog.delete_dataset(name)
+
+
 @router.post(
     "/{name}/snapshots",
     status_code=201,

@@ -95,6 +95,17 @@ def retry(job_id: str, catalog: CatalogOf) -> JobDetail:
     return catalog.retry(job_id)
 
 
+@router.delete(
+    "/{job_id}",
+    status_code=204,
+    dependencies=[Depends(may_submit)],
+    responses=responses(401, 403, 404, 409, 503),
+)
+def delete(job_id: str, catalog: CatalogOf) -> None:
+    """Take away a job that has ended. Its shards, where no other job needs them, follow after a grace time."""
+    catalog.delete_job(job_id)
+
+
 def known_job(job_id: str, catalog: CatalogOf) -> None:
     """A stream has begun before its first event: what can be refused is refused before that."""
     catalog.job_state(job_id)

@@ -20,6 +20,7 @@ from service.datasets.records import (
     object_set_of,
 )
 from service.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
+from service.deletion import refuse_pending
 from service.digests import digest_json
 from service.domain import AssetKind, JobOptions, State
 from service.errors import ConflictError, InputError, LimitError, NotFoundError
@@ -59,7 +60,19 @@ def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[D
         other = _difference(record, hands, objects, request.shared)
         if other:
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
-    parts.index.add_dataset(record)
+    try:
+        refuse_pending(parts.store, "dataset", record.name)
+        wanted = [(AssetKind.HAND, one.digest) for one in hands] + [(AssetKind.OBJECT, one.digest) for one in objects]
+        with parts.index.writing() as connection:
+            if not parts.store.exists(key):
+                raise ConflictError(f"dataset {record.name!r} was deleted just now; create it again")
+            if missing := parts.index.missing_assets(wanted, within=connection):
+                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+            parts.index.add_dataset(record, within=connection)
+    except InputError:
+        if new:
+            parts.store.delete(key)
+        raise
     return parts.index.dataset(record.name), new
 
 

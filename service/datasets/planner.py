@@ -53,7 +53,7 @@ class Planner:
             for cell in cells:
                 if self._clock() > deadline:
                     return False
-                pipeline.enter(self._parts, job_of(cell, work.options, work.revisions, work.owner))
+                pipeline.enter(self._parts, job_of(cell, work.options, work.revisions, work.owner), keeps_assets=True)
                 after = cell.position
             if not cells:
                 break

@@ -198,6 +198,8 @@ class Changes(Database):
         return {job: settle(connection, job, [batch]) for job, batch in touched}
 
     def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
+        if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
+            return None  # of a job that was deleted, or that somebody made up
         upsert(connection, attempts, [attempt_row(attempt)])
         values: dict[str, Any] = {
             "last_attempt": attempt.number,

@@ -10,6 +10,7 @@ from service.index.feed import Feed
 from service.index.grasp_queries import GraspQueries
 from service.index.job_queries import JobQueries
 from service.index.notes import Notes
+from service.index.removals import Removals
 from service.index.service_queries import ServiceQueries
 from service.index.summaries import Summaries
 
@@ -25,6 +26,7 @@ class Index(
     Changes,
     DatasetChanges,
     Notes,
+    Removals,
 ):
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 

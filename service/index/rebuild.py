@@ -15,6 +15,7 @@ from sqlalchemy.exc import DataError
 
 from service import names
 from service.datasets.records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
+from service.deletion import pending
 from service.domain import State
 from service.errors import DamagedError, InputError, NotFoundError
 from service.index.index import Index
@@ -66,6 +67,7 @@ class _Rebuild:
         self._index, self._store, self._connection, self._progress = index, store, connection, progress
         self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
         self.left_out: list[str] = []
+        self._gone = pending(store)
 
     def assets(self) -> None:
         for kind, digest in stored_assets(self._store):
@@ -122,11 +124,17 @@ class _Rebuild:
 
     def _read(self, prefix: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
         """Keys and bytes of records; one that was removed since it was listed is no record."""
-        keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key)]
+        keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_gone(entry.key)]
         with ThreadPoolExecutor(_READERS) as pool:
             for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
                 if data is not None:
                     yield key, data
+
+    def _is_gone(self, key: str) -> bool:
+        """Whether it belongs to a job or dataset that a user deleted."""
+        folder, _, rest = key.partition("/")
+        what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
+        return (what, rest.partition("/")[0]) in self._gone
 
     def _bytes(self, key: str) -> bytes | None:
         try:

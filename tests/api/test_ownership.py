@@ -201,3 +201,34 @@ def test_chosen_jobs_of_others_are_counted_as_left(client: TestClient, people: d
     answer = client.post("/datasets/cells", data=chosen, headers=people["bob"], follow_redirects=False)
     assert "done=0&left=1" in answer.headers["location"]
     assert client.get(f"/v1/jobs/{job}", headers=people["bob"]).json()["state"] == "queued"
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("eve", 403), ("root", 204)])
+def test_a_job_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    job = submitted(client, people["ann"])
+    assert client.delete(f"/v1/jobs/{job}", headers=people["root"]).status_code == 409, "it has not ended"
+    client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"])
+    assert client.delete(f"/v1/jobs/{job}", headers=people[who]).status_code == status
+    assert client.get(f"/v1/jobs/{job}", headers=people["eve"]).status_code == (404 if status == 204 else 200)
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
+def test_an_object_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    client.post("/v1/objects", files={"file": ("box.stl", b"solid")}, headers=people["ann"])
+    assert client.delete("/v1/objects/box", headers=people[who]).status_code == status
+    assert client.delete("/v1/objects/mug", headers=people[who]).status_code == 409, "it comes with graspd"
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
+def test_a_dataset_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+) -> None:
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    assert client.delete("/v1/datasets/d", headers=people["ann"]).status_code == 409, "it has not ended"
+    client.post("/v1/datasets/d/cancel", headers=people["ann"])
+    Planner(parts).advance()
+    assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status

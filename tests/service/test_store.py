@@ -61,6 +61,15 @@ def test_of_many_that_put_one_name_at_once_exactly_one_wins(store: Store) -> Non
     assert store.get("shards/base/x.h5") == bytes([won[0]]) * 10_000
 
 
+def test_a_deleted_object_is_gone_and_its_name_is_free(store: Store) -> None:
+    store.put("jobs/a/job.json", b"1")
+    store.delete("jobs/a/job.json")
+    store.delete("jobs/a/job.json")
+    assert not store.exists("jobs/a/job.json")
+    assert [entry.key for entry in store.list("jobs")] == []
+    assert store.put("jobs/a/job.json", b"2")
+
+
 def test_a_missing_object_is_named(store: Store) -> None:
     with pytest.raises(NotFoundError, match="no/such"):
         store.get("no/such")
