@@ -56,7 +56,7 @@ def _follow(
         if angle > 0:
             rotation = quat_to_matrix(quat_from_axis_angle(motion[3:] / angle, np.array(angle))) @ rotation
         if number in steps:
-            losses.append(loss(np.concatenate([place, turned]), world))
+            losses.append(float(loss(np.concatenate([place, turned]), world)))
     return losses
 
 

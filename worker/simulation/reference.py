@@ -1,4 +1,8 @@
-"""The contact step in float64 NumPy, written for clarity: the oracle of the kernels, and of studies of them."""
+"""The contact step in float64 NumPy, written for clarity: the oracle of the kernels, and of studies of them.
+
+Contacts (N, 3), motions (6) as linear and angular parts. Distances and free motions may have axes before theirs: many
+steps at once.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +17,10 @@ SMOOTH = 1e-5
 
 @dataclass(frozen=True)
 class Contacts:
-    points: Floats
-    normals: Floats
-    distances: Floats
-    weights: Floats
+    points: Floats  # (N, 3) [m]
+    normals: Floats  # (N, 3)
+    distances: Floats  # (..., N) [m]
+    weights: Floats  # (N,)
 
 
 @dataclass(frozen=True)
@@ -36,86 +40,81 @@ class World:
 
 
 def row(normal: Floats, point: Floats) -> Floats:
-    return np.concatenate([normal, np.cross(point, normal)])
+    """(..., 6) of what a motion moves `point` along `normal`, both (..., 3)."""
+    return np.concatenate([normal, np.cross(point, normal)], axis=-1)
 
 
 def motion_at(s: Floats, point: Floats) -> Floats:
-    return s[:3] + np.cross(s[3:], point)
+    return s[..., :3] + np.cross(s[..., 3:], point)
 
 
-def loss(s: Floats, world: World) -> float:
-    x, r = s[:3], world.gyration * s[3:]
-    return float((np.sqrt(x @ x + SMOOTH**2) + np.sqrt(r @ r + SMOOTH**2)) / world.step)
+def loss(s: Floats, world: World) -> Floats:
+    """(...) of motions (..., 6)."""
+    lengths = [np.sqrt(np.sum(v * v, axis=-1) + SMOOTH**2) for v in (s[..., :3], world.gyration * s[..., 3:])]
+    return np.asarray((lengths[0] + lengths[1]) / world.step)
 
 
 def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Floats:
-    """Compliant contact: fixed point of the reweighted least squares."""
-    s = s0.copy()
+    """Compliant contact: fixed point of the reweighted least squares. (..., 6) from free motions (..., 6)."""
+    n, offset = contacts.normals, world.dilation - contacts.distances
+    k = world.stiffness * contacts.weights
+    j = row(n, contacts.points)
+    across = np.eye(3) - n[:, :, None] * n[:, None, :]
+    jt = row(across, contacts.points[:, None, :])
+    pushes, slides = j[:, :, None] * j[:, None, :], np.einsum("nei,nej->nij", jt, jt)
+    s = s0
     for _ in range(passes):
-        a, rhs = world.mass, world.mass @ s0
-        for p, n, rho, w in zip(contacts.points, contacts.normals, contacts.distances, contacts.weights, strict=True):
-            u = motion_at(s, p)
-            c = world.dilation - rho + n @ u
-            if c <= 0:
-                continue
-            k = float(world.stiffness * w)
-            tangent = u - (n @ u) * n
-            slide = min(k, k * world.friction * float(c) / max(float(np.linalg.norm(tangent)), 1e-9))
-            j = row(n, p)
-            a = a + k * np.outer(j, j)
-            rhs = rhs - k * (world.dilation - rho) * j
-            for e in np.eye(3):
-                jt = row(e - (n @ e) * n, p)
-                a = a + slide * np.outer(jt, jt)
-        s = np.asarray(np.linalg.solve(a, rhs), float)
-    return s
+        c = offset + s @ j.T
+        tangent = np.einsum("nei,...i->...ne", jt, s)
+        slip = np.maximum(np.linalg.norm(tangent, axis=-1), 1e-9)
+        push = np.where(c > 0, k, 0.0)
+        slide = np.where(c > 0, np.minimum(k, k * world.friction * c / slip), 0.0)
+        a = world.mass + np.tensordot(push, pushes, 1) + np.tensordot(slide, slides, 1)
+        s = np.linalg.solve(a, (s0 @ world.mass - (push * offset) @ j)[..., None])[..., 0]
+    return np.asarray(s)
 
 
-def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, list[tuple[float, float]]]:
-    """One sweep of position-based dynamics with Coulomb friction; also (normal, tangential) impulses per contact."""
-    inverse = np.linalg.inv(world.mass)
-    s = s0.copy()
+def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, Floats]:
+    """One sweep of position-based dynamics with Coulomb friction: motions (..., 6) from free motions (..., 6), and the
+    impulses (..., N, 2) of each contact, normal and tangential."""
+    s = s0
     impulses = []
-    for p, n, rho in zip(contacts.points, contacts.normals, contacts.distances, strict=True):
-        j = row(n, p)
-        c = world.dilation - rho + j @ s
-        if c <= 0:
-            impulses.append((0.0, 0.0))
-            continue
-        impulse = c / (j @ inverse @ j)
-        s = s - impulse * (inverse @ j)
-        u = motion_at(s, p)
-        tangent = u - (n @ u) * n
-        length = np.linalg.norm(tangent)
-        slip = 0.0
-        if length > 1e-9:
-            jt = row(tangent / length, p)
-            slip = min(length / (jt @ inverse @ jt), world.friction * impulse)
-            s = s - slip * (inverse @ jt)
-        impulses.append((impulse, slip))
-    return s, impulses
+    for i, (p, n) in enumerate(zip(contacts.points, contacts.normals, strict=True)):
+        impulse, change = _pushed(p, n, contacts.distances[..., i], s, world)
+        s = s + change
+        slip, change = _slipped(p, n, impulse, s, world)
+        s = s + change
+        impulses.append(np.stack([impulse, slip], axis=-1))
+    return s, np.stack(impulses, axis=-2)
 
 
 def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
-    """Averaged corrections of all active contacts, `passes` times."""
-    inverse = np.linalg.inv(world.mass)
-    s = s0.copy()
+    """Averaged corrections of all active contacts, `passes` times. (..., 6) from free motions (..., 6)."""
+    p, n = contacts.points, contacts.normals
+    s = s0
     for _ in range(passes):
-        total, active = np.zeros(6), 0
-        for p, n, rho in zip(contacts.points, contacts.normals, contacts.distances, strict=True):
-            j = row(n, p)
-            c = world.dilation - rho + j @ s
-            if c <= 0:
-                continue
-            active += 1
-            impulse = c / (j @ inverse @ j)
-            total -= impulse * (inverse @ j)
-            u = motion_at(s, p)
-            tangent = u - (n @ u) * n
-            length = np.linalg.norm(tangent)
-            if length > 1e-9:
-                jt = row(tangent / length, p)
-                total -= min(length / (jt @ inverse @ jt), world.friction * impulse) * (inverse @ jt)
-        if active:
-            s = s + total / active
+        impulse, push = _pushed(p, n, contacts.distances, s[..., None, :], world)
+        _, slide = _slipped(p, n, impulse, s[..., None, :], world)
+        active = np.sum(impulse > 0, axis=-1, keepdims=True)
+        s = s + (push + slide).sum(axis=-2) / np.maximum(active, 1)
     return s
+
+
+def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
+    """Normal impulses (...) that leave no penetration at points (..., 3) that move by s (..., 6); what they change."""
+    j = row(n, p)
+    back = j @ np.linalg.inv(world.mass)
+    impulse = np.maximum(world.dilation - rho + np.sum(j * s, axis=-1), 0.0) / np.sum(j * back, axis=-1)
+    return impulse, -impulse[..., None] * back
+
+
+def _slipped(p: Floats, n: Floats, impulse: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
+    """Tangential impulses (...) within the cone of the normal ones; what they change (..., 6)."""
+    u = motion_at(s, p)
+    tangent = u - np.sum(n * u, axis=-1, keepdims=True) * n
+    length = np.linalg.norm(tangent, axis=-1)
+    jt = row(tangent / np.maximum(length, 1e-9)[..., None], p)
+    back = jt @ np.linalg.inv(world.mass)
+    weight = np.sum(jt * back, axis=-1)
+    slip = np.where(length > 1e-9, np.minimum(length / np.maximum(weight, 1e-9), world.friction * impulse), 0.0)
+    return slip, -slip[..., None] * back

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -60,13 +61,13 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
     """dL/drho (N,) by central differences in float64."""
     motions = initial_motions(7, world.step, world.gyration)
     step = 1e-6 * world.step
+    steps = step * np.eye(len(contacts.points))[:, None]
 
-    def loss(distances: Floats) -> float:
-        moved = Contacts(contacts.points, contacts.normals, distances, contacts.weights)
-        return float(np.mean([reference.loss(solve64(name, moved, s0, world), world) for s0 in motions]))
+    def losses(distances: Floats) -> Floats:
+        ends = solve64(name, replace(contacts, distances=distances), motions, world)
+        return np.asarray(np.mean(reference.loss(ends, world), axis=-1))
 
-    eye = step * np.eye(len(contacts.points))
-    return np.array([(loss(contacts.distances + e) - loss(contacts.distances - e)) / (2 * step) for e in eye])
+    return (losses(contacts.distances + steps) - losses(contacts.distances - steps)) / (2 * step)
 
 
 def gradient_map(
