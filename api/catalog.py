@@ -38,6 +38,7 @@ from service.domain import AssetKind, JobRequest, Lane, Stage, State
 from service.embedded import redis_url
 from service.errors import ConflictError, NotFoundError, UnavailableError
 from service.index.filters import GraspFilter, GraspSort, Metric
+from service.index.notes import Damage
 from service.index.views import (
     AssetView,
     FailureGroup,
@@ -62,6 +63,7 @@ _PAGE: Final = 200
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_HISTOGRAMS: Final = 256
 _LOSS_BATCHES: Final = 8
+_DAMAGE_SHOWN: Final = 5
 MEAN_METRICS: Final[tuple[Metric, ...]] = (
     "epsilon",
     "contact_area_cm2",
@@ -294,6 +296,10 @@ class Catalog:
     def health(self) -> Health:
         """State of the three parts; asked anew at most every two seconds."""
         return self._probes.health()
+
+    def damage(self) -> tuple[int, list[Damage]]:
+        """Number of objects of the store known to be damaged or missing, and the first of them."""
+        return self._parts.index.known_damage(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
         """The service as Prometheus sees it; a part that is away leaves its numbers out."""

@@ -75,6 +75,7 @@ class Snapshot:
         for state, count in index.jobs.items():
             self._set("graspd_jobs_unfinished", state, value=count)
             self._set("graspd_job_oldest_seconds", state, value=index.oldest_s[state])
+        self._set("graspd_store_damaged", value=index.damaged)
         self._set("graspd_grasps_per_second", "all", value=index.grasps_per_s)
         self._set("graspd_grasps_per_second", "valid", value=index.valid_per_s)
 

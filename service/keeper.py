@@ -23,6 +23,7 @@ from service.pipeline import queue_tasks
 from service.planning import ingest_id, ingest_message
 from service.queue.port import Event, EventKind
 from service.reaper import Reaper
+from service.scrubber import Scrubber
 from service.sweeper import Sweeper
 from service.turns import Turns
 
@@ -35,6 +36,8 @@ _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
 _LONGEST_PAUSE_S: Final = 5.0
 _SWEEP_EVERY_S: Final = 5.0
+#: What a read of the store that is under way has to end, once the keeper stops [s].
+_LAST_READ_S: Final = 3.0
 
 
 class Keeper:
@@ -57,6 +60,24 @@ class Keeper:
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
+        with self._scrubbing(stop):
+            self._run(stop)
+
+    @contextmanager
+    def _scrubbing(self, stop: threading.Event) -> Iterator[None]:
+        """Reads through the store beside the rounds, where the settings want it."""
+        if not self._parts.settings.scrub_mb_per_s:
+            yield
+            return
+        thread = threading.Thread(target=Scrubber(self._parts, stop).run, name="scrub", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(_LAST_READ_S)
+
+    def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
             try:

@@ -6,18 +6,14 @@ import hashlib
 from collections.abc import Sequence
 
 from service import names
-from service.clock import age_of
 from service.domain import Lane, Stage
 from service.errors import DamagedError, NotFoundError
 from service.index.notes import Damage
 from service.parts import Parts
 from service.planning import PlannedTask, message_of, plan
 from service.records import JobRecord, read_record, task_attempts
-from service.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES
+from service.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
 from service.version import STAGE_REVISIONS
-
-#: A file this young may be waiting for the manifest that its worker puts next [s].
-_ON_ITS_WAY_S = 60.0
 
 
 def repair(parts: Parts, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
@@ -50,7 +46,7 @@ def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
     if not one.shard:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
-    if one.what == NO_MANIFEST and (age_of(parts.store.stamp(one.key)[1]) or 0.0) < _ON_ITS_WAY_S:
+    if is_on_its_way(parts.store, one):
         return "its manifest may be on its way; run it again in a minute"
     planned = _planned(parts, stage, one.shard)
     if isinstance(planned, str):

@@ -10,6 +10,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from service import names
+from service.clock import age_of
 from service.datasets.records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
 from service.domain import Asset, Stage
 from service.errors import DamagedError, NotFoundError
@@ -29,7 +30,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
     (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
 )
-_FOLDERS: Final = (names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS)
+FOLDERS: Final = (names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS)
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
 STAGES: Final[dict[str, Stage]] = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
@@ -37,6 +38,8 @@ MISSING: Final = "its file is gone"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"
 FOREIGN: Final = "nothing that graspd put there"
+#: How long a file may be without a manifest [s].
+_ON_ITS_WAY_S: Final = 60.0
 #: Told after each piece that was read: its bytes.
 Read = Callable[[int], None]
 
@@ -47,10 +50,23 @@ def scan(store: Store, *folders: str, read: Read = lambda size: None) -> Iterato
     Raises:
         StoreUnavailable: the store does not answer.
     """
-    for folder in folders or _FOLDERS:
+    for folder in folders or FOLDERS:
         for entry in store.list(folder):
-            if folder == names.SHARDS or any(re.fullmatch(pattern, entry.key) for pattern, _ in _RECORDS):
+            if is_checked(entry.key):
                 yield entry.key, examine(store, entry.key, read=read)
+
+
+def is_on_its_way(store: Store, one: Damage) -> bool:
+    """Whether a file may only wait for the manifest that its worker puts next."""
+    try:
+        return one.what == NO_MANIFEST and (age_of(store.stamp(one.key)[1]) or 0.0) < _ON_ITS_WAY_S
+    except NotFoundError:
+        return True
+
+
+def is_checked(key: str) -> bool:
+    """Whether `examine` knows what an object of this name must hold."""
+    return key.startswith(f"{names.SHARDS}/") or any(re.fullmatch(pattern, key) for pattern, _ in _RECORDS)
 
 
 def examine(store: Store, key: str, *, read: Read = lambda size: None) -> Damage | None:
@@ -59,7 +75,7 @@ def examine(store: Store, key: str, *, read: Read = lambda size: None) -> Damage
         if not key.startswith(f"{names.SHARDS}/"):
             return _record(store, key)
         if (match := _SHARD.fullmatch(key)) is None:
-            return Damage(key, FOREIGN)
+            return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
         if ending == "json":
             return _manifest(store, key, STAGES[kind], shard, read)

@@ -59,6 +59,9 @@ class Settings(BaseSettings):
     shard_grace_s: float = Field(
         7 * 86400.0, ge=0, description="how long shards are kept that no job needs since theirs was deleted [s]"
     )
+    scrub_mb_per_s: float = Field(
+        1.0, ge=0, description="how fast the keeper reads through the store for damage [MiB/s]; 0: never"
+    )
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
     log_format: Literal["auto", "json", "text"] = Field(

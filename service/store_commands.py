@@ -9,6 +9,7 @@ import typer
 
 from service import names
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.errors import ConflictError
 
 app = typer.Typer(no_args_is_help=True)
 store_app = typer.Typer(no_args_is_help=True, help="Check the store, and mend it.")
@@ -29,20 +30,29 @@ def verify(
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Read every shard and record and say what is damaged or missing. Exit code 1 says that something is."""
+    """Read every shard and record and say what is damaged or missing. Exit code 1 says that something is.
+
+    The keeper's own reading pauses meanwhile; a second call is refused.
+    """
     from service.parts import Parts
     from service.repair import repair as mend
     from service.scrub import MISSING, scan
+    from service.scrubber import Turn
 
     parts = Parts.open(load_settings(data_dir=data_dir))
+    turn = Turn(parts, is_keeper=False)
     try:
+        if not turn.is_mine():
+            raise ConflictError("another `graspd store verify` reads this store; wait until it is done")
         shards, found = 0, []
-        for key, wrong in scan(parts.store):
+        for key, wrong in scan(parts.store, read=lambda size: turn.keep()):
+            turn.keep()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
         parts.index.replace_damage(found)
         repaired, left = mend(parts, found) if repair else ([], found)
     finally:
+        turn.end()
         parts.close()
     if json:
         damaged = [{"shard": one.shard or one.key, "what": one.what, "key": one.key} for one in found]

@@ -55,6 +55,7 @@ def home(
         workers=[worker for worker in catalog.workers() if is_recent(worker)],
         failures=catalog.failures(limit=4),
         datasets=_latest_datasets(catalog),
+        damage=catalog.damage(),
     )
 
 
@@ -73,6 +74,7 @@ def workers_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
         busy=sum(worker.state == "busy" for worker in workers),
         alive=sum(worker.state != "lost" for worker in workers),
         stages=stage_depths(catalog),
+        damage=catalog.damage(),
     )
 
 

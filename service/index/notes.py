@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select
@@ -13,6 +13,8 @@ from service.index.database import Database, upsert
 from service.index.tables import damage, notes
 
 _REBUILT: Final = "rebuilt"
+_SCRUB: Final = "scrub"
+_SCRUB_TURN: Final = "scrub turn"
 #: Names of records that are kept; the count is of all.
 _NAMED: Final = 50
 
@@ -36,6 +38,19 @@ class Damage:
     what: str
     shard: str = ""
     found: str = ""
+
+
+@dataclass(frozen=True)
+class ScrubNote:
+    """How far the keeper has read through the store in this round."""
+
+    started: str = ""
+    ended: str = ""
+    """Empty while the round goes on."""
+    folder: int = 0
+    """Place in the list of folders."""
+    after: str = ""
+    """Key up to which it has read that folder."""
 
 
 class Notes(Database):
@@ -74,3 +89,36 @@ class Notes(Database):
         with self.writing() as connection:
             connection.execute(delete(damage).where(damage.c.key.not_in([one.key for one in found])))
         self.set_damage(found)
+
+    def scrub_note(self) -> ScrubNote:
+        """How far the keeper has read through the store; nothing read yet: a note of defaults."""
+        with self.reading() as connection:
+            value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB))
+        return ScrubNote(**value) if value else ScrubNote()
+
+    def set_scrub_note(self, note: ScrubNote) -> None:
+        with self.writing() as connection:
+            upsert(connection, notes, [{"name": _SCRUB, "value": asdict(note)}])
+
+    def take_scrub_turn(self, holder: str, *, is_keeper: bool, lasts_s: float) -> bool:
+        """Take or keep the right to read through the whole store; False: somebody else has it.
+
+        Args:
+            holder: who asks.
+            is_keeper: a keeper gives way to who is none.
+            lasts_s: after so long without a call the right is free again [s].
+        """
+        with self.writing() as connection:
+            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
+            if held and held["holder"] != holder and held["until"] > timestamp() and (is_keeper or not held["keeper"]):
+                return False
+            value = {"holder": holder, "keeper": is_keeper, "until": timestamp(-lasts_s)}
+            upsert(connection, notes, [{"name": _SCRUB_TURN, "value": value}])
+        return True
+
+    def end_scrub_turn(self, holder: str) -> None:
+        """Free the right, if this one has it."""
+        with self.writing() as connection:
+            held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
+            if held and held["holder"] == holder:
+                connection.execute(delete(notes).where(notes.c.name == _SCRUB_TURN))

@@ -12,7 +12,7 @@ from sqlalchemy import Select, func, select
 from service.clock import age_of
 from service.domain import State
 from service.index.database import Database
-from service.index.tables import jobs, shards
+from service.index.tables import damage, jobs, shards
 
 #: Unfinished jobs are counted up to here.
 MOST_JOBS: Final = 10_000
@@ -28,6 +28,8 @@ class IndexNow:
     oldest_s: Mapping[State, float]
     grasps_per_s: float
     valid_per_s: float
+    damaged: int
+    """Objects of the store that are known to be damaged or missing, counted up to `MOST_JOBS`."""
 
 
 def read_index(index: Database) -> IndexNow:
@@ -39,14 +41,20 @@ def read_index(index: Database) -> IndexNow:
             counted[state] = int(connection.scalar(count_jobs(state)) or 0)
             first = connection.scalar(oldest_job(state))
             oldest[state] = (first and age_of(first)) or 0.0
+        damaged = int(connection.scalar(count_damage()) or 0)
         made, valid = connection.execute(made_since(since)).one()
-    return IndexNow(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S)
+    return IndexNow(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
 
 
 def count_jobs(state: State) -> Select[Any]:
     """Number of jobs in a state, up to `MOST_JOBS`."""
     some = select(jobs.c.id).where(jobs.c.state == state.value).limit(MOST_JOBS).subquery()
     return select(func.count()).select_from(some)
+
+
+def count_damage() -> Select[Any]:
+    """Number of damaged objects, up to `MOST_JOBS`."""
+    return select(func.count()).select_from(select(damage.c.key).limit(MOST_JOBS).subquery())
 
 
 def oldest_job(state: State) -> Select[Any]:

@@ -38,6 +38,7 @@ _ALL: Final = (
     Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
     Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
     Series("graspd_grasps_per_second", "gauge", ("verdict",), "grasps kept in the last minute: all, valid", "index"),
+    Series("graspd_store_damaged", "gauge", (), "objects of the store known to be damaged or missing", "index"),
     Series("graspd_part_up", "gauge", ("part",), "1: redis, index or store answers", "probe"),
     Series("graspd_part_latency_seconds", "gauge", ("part",), "time of a ping, a read, a small write", "probe"),
     Series("graspd_grasps_total", "counter", ("verdict",), "grasps kept: all, valid", "keeper"),

@@ -12,6 +12,7 @@ from starlette.testclient import TestClient
 from service.domain import State
 from service.errors import IndexUnavailable, QueueUnavailable
 from service.index.index import Index
+from service.index.notes import Damage
 from service.parts import Parts
 from service.planning import plan
 from service.queue.memory import MemoryQueue
@@ -24,6 +25,23 @@ def test_an_empty_service_says_what_to_do(http: TestClient) -> None:
     page = http.get("/").text
     assert "graspd submit" in page
     assert "graspd worker" in page
+
+
+@pytest.mark.parametrize("path", ["/", "/workers"])
+def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some(
+    http: TestClient, parts: Parts, path: str
+) -> None:
+    assert "graspd store verify" not in http.get(path).text
+    parts.index.set_damage([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
+    page = http.get(path).text
+    assert "7 objects of the store are damaged or missing" in page
+    assert "graspd store verify --repair" in page
+    if path == "/":
+        assert "shards/base/0.h5" in page
+        assert "its &lt;file&gt; is gone" in page
+        assert "and 2 more" in page
+    parts.index.replace_damage([])
+    assert "damaged or missing" not in http.get(path).text
 
 
 def test_home_shows_jobs_workers_and_failures(http: TestClient, parts: Parts) -> None:

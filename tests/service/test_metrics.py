@@ -11,8 +11,10 @@ from typing import Any
 import pytest
 from sqlalchemy.dialects import sqlite
 
+from api.metrics import Metrics, Snapshot
 from service.domain import Lane, Stage, State, TaskMessage
 from service.index.index import Index
+from service.index.notes import Damage
 from service.metrics import index_now
 from service.metrics.series import SERIES
 from service.metrics.tally import MOST_KINDS, OTHER_KIND, Tally, parse_field
@@ -62,6 +64,15 @@ def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: A
     tables = [step for step in steps if re.search(r"\b(jobs|shards)\b", step)]
     assert tables
     assert all(step.startswith("SEARCH") and "USING" in step for step in tables)
+
+
+def test_damage_of_the_store_is_told(parts: Parts) -> None:
+    assert index_now.read_index(parts.index).damaged == 0
+    parts.index.set_damage([Damage("shards/base/a.h5", "its file is gone", "a")])
+    assert index_now.read_index(parts.index).damaged == 1
+    shown = Snapshot()
+    shown.add_index(index_now.read_index(parts.index))
+    assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
 def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(parts: Parts) -> None:
