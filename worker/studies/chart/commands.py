@@ -42,7 +42,7 @@ def chart(
     quick: Annotated[bool, typer.Option("--quick", help="Little of everything: seconds instead of an hour.")] = False,
     sweep: Annotated[bool, typer.Option("--sweep", help="Also turn fast_graspd's knobs one at a time.")] = False,
     knob: Annotated[
-        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solve'; several times.")
+        list[str] | None, typer.Option(help="With --sweep: only this knob, such as 'contact solver'; several times.")
     ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",

@@ -1,8 +1,7 @@
 """fast_graspd's knobs turned one at a time: what each costs in accuracy and gains in speed.
 
-Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, whether the M simulations
-share one closest-point query per hand point (as they do) or ask M times (as the paper's code does), and the precision
-of the contact solve. Queries, kinematics and penalties stay float32 in both: Warp's queries know nothing else.
+Some knobs are no part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
+simulations share one closest-point query per hand point (as they do) or ask M times (as the paper's code does).
 """
 
 from __future__ import annotations
@@ -24,10 +23,11 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
 from worker.quality.referee.decomposition import decompose
 from worker.simulation.simulation import LossOptions
+from worker.studies.chart import kernels
 from worker.studies.chart.cells import Cell, Setting
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import figures, plain
-from worker.studies.chart.variants import MODULES, asking_each, solving_in_64
+from worker.studies.chart.variants import asking_each
 
 Say = Callable[[str], None]
 Change = Callable[[Pair], Pair]
@@ -94,7 +94,6 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
         Turn("culling", "band", change=_options(exact_below=1.0)),
         Turn("culling", "none", change=_options(exact_below=1.0, band=0.3)),
     ]
-    found += [Turn("contact solve", "float32"), Turn("contact solve", "float64", change=solving_in_64)]
     known = list(dict.fromkeys(turn.knob for turn in found))
     if unknown := [name for name in knobs if name not in known]:
         raise InputError(f"there is no knob {unknown[0]!r}; choose of {', '.join(map(repr, known))}")
@@ -112,8 +111,7 @@ def sweep(
     Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
     processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
     """
-    for module in MODULES:
-        wp.load_module(module=module, device=device)
+    wp.load_module(module=kernels, device=device)
     default = Turn("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
