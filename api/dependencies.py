@@ -26,10 +26,6 @@ def may_submit(request: Request) -> None:
     authorize(request, Scope.SUBMIT)
 
 
-def may_administer(request: Request) -> None:
-    authorize(request, Scope.ADMIN)
-
-
 def may_scrape(request: Request) -> None:
     """Whoever may read; or anybody, where the settings say so."""
     if request.app.state.settings.metrics_need_key:

@@ -27,12 +27,12 @@ from service.domain import Lane, State
 from service.index.index import Index
 from service.parts import Parts
 from service.planning import message_of, plan
-from service.queue.memory import MemoryQueue
 from service.records import JobRecord, read_record
 from service.settings import Settings
 from service.store import open_store
 from service.supervisor import Supervisor
 from tests.fakes import add_assets, fake_stages, make_shard, request
+from tests.memory_queue import MemoryQueue
 
 #: A batch of 32 grasps takes at least this long on two cores (docs/performance.md) [s].
 BATCH_S: Final = 1.0

@@ -11,7 +11,7 @@ from service.errors import NotFoundError
 from service.index import cursors
 from service.index.database import Database
 from service.index.filters import GraspFilter, GraspSort
-from service.index.grasp_search import count, search
+from service.index.grasp_search import search
 from service.index.tables import grasps, shards, tasks
 from service.index.views import GraspView, Page, ShardView
 
@@ -46,11 +46,6 @@ class GraspQueries(Database):
         if found is None:
             raise NotFoundError(f"there is no grasp {row} in shard {shard_id!r}")
         return GraspView(**{name: found[name] for name in GraspView.model_fields})
-
-    def grasp_count(self, where: GraspFilter | None = None) -> int:
-        """Number of grasps that match."""
-        with self.reading() as connection:
-            return count(connection, where or GraspFilter())
 
     def shards(
         self,

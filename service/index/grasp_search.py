@@ -95,24 +95,6 @@ def search(
     return rows
 
 
-def count(connection: Connection, where: GraspFilter) -> int:
-    """Number of grasps that pass; from the sums of the shards where these tell."""
-    wanted = conditions(where)
-    if {condition.group for condition in wanted} <= {"shard", "job", "pair", "flag"} and where.success is None:
-        number = {None: shards.c.count, True: shards.c.valid, False: shards.c.count - shards.c.valid}[where.valid]
-        query = select(func.sum(number)).where(shards.c.kind == "base")
-        for condition in wanted:
-            if condition.group in ("shard", "job"):
-                query = query.where(condition.on(shards.c.id))
-            elif condition.group == "pair":
-                query = query.where(condition.on(shards.c[str(condition.column.key)]))
-        return int(connection.scalar(query) or 0)
-    few = _few(connection, where, wanted)
-    sqlite = connection.dialect.name == "sqlite"
-    tests = [c.sql([few] if few else [] if sqlite else None) for c in wanted]
-    return int(connection.scalar(select(func.count()).select_from(grasps).where(*tests)) or 0)
-
-
 def _with_metric(
     connection: Connection,
     wanted: Sequence[Condition],

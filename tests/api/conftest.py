@@ -12,10 +12,10 @@ from starlette.testclient import TestClient
 from api.app import create_app
 from service.index.index import Index
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.settings import Settings
 from service.store import open_store
 from tests.api.factories import add_builtins
+from tests.memory_queue import MemoryQueue
 from tests.service.conftest import redis_server, rq_queue
 
 __all__ = ["redis_server", "rq_queue"]

@@ -16,8 +16,8 @@ from api.key_commands import duration
 from api.keys import KeyFile, KeyLimits, Scope
 from service.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.settings import Settings
+from tests.memory_queue import MemoryQueue
 
 JOB = {"hand": "allegro", "object": "mug"}
 

@@ -15,8 +15,8 @@ from service.index.index import Index
 from service.index.notes import Damage
 from service.parts import Parts
 from service.planning import plan
-from service.queue.memory import MemoryQueue
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+from tests.memory_queue import MemoryQueue
 
 FORM = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "standard", "seed": "0", "friction": "1.0"}
 

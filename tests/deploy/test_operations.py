@@ -16,12 +16,12 @@ from service.index.index import Index
 from service.index.rebuild import differences, rebuild
 from service.library import publish_builtins
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.settings import Settings
 from service.store import open_store
 from tests.conftest import REPOSITORY
 from tests.deploy import composition, page
 from tests.fakes import add_assets, request
+from tests.memory_queue import MemoryQueue
 from tests.service.test_index import run_all
 
 

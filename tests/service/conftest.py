@@ -14,11 +14,11 @@ from service.errors import QueueUnavailable
 from service.index.index import Index
 from service.parts import Parts
 from service.queue.connection import connect
-from service.queue.memory import MemoryQueue
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store import open_store
 from tests.fakes import add_assets
+from tests.memory_queue import MemoryQueue
 
 
 @pytest.fixture(scope="session")

@@ -27,13 +27,13 @@ from service.index.tables import metadata
 from service.index.views import GraspView
 from service.parts import Parts
 from service.planning import message_of, plan
-from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, put_record, read_record
 from service.settings import Settings
 from service.store import Store, open_store
 from service.turns import Turns
 from service.version import STAGE_REVISIONS
 from tests.fakes import add_assets, make_shard, request
+from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 
 
@@ -135,7 +135,7 @@ def test_a_job_shows_progress_by_stage(parts: Parts) -> None:
     run_all(parts, job.id)
     done = parts.index.job(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 64)
-    assert done.valid == parts.index.grasp_count(GraspFilter(job=job.id, valid=True))
+    assert done.valid == len(parts.index.grasps(GraspFilter(job=job.id, valid=True), limit=200).items)
     assert done.finished is not None
 
 
@@ -202,7 +202,6 @@ def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
     ]
     assert found == expected
     assert 0 < len(found) < 64
-    assert parts.index.grasp_count(where) == len(found)
 
 
 def test_a_cursor_of_another_list_is_refused(parts: Parts) -> None:
@@ -499,16 +498,3 @@ def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server:
     with pytest.raises(InputError, match="cannot hold"), index.writing() as connection:
         connection.execute(tables.workers.insert().values(name="x" * 999))
     index.close()
-
-
-@pytest.mark.parametrize("where", [
-    {}, {"valid": True}, {"valid": False, "hand": "gripper"}, {"object": "cube"}, {"success": True},
-    {"valid": True, "at_least": {"epsilon": 0.5}},
-    {"hand": "gripper", "at_most": {"epsilon": 0.9, "wrench_volume": 0.3}},
-])  # fmt: skip
-def test_grasps_are_counted_as_they_are_listed(parts: Parts, where: dict[str, object]) -> None:
-    job, _ = pipeline.submit(parts, request(grasps=96))
-    run_all(parts, job.id)
-    for place in ({}, {"job": job.id}, {"shard": parts.index.shards().items[0].id}):
-        some = GraspFilter(**where, **place)  # type: ignore[arg-type]
-        assert parts.index.grasp_count(some) == len(parts.index.grasps(some, limit=200).items)

@@ -21,12 +21,12 @@ from service.keeper import Keeper
 from service.library import stored_assets
 from service.parts import Parts
 from service.planning import plan
-from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, add_job_event, put_record, read_record
 from service.settings import Settings
 from service.store import open_store
 from tests.damage import overwrite
 from tests.fakes import add_assets, make_shard, message_for, request
+from tests.memory_queue import MemoryQueue
 
 GOOD = 3
 DAMAGED = b'{"x": 1}'

@@ -17,10 +17,10 @@ from service.index.rebuild import differences
 from service.keeper import Keeper
 from service.library import publish_asset, stored_assets
 from service.parts import Parts
-from service.queue.memory import Delivery, MemoryQueue
 from service.queue.port import Event, EventKind
 from service.reaper import LOST_AFTER_S
 from tests.fakes import HAND_FILES, fake_stages, make_shard, request
+from tests.memory_queue import Delivery, MemoryQueue
 from worker.context import StopReason, TaskContext
 from worker.runner import Runner
 

@@ -9,9 +9,9 @@ from service.domain import AssetKind, Lane, State
 from service.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
 from service.library import publish_asset
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.records import job_events
 from tests.fakes import HAND_FILES, request
+from tests.memory_queue import MemoryQueue
 from tests.service.test_index import fail, run_all
 
 

@@ -14,10 +14,10 @@ from rq.executions import prepare_execution
 from service.clock import timestamp
 from service.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.queue.allowed import AllowedJob, AllowedQueue
-from service.queue.memory import MemoryQueue
 from service.queue.port import BULK_EVERY, Event, EventKind, TaskQueue, WorkerBeat
 from service.queue.rq_queue import RqQueue, queue_names, worker_key
 from tests.fakes import request
+from tests.memory_queue import MemoryQueue
 from worker.context import StopReason, TaskContext
 from worker.heartbeat import Heartbeat, Hold, place_of
 from worker.pulse import Pulse

@@ -16,7 +16,6 @@ from service.index.rebuild import differences
 from service.keeper import Keeper
 from service.manifests import ShardManifest, load_manifest, load_shard
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.queue.port import EventKind
 from service.repair import repair
 from service.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
@@ -24,6 +23,7 @@ from service.settings import Settings
 from service.store import open_store
 from tests.damage import cut, flip, overwrite, remove
 from tests.fakes import add_assets, fake_stages, request
+from tests.memory_queue import MemoryQueue
 from worker.context import TaskContext
 from worker.runner import Runner
 

@@ -19,7 +19,7 @@ from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
 from worker.rendering.stage import Stage
 
-#: Sides from which `three_sides` looks, measured from the side view of the hand [rad].
+#: Sides 120 degrees apart, measured from the side view of the hand [rad].
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
@@ -91,13 +91,6 @@ def grasp_pictures(
         shots.append(_shoot(stages[worlds], hand, obj, bodies, size, azimuths, samples, cancelled))
     empty = np.zeros((0, len(azimuths), size[1], size[0], 3), np.uint8)
     return np.concatenate([empty, *shots])
-
-
-def three_sides(
-    hand: HandModel, obj: ObjectModel, hand_pose: Floats, joint_positions: Floats, size: tuple[int, int] = (320, 320)
-) -> NDArray[np.uint8]:
-    """(N, 3, H, W, 3): each grasp from three sides, 120 degrees apart."""
-    return grasp_pictures(hand, obj, hand_pose, joint_positions, size, THREE_SIDES)
 
 
 def _shoot(

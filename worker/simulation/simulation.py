@@ -363,14 +363,6 @@ class Simulation:
             )  # fmt: skip
         self._launch(optimizers.advance, 1, [self.iteration])
 
-    def record_evaluation(self) -> None:
-        """Fix the launches of loss and gradient without a step."""
-        self._commands, self._graph = [], None
-        self._record_kinematics()
-        self._record_contact()
-        self._record_penalties()
-        self._record_gradient()
-
     def record_placement(self) -> None:
         """Fix the launches that tell contacts and penetration depths only."""
         self._commands, self._graph = [], None

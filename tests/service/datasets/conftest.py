@@ -10,10 +10,10 @@ from pydantic import SecretStr
 
 from service.index.index import Index
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.settings import Settings
 from service.store import open_store
 from tests.fakes import add_assets
+from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 from tests.service.datasets.makers import add_asset
 

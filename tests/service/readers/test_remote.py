@@ -10,12 +10,12 @@ import pytest
 
 from service.index.index import Index
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.readers import Grasps, Pictures, open_shards
 from service.records import JobRecord
 from service.settings import Settings
 from service.store import open_store
 from tests.api import factories
+from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server
 
 pytestmark = pytest.mark.s3

@@ -21,11 +21,11 @@ from service.index.index import Index
 from service.manifests import publish_shard
 from service.parts import Parts
 from service.planning import message_of, plan
-from service.queue.memory import MemoryQueue
 from service.records import AttemptRecord, JobRecord, put_record, read_record
 from service.settings import Settings
 from service.store import open_store
 from tests.api.factories import add_builtins, poses, scene_columns
+from tests.memory_queue import MemoryQueue
 from worker.stages.output import Output, shard_of
 
 HANDS = ("allegro", "barrett")

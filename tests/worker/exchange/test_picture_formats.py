@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from service.errors import InputError
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.readers import Pictures, Shards, open_shards
 from service.settings import Settings
 from service.shards import Shard
 from service.store import open_store
+from tests.memory_queue import MemoryQueue
 from worker.exchange import replicator, webdataset
 from worker.rendering.annotate import box_corners
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.rendering import render
-from worker.rendering.pictures import THREE_SIDES, grasp_pictures, three_sides
+from worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from worker.rendering.sheets import GAP, MARGIN, best, contact_sheet, figures, three_sides_sheet, views_page
 from worker.rendering.typography import PAPER, depth_colours
 
@@ -54,7 +54,8 @@ def test_a_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, picture
 
 
 def test_no_grasps_give_no_pictures(block):
-    assert three_sides(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64)).shape == (0, 3, 64, 80, 3)
+    drawn = grasp_pictures(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
+    assert drawn.shape == (0, 3, 64, 80, 3)
 
 
 def quality(count: int) -> dict[str, np.ndarray]:

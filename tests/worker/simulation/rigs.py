@@ -42,3 +42,13 @@ def rig(
     )  # fmt: skip
     simulation.set_schedule(schedule or still())
     return simulation
+
+
+def evaluate(simulation: Simulation) -> None:
+    """Loss and gradient of the state, without a step."""
+    simulation._commands, simulation._graph = [], None
+    simulation._record_kinematics()
+    simulation._record_contact()
+    simulation._record_penalties()
+    simulation._record_gradient()
+    simulation.run()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.transforms import apply, invert, quat_from_axis_angle, quat_multiply
-from tests.worker.simulation.rigs import ball, rig, still
+from tests.worker.simulation.rigs import ball, evaluate, rig, still
 from tests.worker.simulation.test_kinematics import root_poses
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
@@ -70,8 +70,7 @@ def test_object_points_inside_links_push_the_hand_along_the_true_gradient(name: 
     schedule.object_penetration[:] = 1.0
     simulation.set_schedule(schedule)
     simulation.set_state(state)
-    simulation.record_evaluation()
-    simulation.run()
+    evaluate(simulation)
     found = simulation.gradient.numpy()[0]
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 0.01, "the state penetrates"
@@ -106,8 +105,7 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     schedule.self_penetration[:] = 1.0
     simulation.set_schedule(schedule)
     simulation.set_state(state)
-    simulation.record_evaluation()
-    simulation.run()
+    evaluate(simulation)
     found = simulation.gradient.numpy()[0]
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-4, "the links touch"
@@ -121,8 +119,7 @@ def test_the_range_and_limit_penalties_have_their_closed_form_gradient() -> None
     options = LossOptions(simulate=False, leak=0.0, range_weight=0.3, limit_weight=7.0)
     simulation = rig(hand, ball(), capacity=1, options=options)
     simulation.set_state(state)
-    simulation.record_evaluation()
-    simulation.run()
+    evaluate(simulation)
     half = 0.5 * (hand.upper - hand.lower)
     expected = 2 * 0.3 * (half + 0.1) / half**2 + 2 * 7.0 * 0.1
     np.testing.assert_allclose(simulation.gradient.numpy()[0, 6:], expected, rtol=1e-5)
@@ -143,8 +140,7 @@ def test_loss_and_gradient_are_finite_wherever_the_hand_is(place: str, solver: s
     simulation = rig(hand, obj, capacity=1, options=LossOptions(contact_solver=solver))
     simulation.set_schedule(still(dilation=0.01, weight=1e4))
     simulation.set_state(state)
-    simulation.record_evaluation()
-    simulation.run()
+    evaluate(simulation)
     assert np.all(np.isfinite(simulation.loss.numpy()))
     assert np.all(np.isfinite(simulation.gradient.numpy()))
 
@@ -157,8 +153,7 @@ def test_a_mesh_with_degenerate_normals_gives_finite_gradients() -> None:
     simulation = rig(hand, broken, capacity=1)
     simulation.set_schedule(still(dilation=0.01, weight=1e4))
     simulation.set_state(fist_in_ball(hand))
-    simulation.record_evaluation()
-    simulation.run()
+    evaluate(simulation)
     assert np.all(np.isfinite(simulation.gradient.numpy()))
 
 
