@@ -1,4 +1,4 @@
-"""How many cores this process may keep busy: not what the machine has, but what it is given of them."""
+"""How many cores and how much memory this process may use: not what the machine has, but what it is given of it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-_ROOT: Final = Path("/")
+ROOT: Final = Path("/")
 #: Where systems mount the CPU controller of cgroup v1.
 _V1: Final = ("cpu", "cpu,cpuacct")
 
 
-def available_cores(root: Path = _ROOT) -> int:
+def available_cores(root: Path = ROOT) -> int:
     """Cores for threads of this process: its affinity, or the CPU quota of its control group where that is less.
 
     A quota of one and a half cores gives 2: a thread that waits for its share costs less than half a core unused.
@@ -37,6 +37,19 @@ def _quotas(root: Path) -> Iterator[float]:
                 for name in _V1:
                     files = (mount / name / group / f"cpu.cfs_{what}_us" for what in ("quota", "period"))
                     yield from _ratio([word for file in files for word in _words(file)])
+
+
+def memory_limits(root: Path = ROOT) -> Iterator[int]:
+    """Limits of memory [bytes] of this process's control group and of those it is in; none where there is none."""
+    mount = root / "sys/fs/cgroup"
+    for controllers, path in _groups(root / "proc/self/cgroup"):
+        for group in (str(one).lstrip("/") for one in (PurePosixPath(path), *PurePosixPath(path).parents)):
+            words = []
+            if not controllers:
+                words = _words(mount / group / "memory.max")
+            elif "memory" in controllers.split(","):
+                words = _words(mount / "memory" / group / "memory.limit_in_bytes")
+            yield from (int(word) for word in words if word.isdigit() and int(word) > 0)
 
 
 def _groups(file: Path) -> Iterator[tuple[str, str]]:

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from service.cores import ROOT, memory_limits
+
 _STATUS: Final = Path("/proc/self/statm")
 
 
@@ -21,6 +23,11 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def limit_mb(wanted: int) -> float:
-    """The limit of a worker [MiB]: as given, or half of the machine's memory for 0."""
-    return wanted or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20 / 2
+def limit_mb(wanted: int, root: Path = ROOT) -> float:
+    """The limit of a worker [MiB]: as given; for 0 half of the machine's memory, or of its control group's if less.
+
+    Args:
+        root: the folder that holds `proc` and `sys`.
+    """
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return wanted or min([machine, *memory_limits(root)]) / 2**20 / 2

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from api import dataset_quota
+from api.auth import caller, must_own
 from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
 from api.paging import link_next
 from api.problems import ApiError, responses
@@ -176,8 +177,15 @@ def get_snapshot(name: DatasetName, digest: SnapshotDigest, catalog: CatalogOf) 
     responses=responses(400, 401, 403, 404, 413, 422, 503),
 )
 def add_object_set(body: ObjectSetRequest, response: Response, catalog: CatalogOf) -> ObjectSetView:
-    """Give objects a name together. Other objects under the same name are its next version."""
-    found = actions.add_object_set(catalog.parts, body.name, body.objects)
+    """Give objects a name together. Other objects under the same name are its next version, for its owner or an admin."""
+    key = caller.get()
+    found = actions.add_object_set(
+        catalog.parts,
+        body.name,
+        body.objects,
+        owner=key.id if key else "",
+        may_follow=lambda owner: must_own(owner, f"the set {body.name!r}"),
+    )
     response.headers["Location"] = f"/v1/object-sets/{found.name}"
     return found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Literal
 
 from service import names
@@ -12,6 +12,7 @@ from service.clock import timestamp
 from service.datasets.records import (
     DatasetRecord,
     Member,
+    ObjectSet,
     Snapshot,
     add_dataset_event,
     dataset_events,
@@ -27,7 +28,7 @@ from service.errors import ConflictError, InputError, LimitError, NotFoundError
 from service.index.dataset_views import DatasetView, ObjectSetView
 from service.parts import Parts
 from service.pipeline import usable
-from service.records import put_record
+from service.records import put_record, read_record
 
 
 def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[DatasetView, bool]:
@@ -137,8 +138,19 @@ def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
     return taken, new
 
 
-def add_object_set(parts: Parts, name: str, objects: Iterable[str]) -> ObjectSetView:
+def add_object_set(
+    parts: Parts,
+    name: str,
+    objects: Iterable[str],
+    *,
+    owner: str = "",
+    may_follow: Callable[[str], None] = lambda owner: None,
+) -> ObjectSetView:
     """Give objects a name together. The same objects again change nothing; others make a new version.
+
+    Args:
+        owner: id of the API key that asks; a new version keeps the owner of the set.
+        may_follow: called with the owner of the set before it gets a new version; raises where that is refused.
 
     Raises:
         NotFoundError: unknown object.
@@ -155,7 +167,9 @@ def add_object_set(parts: Parts, name: str, objects: Iterable[str]) -> ObjectSet
         if set(present.objects) == set(wanted):
             return present
         after = present.digest
-    found = object_set_of(name, wanted, after=after)
+        owner = read_record(ObjectSet, parts.store, names.object_set(name, after)).owner
+        may_follow(owner)
+    found = object_set_of(name, wanted, after=after, owner=owner)
     put_record(parts.store, names.object_set(name, found.digest), found)
     parts.index.add_object_set(found)
     return parts.index.object_set(name)

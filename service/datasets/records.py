@@ -117,6 +117,8 @@ class ObjectSet(Record):
     digest: Digest
     objects: tuple[Name, ...]
     created: str
+    owner: str = ""
+    """Id of the key that made the set; empty: none, or not known."""
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
@@ -178,7 +180,9 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
     return max(taken, key=lambda one: (one.created, one.digest))
 
 
-def object_set_of(name: str, objects: Iterable[str], *, after: str = "") -> ObjectSet:
+def object_set_of(name: str, objects: Iterable[str], *, after: str = "", owner: str = "") -> ObjectSet:
     """The version of a set that follows the one with digest `after`; the order of the objects does not matter."""
     members = tuple(sorted(set(objects)))
-    return ObjectSet(name=name, digest=digest_json([after, *members]), objects=members, created=timestamp())
+    return ObjectSet(
+        name=name, digest=digest_json([after, *members]), objects=members, created=timestamp(), owner=owner
+    )

@@ -232,3 +232,18 @@ def test_a_dataset_is_deleted_by_its_key_or_an_admin(
     client.post("/v1/datasets/d/cancel", headers=people["ann"])
     Planner(parts).advance()
     assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 201), ("bob", 403), ("eve", 403), ("root", 201)])
+def test_a_set_of_objects_gets_a_new_version_from_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    def put(headers: Headers, *objects: str) -> int:
+        return client.post("/v1/object-sets", json={"name": "s", "objects": objects}, headers=headers).status_code
+
+    assert put(people["ann"], "mug") == 201
+    assert put(people["root"], "mug") == 201
+    assert put(people[who], "mug", "block") == status
+    held = client.get("/v1/object-sets/s", headers=people["eve"]).json()["objects"]
+    assert ("block" in held) is (status == 201)
+    assert put(people["ann"], "block") == 201

@@ -28,6 +28,8 @@ REFERENCE_SAMPLES: Final = 2000
 REFERENCE_SELF_POINTS: Final = 1000
 #: Names that `Simulation.record_iteration` knows.
 OPTIMIZERS: Final = ("adam", "gd")
+#: Kernels of the contact step by their names.
+_SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
 #: Largest dilation a schedule may ask for [m].
 MAX_DILATION: Final = 0.1
 
@@ -127,6 +129,8 @@ class Simulation:
         self, hand: DeviceHand, obj: DeviceObject, points: SurfacePoints, self_points: SurfacePoints,
         *, capacity: int, options: LossOptions,
     ) -> None:  # fmt: skip
+        if options.contact_solver not in _SOLVERS:
+            raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(_SOLVERS)}")
         self.hand, self.obj, self.options, self.capacity = hand, obj, options, capacity
         self.device = hand.device
         self.dofs, self.bodies, self.count = hand.model.dofs, hand.model.bodies, len(points)
@@ -287,10 +291,9 @@ class Simulation:
         ]  # fmt: skip
         if self.states is not None:
             inputs.append(self.states)
-        kernel = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
         if o.simulate:
             self._launch(
-                kernel[o.contact_solver], (self.capacity, o.velocities),
+                _SOLVERS[o.contact_solver], (self.capacity, o.velocities),
                 [*inputs, self.loss, self.end, self.contact_gradient],
             )  # fmt: skip
         else:

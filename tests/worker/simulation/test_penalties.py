@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.errors import InputError
 from service.transforms import apply, invert, quat_from_axis_angle, quat_multiply
 from tests.worker.simulation.rigs import ball, evaluate, rig, still
 from tests.worker.simulation.test_kinematics import root_poses
@@ -130,6 +131,11 @@ PLACES = {
     "on the surface": (0.035, 0.0, 0.0),
     "far away": (3.0, 2.0, 1.0),
 }
+
+
+def test_an_unknown_contact_solver_is_refused_in_a_line() -> None:
+    with pytest.raises(InputError, match="unknown contact solver 'newton'; choose one of direct"):
+        rig(hand_from_path("allegro"), ball(), capacity=1, options=LossOptions(contact_solver="newton"))
 
 
 @pytest.mark.parametrize("place", PLACES)
