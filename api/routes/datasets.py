@@ -177,7 +177,7 @@ def get_snapshot(name: DatasetName, digest: SnapshotDigest, catalog: CatalogOf) 
     responses=responses(400, 401, 403, 404, 413, 422, 503),
 )
 def add_object_set(body: ObjectSetRequest, response: Response, catalog: CatalogOf) -> ObjectSetView:
-    """Give objects a name together. Other objects under the same name are its next version, for its owner or an admin."""
+    """Give objects a name together. Others under the same name are its next version: for its owner, or an admin."""
     key = caller.get()
     found = actions.add_object_set(
         catalog.parts,
