@@ -161,7 +161,6 @@ def test_the_services_of_the_compose_file_do_a_job_together(
 
 @pytest.mark.s3
 def test_a_check_fails_where_nothing_lives(topology: Topology) -> None:
-    time.sleep(0.5)
     for service, command in (("keeper", "keeper"), ("worker-cpu", "worker")):
         done = topology.graspd(service, command, "--check")
         assert done.returncode == 1

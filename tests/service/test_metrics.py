@@ -95,14 +95,14 @@ _BUSY = {
 def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
     rq_queue.enqueue(tasks(2), Lane.BULK)
     rq_queue.connection.sadd(WORKERS, "w1", "gone")
-    rq_queue.connection.set(worker_key("w1"), json.dumps(_BUSY), px=4000)
-    found = rq_queue.now(lease_s=6)
+    rq_queue.connection.set(worker_key("w1"), json.dumps(_BUSY), px=400_000)
+    found = rq_queue.now(lease_s=600)
     place = (Lane.BULK, Stage.SYNTHESIZE)
     assert found.depth[place] == 2
     assert 0 <= found.oldest_s[place] < 60
     assert set(found.workers) == {"w1"}
     assert found.workers["w1"].state == "busy"
-    assert 2.0 <= found.workers["w1"].lease_age_s < 4.0
+    assert 200.0 <= found.workers["w1"].lease_age_s < 400.0
 
 
 def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> None:

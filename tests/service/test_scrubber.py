@@ -12,13 +12,13 @@ from service.index.index import Index
 from service.keeper import Keeper
 from service.manifests import ShardManifest
 from service.parts import Parts
-from service.queue.memory import MemoryQueue
 from service.scrub import FOLDERS, MISSING, NO_MANIFEST
 from service.scrubber import Interrupted, Scrubber, Turn
 from service.settings import Settings
 from service.store import open_store
 from tests.damage import flip, overwrite, remove
 from tests.fakes import make_shard, message_for
+from tests.memory_queue import MemoryQueue
 
 WAIT_S = 30.0
 
