@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from service.queue.memory import MemoryQueue
 
 from service import names
 from service.index.index import Index
