@@ -6,7 +6,6 @@ import threading
 from pathlib import Path
 
 import pytest
-from service.queue.memory import MemoryQueue
 
 from service import names
 from service.index.index import Index
