@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from typing import Final
 
 import numpy as np
+from cachetools import LRUCache
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -40,14 +40,10 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     with _lock:
         if key not in _samples:
             _samples[key] = _sample(hand, count, seed)
-            while len(_samples) > _KEPT:
-                _samples.popitem(last=False)
-        _samples.move_to_end(key)
         return _samples[key]
 
 
-_KEPT: Final = 32
-_samples: OrderedDict[tuple[str, int, int], SurfacePoints] = OrderedDict()
+_samples: LRUCache[tuple[str, int, int], SurfacePoints] = LRUCache(32)
 _lock = threading.Lock()
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from types import ModuleType
 from typing import Final, Generic, TypeVar
 
 import numpy as np
 import warp as wp
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.domain import Fidelity
@@ -40,8 +40,8 @@ class Kept(Generic[T]):
     """What a method makes once of a pair and its options, kept for the pairs used last."""
 
     def __init__(self, make: Callable[..., T], size: int = 4) -> None:
-        self._make, self._size = make, size
-        self._found: OrderedDict[tuple[object, ...], tuple[Pair, T]] = OrderedDict()
+        self._make = make
+        self._found: LRUCache[tuple[object, ...], tuple[Pair, T]] = LRUCache(size)
         self._lock = threading.Lock()
 
     def __call__(self, pair: Pair, *options: object) -> T:
@@ -51,9 +51,6 @@ class Kept(Generic[T]):
             if key not in self._found:
                 # The pair is kept beside it: its id is not given to another one meanwhile.
                 self._found[key] = (pair, self._make(pair, *options))
-            self._found.move_to_end(key)
-            while len(self._found) > self._size:
-                self._found.popitem(last=False)
             return self._found[key][1]
 
 

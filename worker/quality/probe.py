@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.transforms import compose, quat_to_matrix
@@ -201,8 +201,7 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
     return np.concatenate([middle, [1.0, 0, 0, 0]])
 
 
-_KEPT: Final = 8
-_probes: OrderedDict[tuple[str, str, int, int], Probe] = OrderedDict()
+_probes: LRUCache[tuple[str, str, int, int], Probe] = LRUCache(8)
 _lock = threading.Lock()
 
 
@@ -214,7 +213,4 @@ def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_poin
         if probe is None:
             probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points)
             _probes[key] = probe
-        _probes.move_to_end(key)
-        while len(_probes) > _KEPT:
-            _probes.popitem(last=False)
         return probe

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from cachetools import LRUCache
 
 from service.transforms import apply
 from worker.objects.model import Floats, ObjectModel
@@ -22,8 +22,7 @@ from worker.rendering.stage import Stage
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)
 #: Depth at which things wait that a pass does not show [m].
 _AWAY_M: Final = -50.0
-_KEPT_STAGES: Final = 4
-_stages: OrderedDict[tuple[object, ...], Stage] = OrderedDict()
+_stages: LRUCache[tuple[object, ...], Stage] = LRUCache(4)
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,4 @@ def _solids(objects: Sequence[ObjectModel]) -> list[Solid | Box]:
 def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], worlds: int, device: str) -> Stage:
     if key not in _stages:
         _stages[key] = Stage(solids(), worlds, device)
-        while len(_stages) > _KEPT_STAGES:
-            _stages.popitem(last=False)
-    _stages.move_to_end(key)
     return _stages[key]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Final, TypeVar, cast
+from typing import TypeVar, cast
+
+from cachetools import LRUCache
 
 from service import names
 from service.domain import AssetKind, TaskMessage
@@ -18,8 +19,7 @@ from worker.stages.prepared import prepared_object
 
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
-_KEPT: Final = 8
-_cache: OrderedDict[Hashable, object] = OrderedDict()
+_cache: LRUCache[Hashable, object] = LRUCache(8)
 
 
 def hand_of(store: Store, message: TaskMessage) -> HandModel:
@@ -55,7 +55,4 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
 def _cached(key: Hashable, load: Callable[[], T]) -> T:
     if key not in _cache:
         _cache[key] = load()
-        if len(_cache) > _KEPT:
-            _cache.popitem(last=False)
-    _cache.move_to_end(key)
     return cast("T", _cache[key])

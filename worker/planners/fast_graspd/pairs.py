@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Final
+
+from cachetools import LRUCache
 
 from service.domain import Fidelity
 from worker.hands.model import HandModel, SurfacePoints
@@ -50,7 +51,7 @@ class Pair:
         return Simulation(self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options)
 
 
-_pairs: OrderedDict[tuple[str, str, str, str], Pair] = OrderedDict()
+_pairs: LRUCache[tuple[str, str, str, str], Pair] = LRUCache(KEPT)
 _lock = threading.Lock()
 
 
@@ -59,7 +60,6 @@ def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) 
     key = (hand.content, obj.content, fidelity.model_dump_json(), device)
     with _lock:
         if key in _pairs:
-            _pairs.move_to_end(key)
             return _pairs[key]
         kernels.load(device)
         samples = object_samples(obj, fidelity.object_points)
@@ -79,6 +79,4 @@ def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) 
             hand=DeviceHand.create(hand, device),
         )
         _pairs[key] = pair
-        while len(_pairs) > KEPT:
-            _pairs.popitem(last=False)
         return pair
