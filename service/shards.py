@@ -128,6 +128,54 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "share of verdicts that survive 1 mm and 1 degree of noise on the object",
             optional=True,
         ),
+        # Grasps that were planned for a scene say which, and how they are reached and lifted there.
+        "scene/object_pose": Column(
+            "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up", optional=True
+        ),
+        "scene/rest_probability": Column(
+            "S",
+            "f8",
+            "1",
+            "none",
+            "share of drops that come to rest on the same face of the convex hull",
+            optional=True,
+        ),
+        "grasp/scene_index": Column("N", "i4", "1", "none", "row of the grasp's scene in /scene", optional=True),
+        "grasp/approach": Column(
+            "N W 7",
+            "f8",
+            "m, 1",
+            "object",
+            f"way in from the standoff to the pregrasp, in the joints of approach_joint_positions: {_POSE}",
+            optional=True,
+        ),
+        "grasp/approach_joint_positions": Column(
+            "N J", "f8", "rad or m", "joint", "joints of the open hand that comes, order in joint_names", optional=True
+        ),
+        "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
+        "quality/clearance_m": Column(
+            "N",
+            "f8",
+            "m",
+            "scene",
+            "least distance of the hand from supports: coming, closing and lifting",
+            optional=True,
+        ),
+        "quality/lift_outcome": Column(
+            "N",
+            "u1",
+            "enum",
+            "none",
+            "lift test: 0 not tried, 1 lifted, 2 penetration, 3 touched on the way, 4 lost while closing, 5 not lifted,"
+            " 6 turned, 7 diverged",
+            optional=True,
+        ),
+        "quality/lift_hard": Column(
+            "N", "i1", "bool", "none", "lift test at half the friction: 1 lifted, 0 not, -1 not tested", optional=True
+        ),
+        "quality/pushes": Column(
+            "N", "i1", "bool", "none", "six pushes without the scene: 1 held, 0 dropped, -1 not tested", optional=True
+        ),
     },
     "scene": {
         "scene/object_pose": Column("S 7", "f8", "m, 1", "table", "object frame at rest; table top is z = 0"),

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -27,9 +27,12 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
+from worker.quality.referee.lifting import judge_lifts, lift_key
 from worker.quality.referee.protocol import DIRECTIONS
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
+from worker.scenes.verdicts import lift_level, scene_verdicts
+from worker.surroundings import Scenes
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -39,8 +42,9 @@ ROUND_STRIDE: Final = 1 << 20
 SMALLEST_ROUND: Final = 8
 #: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
 _LEAST_RATE: Final = 0.1
-#: Why a grasp is not kept: its hand is no number, the referee dropped it, or it failed the geometric gate.
-REJECTIONS: Final = ("diverged", "dropped", "gate")
+#: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, or it
+#: failed the geometric gate.
+REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate")
 #: Shares of a round's progress: planned, judged, measured.
 _PARTS: Final = (0.6, 0.8, 1.0)
 
@@ -62,6 +66,9 @@ class Certified:
     """Grasps planned in all."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of planning, judging and measuring [s]."""
+    shares: dict[str, float] = field(default_factory=dict)
+    """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
+    lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
 
 
 @dataclass
@@ -72,6 +79,8 @@ class _Round:
     columns: Arrays
     fates: NDArray[np.str_]
     """What became of each grasp that was planned: kept, or one of `REJECTIONS`."""
+    in_scene: dict[str, int] = field(default_factory=dict)
+    """In scenes: how many were clear, lifted, lifted_hard."""
 
 
 def certified_grasps(
@@ -83,6 +92,7 @@ def certified_grasps(
     batch: int = 0,
     threads: int = 0,
     device: str = "cpu",
+    scenes: Scenes | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     progress: Progress = lambda done, total, message: None,
     cancelled: Cancelled = lambda: False,
@@ -98,6 +108,7 @@ def certified_grasps(
         batch: number of the batch within its job.
         threads: 0: all cores.
         device: of the planner.
+        scenes: where the grasps are to be used, in turn; valid then means lifted out of its scene. None: free.
         pieces: gives the object's convex pieces; runs beside the first round's planning.
         progress: called with the share that is done.
         cancelled: polled often.
@@ -107,6 +118,7 @@ def certified_grasps(
         TaskCancelled: when `cancelled()` answers True.
     """
     work = _Work(hand, obj, request, batch, threads, device, progress, cancelled)
+    work.scenes = scenes
     with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
         work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
         rounds = work.until(count)
@@ -167,6 +179,7 @@ class _Work:
         self.hand, self.obj, self.request, self.batch = hand, obj, request, batch
         self.threads, self.device, self.cancelled = threads, device, cancelled
         self.pieces: Future[ConvexPieces] | None = None
+        self.scenes: Scenes | None = None
         self.tried = 0
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
         self._progress = progress
@@ -195,15 +208,31 @@ class _Work:
         # the share of valid ones would look worse than it is.
         places = np.flatnonzero(fates == "kept")
         tried = int(places[count - 1]) + 1 if len(places) > count else len(fates)
-        rejected = {name: int(np.count_nonzero(fates[:tried] == name)) for name in REJECTIONS}
+        reasons = [name for name in REJECTIONS if name != "blocked" or self.scenes is not None]
+        rejected = {name: int(np.count_nonzero(fates[:tried] == name)) for name in reasons}
         kept = np.arange(min(count, len(grasps)))
         grasps = grasps.take(kept)
         columns = {path: array if path == _THRESHOLDS else array[kept] for path, array in columns.items()}
+        found = Certified(grasps, columns, tried, rejected, None, len(fates), self.seconds, self._shares(rounds))
         if self.pieces is None:
-            return Certified(grasps, columns, tried, rejected, None, len(fates), self.seconds)
+            return found
         columns |= self._second_opinions(grasps, columns["quality/valid"])
-        key = verdict_key(self.hand, self.obj, self._level, False, pieces=self.pieces.result())
-        return Certified(grasps, columns, tried, rejected, key, len(fates), self.seconds)
+        return replace(found, columns=columns, verdict_key=self._key(self.pieces.result()))
+
+    def _key(self, pieces: ConvexPieces) -> str:
+        if self.scenes is None:
+            return verdict_key(self.hand, self.obj, self._level, False, pieces=pieces)
+        placed = self.scenes.placed(np.zeros(0, int))
+        return lift_key(self.hand, self.obj, placed, lift_level(self.request.referee), False, pieces=pieces)
+
+    def _shares(self, rounds: list[_Round]) -> dict[str, float]:
+        if self.scenes is None:
+            return {}
+        planned = max(1, sum(len(part.fates) for part in rounds))
+        return {
+            f"{name}_share": sum(part.in_scene.get(name, 0) for part in rounds) / planned
+            for name in ("clear", "lift", "lift_hard")
+        }
 
     @property
     def _level(self) -> Any:
@@ -211,11 +240,14 @@ class _Work:
 
     def _round(self, number: int, size: int) -> _Round:
         request = self.request
+        index = None if self.scenes is None else (self.tried + np.arange(size)) % len(self.scenes.object_pose)
+        placed = self.scenes.placed(index) if self.scenes is not None and index is not None else None
         planned = synthesize(
             self.hand, self.obj, count=size, method=request.method, fidelity=request.knobs, seed=request.seed,
             batch=self.batch + number * ROUND_STRIDE, options=request.options, threads=self.threads, device=self.device,
-            progress=self._part(0), cancelled=self.cancelled,
+            progress=self._part(0), cancelled=self.cancelled, placed=placed,
         )  # fmt: skip
+        planned = replace(planned, scene=index)
         self.tried += size
         self.seconds["planner"] += planned.seconds
         return self.score(planned)
@@ -226,7 +258,11 @@ class _Work:
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "raw"
-        columns = self._judged(planned)
+        if self.scenes is None:
+            columns, in_scene = self._judged(planned), dict[str, int]()
+        else:
+            planned, columns, in_scene = self._judged_in_scenes(planned, self.scenes)
+            fates[finite[columns["quality/success"] < 0]] = "blocked"
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
         columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps)
@@ -236,11 +272,24 @@ class _Work:
         columns["quality/valid"] = (sound & held).astype(np.uint8)
         if not every:
             wanted = sound if self.pieces is None else sound & held
-            fates[np.delete(finite, rows)] = "dropped"
+            lost = np.delete(finite, rows)
+            fates[lost[fates[lost] == "kept"]] = "dropped"
             fates[finite[rows[~wanted]]] = "gate"
             grasps = grasps.take(np.flatnonzero(wanted))
             columns = {path: array if path == _THRESHOLDS else array[wanted] for path, array in columns.items()}
-        return _Round(grasps, columns, fates)
+        return _Round(grasps, columns, fates, in_scene)
+
+    def _judged_in_scenes(self, grasps: GraspSet, scenes: Scenes) -> tuple[GraspSet, Arrays, dict[str, int]]:
+        """The grasps with their ways, their verdicts, and how many were clear and lifted."""
+        assert grasps.scene is not None
+        pieces = None if self.pieces is None else self.pieces.result()
+        began = time.perf_counter()
+        grasps, columns, counts = scene_verdicts(
+            self.hand, self.obj, grasps, scenes, level=lift_level(self.request.referee), pieces=pieces,
+            threads=self.threads, progress=self._part(1), cancelled=self.cancelled,
+        )  # fmt: skip
+        self.seconds["referee"] += time.perf_counter() - began
+        return grasps, columns, counts
 
     def _judged(self, grasps: GraspSet) -> Arrays:
         if self.pieces is None:
@@ -278,7 +327,7 @@ class _Work:
         audited = np.flatnonzero(valid)[: self.request.audits_of(self.batch)]
         audit = np.full(len(grasps), -1, np.int8)
         if len(audited):
-            audit[audited] = judge(self.hand, self.obj, grasps.take(audited), level="letter", **common).success
+            audit[audited] = self._audited(grasps.take(audited), common)
         if self.request.audits_of(self.batch):
             columns["quality/audit"] = audit
         if repeats := self.request.robustness:
@@ -287,6 +336,13 @@ class _Work:
             )
         self.seconds["referee"] += time.perf_counter() - began
         return columns
+
+    def _audited(self, grasps: GraspSet, common: dict[str, Any]) -> NDArray[np.int8]:
+        if self.scenes is None:
+            return judge(self.hand, self.obj, grasps, level="letter", **common).success
+        assert grasps.scene is not None
+        placed = self.scenes.placed(grasps.scene)
+        return judge_lifts(self.hand, self.obj, grasps, placed, level="letter", **common).success
 
     def _part(self, number: int) -> Progress:
         """Progress of one part of the present round within the whole batch."""

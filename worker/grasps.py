@@ -40,6 +40,14 @@ class GraspSet:
     seconds: float = 0.0
     info: dict[str, object] = field(default_factory=dict)
     """What the planner wants kept: loss curves, iteration counts. JSON values only."""
+    approach: Floats | None = None
+    """(N, W, 7) hand poses from the standoff to the pregrasp, in the joint positions `coming`; only in scenes."""
+    coming: Floats | None = None
+    """(N, J) joint positions of the open hand that comes; only in scenes."""
+    scene: NDArray[np.intp] | None = None
+    """(N,) the scene of each grasp; only in scenes."""
+    lift: Posture | None = None
+    """N squeeze postures raised against gravity; only in scenes."""
 
     def __len__(self) -> int:
         return len(self.grasp)
@@ -48,7 +56,11 @@ class GraspSet:
         """Some of the grasps, in the order of `rows`; what the planner said of the whole set stays."""
         loss = np.asarray(self.stability_loss, float)[rows]
         grasp, pregrasp, squeeze = (part.take(rows) for part in (self.grasp, self.pregrasp, self.squeeze))
-        return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info)
+        approach = None if self.approach is None else np.asarray(self.approach, float)[rows]
+        lift = None if self.lift is None else self.lift.take(rows)
+        scene = None if self.scene is None else self.scene[rows]
+        coming = None if self.coming is None else np.asarray(self.coming, float)[rows]
+        return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift)
 
 
 def joined(sets: Sequence[GraspSet]) -> GraspSet:
@@ -57,7 +69,16 @@ def joined(sets: Sequence[GraspSet]) -> GraspSet:
         _joined([getattr(part, name) for part in sets]) for name in ("grasp", "pregrasp", "squeeze")
     )
     loss = np.concatenate([np.asarray(part.stability_loss, float) for part in sets])
-    return GraspSet(grasp, pregrasp, squeeze, loss, sum(part.seconds for part in sets), dict(sets[0].info))
+    ways = [part.approach for part in sets if part.approach is not None]
+    lifts = [part.lift for part in sets if part.lift is not None]
+    approach = np.concatenate(ways) if len(ways) == len(sets) else None
+    lift = _joined(lifts) if len(lifts) == len(sets) else None
+    seconds = sum(part.seconds for part in sets)
+    numbers = [part.scene for part in sets if part.scene is not None]
+    scene = np.concatenate(numbers) if len(numbers) == len(sets) else None
+    opens = [part.coming for part in sets if part.coming is not None]
+    coming = np.concatenate(opens) if len(opens) == len(sets) else None
+    return GraspSet(grasp, pregrasp, squeeze, loss, seconds, dict(sets[0].info), approach, coming, scene, lift)
 
 
 def _joined(parts: Sequence[Posture]) -> Posture:

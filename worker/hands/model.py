@@ -130,6 +130,11 @@ class HandModel:
         return len(self.parent)
 
     @property
+    def span(self) -> Floats:
+        """(D,) range of each dof [rad or m]."""
+        return self.upper - self.lower
+
+    @property
     def dofs(self) -> int:
         return len(self.dof_names)
 

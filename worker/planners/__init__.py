@@ -10,7 +10,8 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
-from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner
+from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner, scene_planner
+from worker.surroundings import Placed
 
 __all__ = [
     "GROUP",
@@ -23,6 +24,7 @@ __all__ = [
     "method",
     "method_names",
     "planner",
+    "scene_planner",
     "synthesize",
 ]
 
@@ -41,17 +43,13 @@ def synthesize(
     device: str = "cpu",
     progress: Progress = lambda done, total, message: None,
     cancelled: Cancelled = lambda: False,
+    placed: Placed | None = None,
 ) -> GraspSet:
-    """Grasps by the named method with its own `options`; see `Planner`."""
-    return planner(method, options)(
-        hand,
-        obj,
-        count=count,
-        fidelity=fidelity,
-        seed=seed,
-        batch=batch,
-        threads=threads,
-        device=device,
-        progress=progress,
-        cancelled=cancelled,
-    )
+    """Grasps by the named method with its own `options`, each in its scene where they are `placed`; see `Planner`."""
+    common: dict[str, Any] = {
+        "count": count, "fidelity": fidelity, "seed": seed, "batch": batch, "threads": threads, "device": device,
+        "progress": progress, "cancelled": cancelled,
+    }  # fmt: skip
+    if placed is None:
+        return planner(method, options)(hand, obj, **common)
+    return scene_planner(method, options)(hand, obj, **common, placed=placed)

@@ -18,6 +18,7 @@ from service.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOpt
 from service.cli import JsonFlag, emit, reporting_errors
 from service.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
 from service.errors import InputError
+from service.scene_spec import parse_scene
 from service.shards import Attribute, json_attribute, write_shard
 from worker.certified import Certified, certified_grasps, joined_columns
 from worker.devices import Device
@@ -26,11 +27,13 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.origin import remembered
-from worker.planners import PLANNERS, planner
+from worker.planners import PLANNERS, planner, scene_planner
 from worker.planners import Progress as Report
 from worker.planners.registry import parsed_options
 from worker.quality.referee.key import Level
+from worker.scenes.kinds import rest_poses, supports_of
 from worker.stages.synthesize import postures, verdict_attributes
+from worker.surroundings import Scenes
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -67,9 +70,17 @@ def synth(
     allow_open: AllowOpenOption = False,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core", min=0)] = 0,
+    scene: Annotated[
+        str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
+    ] = "free",
+    scenes: Annotated[int, typer.Option(help="Scenes that the grasps are shared out to.", min=1, max=4096)] = 4,
+    faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
     json: JsonFlag = False,
 ) -> None:
-    """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file."""
+    """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file.
+
+    In a scene a grasp is valid if it comes, closes and lifts without touching anything else and holds what it lifts.
+    """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     request = _request(want, budget, referee).model_copy(
@@ -82,21 +93,32 @@ def synth(
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
     model = hand_from_path(hand)
     obj = object_from_path(object_, face_error_m=request.knobs.face_error_m, options=mesh)
+    place = parse_scene(scene, faces=faces)
+    if place.kind != "free":
+        scene_planner(method, request.options)
     device = Device(device).resolve()
     began = time.perf_counter()
+    poses = rest_poses(place, obj, count=scenes, seed=seed) if place.kind != "free" else {}
+    where = Scenes(supports_of(place), poses["scene/object_pose"]) if poses else None
     with _bar(grasps, quiet=json) as report:
         batches = [
             certified_grasps(
                 model, obj, request, count=min(BATCH_SIZE, grasps - first), batch=first // BATCH_SIZE,
-                threads=threads, device=device, progress=report(first, min(BATCH_SIZE, grasps - first)),
+                threads=threads, device=device, scenes=where,
+                progress=report(first, min(BATCH_SIZE, grasps - first)),
             )
             for first in range(0, grasps, BATCH_SIZE)
         ]  # fmt: skip
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**postures(batch.grasps), **batch.columns} for batch in batches])
+    arrays |= {name: poses[name] for name in ("scene/object_pose", "scene/rest_probability") if name in poses}
     attributes = _attributes(model, obj, request, batches, device, seconds)
+    if poses:
+        attributes["scene"] = json_attribute(place.model_dump(mode="json"))
     out.write_bytes(write_shard("base", arrays, attributes | remembered(hand, object_, mesh)))
     found = summary(arrays, request, batches, out, seconds)
+    if poses:
+        found |= {"scene": place.kind, "scenes": len(poses["scene/object_pose"])} | _shares(batches)
     if json:
         emit(found)
     else:
@@ -194,6 +216,15 @@ def summary(arrays: Arrays, request: JobOptions, batches: list[Certified], out: 
     }
 
 
+def _shares(batches: list[Certified]) -> dict[str, float]:
+    """Of all grasps that were planned: clear, lifted, lifted at half the friction."""
+    planned = sum(batch.planned for batch in batches)
+    return {
+        name: round(sum(batch.shares[name] * batch.planned for batch in batches) / max(1, planned), 4)
+        for name in batches[0].shares
+    }
+
+
 def _said(found: dict[str, Any]) -> str:
     """The summary as a line; the second one tells what is missing."""
     judged, mean = found["referee"] != "none", found["mean"]
@@ -207,6 +238,11 @@ def _said(found: dict[str, Any]) -> str:
         lines[0] += (
             f"; mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "
             f"penetration {mean['penetration_depth_mm']:.2f} mm"
+        )
+    if "scene" in found:
+        lines.append(
+            f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "
+            f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
         )
     if found["want"] == "valid" and found["grasps"] < found["wanted"]:
         lines.append(f"{found['wanted']} {word} ones were wanted: the budget of tries ended first; see --budget")

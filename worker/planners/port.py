@@ -12,6 +12,7 @@ from service.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.surroundings import Placed
 
 Progress = Callable[[float, float, str], None]
 Cancelled = Callable[[], bool]
@@ -44,6 +45,26 @@ class Planner(Protocol):
     ) -> GraspSet: ...
 
 
+class ScenePlanner(Protocol):
+    """A planner that makes grasps for the scenes they are in: grasp i in scene `placed.index[i]`."""
+
+    def __call__(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        *,
+        count: int,
+        fidelity: Fidelity,
+        seed: int,
+        batch: int,
+        threads: int,
+        device: str,
+        progress: Progress,
+        cancelled: Cancelled,
+        placed: Placed | None,
+    ) -> GraspSet: ...
+
+
 class Options(BaseModel):
     """Base of a method's own options: those that the fidelity, which all methods share, does not have."""
 
@@ -60,6 +81,8 @@ class Method:
     """Where the method is published."""
     planner: Callable[[Any], Planner]
     """From the options to the planner."""
+    scene_planner: Callable[[Any], ScenePlanner] | None = None
+    """The same for grasps in scenes; None: the method plans around floating objects only."""
     options: type[Options] = Options
     """The options it takes."""
     uses: tuple[str, ...] = ()

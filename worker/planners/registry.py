@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from service.cli import validation_line
 from service.errors import InputError
-from worker.planners.port import Method, Planner
+from worker.planners.port import Method, Options, Planner, ScenePlanner
 
 #: Entry-point group of planners of other packages.
 GROUP: Final = "graspd.planners"
@@ -59,13 +59,29 @@ def planner(name: str, options: Mapping[str, Any] | None = None) -> Planner:
     Raises:
         InputError: unknown method, unknown option, or a value out of its range.
     """
+    return method(name).planner(_options(name, options))
+
+
+def scene_planner(name: str, options: Mapping[str, Any] | None = None) -> ScenePlanner:
+    """The same for grasps in scenes.
+
+    Raises:
+        InputError: as `planner`, or the method plans around floating objects only.
+    """
+    known = method(name)
+    if known.scene_planner is None:
+        able = ", ".join(one for one in method_names() if method(one).scene_planner is not None)
+        raise InputError(f"method {name} plans around floating objects only; in scenes choose {able}, or scene free")
+    return known.scene_planner(_options(name, options))
+
+
+def _options(name: str, options: Mapping[str, Any] | None) -> Options:
     known = method(name)
     try:
-        chosen = known.options(**(options or {}))
+        return known.options(**(options or {}))
     except ValidationError as error:
         there_are = ", ".join(known.options.model_fields) or "none"
         raise InputError(f"option of {name}: {validation_line(error)}; its options: {there_are}") from None
-    return known.planner(chosen)
 
 
 def parsed_options(pairs: list[str]) -> dict[str, str]:

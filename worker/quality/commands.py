@@ -16,6 +16,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 from service.errors import InputError
 from worker.quality.evaluate import Protocol, combine, evaluate
 from worker.quality.referee.key import Level
+from worker.quality.referee.lifting import LiftLevel
 from worker.quality.sources import expand, load_case
 
 app = typer.Typer(add_completion=False)
@@ -35,9 +36,15 @@ def evaluate_command(
         typer.Argument(help="Base shards, reference-grasp JSON files, folders of either, DexGraspBench folders."),
     ],
     protocol: Annotated[
-        str, typer.Option(help="dexgraspbench, or displacement: no pushes, only the slip in 0.15 s.")
+        str,
+        typer.Option(
+            help="dexgraspbench: six pushes; lift: out of the scene the grasps were planned in; displacement: only the "
+            "slip in 0.15 s."
+        ),
     ] = "dexgraspbench",
-    level: Annotated[str, typer.Option(help="letter, certificate or screen: what a verdict costs.")] = "certificate",
+    level: Annotated[
+        str, typer.Option(help="What a verdict costs: letter, certificate or screen; of a lift: letter or lift.")
+    ] = "",
     hard: Annotated[bool, typer.Option("--hard", help="Half the friction, a tenth of the torsional.")] = False,
     hand: Annotated[
         str | None, typer.Option(help="The hand's file; default: what the file says, found by its digest.")
@@ -53,9 +60,11 @@ def evaluate_command(
 ) -> None:
     """Measure grasps and let an independent engine judge them. Numbers are medians, ε and areas at 5 mm."""
     if protocol not in get_args(Protocol):
-        raise InputError(f"unknown protocol {protocol!r}; choose {' or '.join(get_args(Protocol))}")
-    if level not in get_args(Level):
-        raise InputError(f"unknown level {level!r}; choose one of {', '.join(get_args(Level))}")
+        raise InputError(f"unknown protocol {protocol!r}; choose {', '.join(get_args(Protocol))}")
+    levels = get_args(LiftLevel if protocol == "lift" else Level)
+    level = level or ("lift" if protocol == "lift" else "certificate")
+    if level not in levels:
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
     rows: list[dict[str, Any]] = []
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
                TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip

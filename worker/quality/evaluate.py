@@ -6,24 +6,28 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import MeshError
+from service.errors import InputError, MeshError
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import Verdicts, judge
 from worker.quality.referee.key import Level
+from worker.quality.referee.lift import LiftOutcome
+from worker.quality.referee.lifting import LiftLevel, judge_lifts
 from worker.quality.referee.protocol import Outcome
 from worker.quality.sources import Case
 from worker.quality.table import DEFAULT_FRICTION, measure
+from worker.scenes.way import plan_way
+from worker.surroundings import Placed
 
-Protocol = Literal["dexgraspbench", "displacement"]
+Protocol = Literal["dexgraspbench", "displacement", "lift"]
 Progress = Callable[[float, float, str], None]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
@@ -34,7 +38,7 @@ def evaluate(
     case: Case,
     *,
     protocol: Protocol = "dexgraspbench",
-    level: Level = "certificate",
+    level: Level | LiftLevel = "certificate",
     hard: bool = False,
     friction: float | None = None,
     threads: int = 0,
@@ -46,8 +50,14 @@ def evaluate(
     Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
     making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
-    the first principal component. verdicts, where somebody judged: see `told`.
+    the first principal component. verdicts, where somebody judged: see `told`. With protocol lift also clear_share
+    (free of what stands in the scene, coming, closing and lifting).
+
+    Raises:
+        InputError: protocol lift on grasps that were planned around a free object, or a level that it does not have.
     """
+    if protocol == "lift" and case.placed is None:
+        raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(
         case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], threads=threads, progress=progress
@@ -62,10 +72,12 @@ def evaluate(
     else:
         if protocol == "dexgraspbench":
             verdicts = judge(
-                case.hand, case.obj, case.grasps, level=level, hard=hard, threads=threads, pieces=pieces,
+                case.hand, case.obj, case.grasps, level=cast(Level, level), hard=hard, threads=threads, pieces=pieces,
                 progress=progress,
             )  # fmt: skip
             row |= _success(case, verdicts, verdicts.seconds)
+        if protocol == "lift" and case.placed is not None:
+            row |= _lifted(case, case.placed, level, hard, threads, pieces, progress)
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, threads=threads)
         row |= pieces.facts
     return row | _medians(case, table, sd)
@@ -94,6 +106,35 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
         row["published"] = int(known.sum())
         row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
     return row
+
+
+def _lifted(
+    case: Case, placed: Placed, level: str, hard: bool, threads: int, pieces: ConvexPieces, progress: Progress
+) -> dict[str, Any]:
+    chosen: Any = "lift" if level == "certificate" else level
+    verdicts = judge_lifts(
+        case.hand, case.obj, case.grasps, placed, level=chosen, hard=hard, threads=threads, pieces=pieces,
+        progress=progress,
+    )  # fmt: skip
+    clear = plan_way(case.hand, case.obj, case.grasps, placed).clear
+    held = int(verdicts.success.sum())
+    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, clear, strict=True)
+    return {
+        "level": verdicts.level,
+        "gsr": _plain(held / max(1, len(case.grasps))),
+        "osr": float(held > 0),
+        "clear_share": _plain(float(clear.mean())) if len(clear) else None,
+        "referee_seconds": _plain(verdicts.seconds),
+        "reasons": dict(Counter(verdicts.reasons).most_common()),
+        "verdict_key": verdicts.terms,
+        "verdicts": [
+            {
+                "row": row, "held": bool(one), "outcomes": [LiftOutcome(int(what)).name.lower()],
+                "margin": _plain(margin) if math.isfinite(margin) else None, "reason": reason, "clear": bool(free),
+            }
+            for row, (one, what, margin, reason, free) in enumerate(rows)
+        ],
+    }  # fmt: skip
 
 
 def told(verdicts: Verdicts) -> list[dict[str, Any]]:
@@ -155,6 +196,8 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
     judged = [row for row in rows if row["gsr"] is not None]
     out["gsr"] = _rate(judged, "gsr", "n")
+    if any("clear_share" in row for row in rows):
+        out["clear_share"] = _rate([row for row in rows if row.get("clear_share") is not None], "clear_share", "n")
     out["osr"] = _plain(float(np.mean([row["osr"] for row in judged]))) if judged else None
     out["agreement_published"] = _rate(judged, "agreement_published", "published")
     for key in ("sgs", "sgs_without_referee"):

@@ -19,6 +19,8 @@ from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, hold
+from worker.simulation.obstacles import HandFeatures, feature_distances
+from worker.surroundings import Placed
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
 #: comes back faster and kicks the object away more often.
@@ -39,6 +41,11 @@ OPENING_STEPS: Final = 24
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
+#: Distance that opening fingers keep from obstacles [m].
+ROOM_M: Final = 0.0025
+#: Share of its range by which a joint opens beyond the pregrasp for the way in: fingers that reach around the object
+#: would sweep it away.
+WIDE: Final = 0.4
 RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
 #: Hand points within this of the object press on it [m].
@@ -53,16 +60,32 @@ _POINTS: Final = 600
 _CHUNK: Final = 32
 
 
-def pregrasp(hand: HandModel, obj: ObjectModel, grasp: Posture) -> Posture:
+def pregrasp(hand: HandModel, obj: ObjectModel, grasp: Posture, placed: Placed | None = None) -> Posture:
     """N postures from which the hand closes.
 
     Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away, or as far as it
-    can get without running into other fingers; then the root moves back along the palm's approach if the hand is still
-    in touch.
+    can get without running into other fingers or, where the grasps are `placed`, an obstacle of their scene; then the
+    root moves back along the palm's approach if the hand is still in touch.
     """
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
-    parts = [_pregrasp(probe, _rows(grasp, i)) for i in range(0, len(grasp), _CHUNK)]
+    starts = range(0, len(grasp), _CHUNK)
+    scenes = [placed.take(slice(i, i + _CHUNK)) if placed is not None else None for i in starts]
+    parts = [_pregrasp(probe, _rows(grasp, i), scene) for i, scene in zip(starts, scenes, strict=True)]
     return _join(hand, parts)
+
+
+def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed) -> Floats:
+    """(N, J) joint positions in which a hand comes to its pregrasp: fingers plainly opened as far as `WIDE` of their
+    range, or until they would run into one another or into an obstacle."""
+    probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
+    parts = []
+    for start in range(0, len(pregrasp), _CHUNK):
+        rows, scene = _rows(pregrasp, start), placed.take(slice(start, start + _CHUNK))
+        q = hand.reduce(rows.joint_positions)
+        far = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, q))
+        wide = np.where(_finger_of_dof(hand) >= 0, q + np.clip(far - q, -WIDE * hand.span, WIDE * hand.span), q)
+        parts.append(hand.expand(_without_jams(probe, rows.hand_pose, q, wide, scene)))
+    return np.concatenate([np.zeros((0, len(hand.joint_names))), *parts])
 
 
 def squeeze(
@@ -111,7 +134,7 @@ def _pressing(probe: Probe, found: Distances, b: int) -> Contacts:
     return Contacts(probe.points.body[chosen], place[chosen], -normal[chosen])
 
 
-def _pregrasp(probe: Probe, grasp: Posture) -> Posture:
+def _pregrasp(probe: Probe, grasp: Posture, placed: Placed | None) -> Posture:
     hand = probe.hand
     q = hand.reduce(grasp.joint_positions)
     finger = _finger_of_dof(hand)
@@ -129,7 +152,7 @@ def _pregrasp(probe: Probe, grasp: Posture) -> Posture:
     opened = q.copy()
     for d in np.flatnonzero(finger >= 0):
         opened[:, d] = paths[np.arange(len(q)), chosen[:, finger[d]], d]
-    return _retreat(probe, grasp.hand_pose, _without_jams(probe, grasp.hand_pose, q, opened))
+    return _retreat(probe, grasp.hand_pose, _without_jams(probe, grasp.hand_pose, q, opened, placed))
 
 
 def _finger_of_dof(hand: HandModel) -> NDArray[np.int32]:
@@ -192,19 +215,24 @@ def _first_clear(clearance: Floats, wanted: float) -> NDArray[np.intp]:
     return np.where(enough.any(axis=1), enough.argmax(axis=1), clearance.argmax(axis=1))
 
 
-def _without_jams(probe: Probe, hand_pose: Floats, q: Floats, opened: Floats) -> Floats:
-    """(B, D) the postures `opened`, fingers held back towards the grasp q where they would run into one another.
+def _without_jams(probe: Probe, hand_pose: Floats, q: Floats, opened: Floats, placed: Placed | None = None) -> Floats:
+    """(B, D) the postures `opened`, fingers held back towards the grasp q where they would run into one another or
+    into an obstacle.
 
     Fingers that jam never reach the grasp when they close again.
     """
     finger = _finger_of_dof(probe.hand)
     limit = _finger_depth(probe, hand_pose, q[:, None]) + JAM_M
+    # A finger may stand nearer to an obstacle in the grasp than it should: opening must not bring it nearer still.
+    room = None if placed is None else np.minimum(_finger_room(probe.hand, hand_pose, q[:, None], placed), ROOM_M)
     share = np.ones_like(limit)
     rows = np.arange(len(q))
     for look in range(JAM_LOOKS):
         move = (opened - q)[rows] * np.where(finger >= 0, share[rows][:, finger], 1.0)
         way = q[rows, None] + np.array(WAY)[None, :, None] * move[:, None]
         jammed = _finger_depth(probe, hand_pose[rows], way) > limit[rows]
+        if placed is not None and room is not None:
+            jammed |= _finger_room(probe.hand, hand_pose[rows], way, placed.take(rows)) < room[rows] - 1e-6
         if not jammed.any():
             break
         share[rows] *= np.where(jammed, 0.5 if look < JAM_LOOKS - 1 else 0.0, 1.0)
@@ -224,6 +252,23 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
         mine = finger == f
         if mine.any():
             out[:, f] = depth[:, mine].max(axis=1)
+    return out
+
+
+def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
+    """(B, fingers) least distance of each finger from the obstacles of its scene on paths (B, K, D); inf: no finger."""
+    count, steps, _ = paths.shape
+    finger = finger_of_body(hand)[HandFeatures.of(hand).body]
+    out = np.full((count, max(1, len(hand.fingertips))), np.inf)
+    for number, scene in enumerate(placed.scenes):
+        rows = np.flatnonzero(placed.index == number)
+        if not len(rows):
+            continue
+        joints = hand.expand(paths[rows]).reshape(len(rows) * steps, -1)
+        found = feature_distances(hand, Posture(np.repeat(hand_pose[rows], steps, axis=0), joints), scene)
+        found = found.reshape(len(rows), steps, -1).min(axis=1)
+        for f in np.unique(finger[finger >= 0]):
+            out[rows, f] = found[:, finger == f].min(axis=1)
     return out
 
 

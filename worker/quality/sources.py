@@ -14,7 +14,8 @@ from worker.exchange import dexgraspbench, reference
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.scenes.sources import hand_of_shard, object_of_shard
+from worker.scenes.sources import hand_of_shard, object_of_shard, placed_of_shard
+from worker.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +36,8 @@ class Case:
     """Whether those seconds hold the referee's work on them already."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
+    placed: Placed | None = None
+    """The scenes that the grasps were planned in, if any."""
 
 
 def expand(path: Path) -> list[Path]:
@@ -81,13 +84,20 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     }
     _check_joints(path, model, parts["grasp"])
     loss = np.asarray(shard["quality/stability_loss"], float)
-    grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], loss)
+    placed = placed_of_shard(shard)
+    grasps = GraspSet(
+        parts["grasp"], parts["pregrasp"], parts["squeeze"], loss,
+        approach=np.asarray(shard["grasp/approach"], float) if placed is not None else None,
+        coming=np.asarray(shard["grasp/approach_joint_positions"], float) if placed is not None else None,
+        scene=placed.index if placed is not None else None,
+    )  # fmt: skip
     said = shard.attributes
     return Case(
         path.name, model, thing, grasps,
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
         judged=said.get("verdict_level", "none") != "none",
+        placed=placed,
     )  # fmt: skip
 
 

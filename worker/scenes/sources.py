@@ -11,14 +11,17 @@ from typing import Final
 import numpy as np
 
 from service.domain import AssetKind
-from service.errors import ConflictError
+from service.errors import ConflictError, InputError
+from service.scene_spec import SceneSpec
 from service.shards import Shard
 from worker.hands.load import hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object, object_from_path
 from worker.origin import Found, Wanted, at, find, options_of
+from worker.scenes.kinds import supports_of
 from worker.scenes.neighbours import Neighbours
+from worker.surroundings import Placed, Scenes
 
 #: Neighbours are looked at and kept clear of, not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
@@ -104,6 +107,22 @@ def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel
     folder = None if shard.path is None else shard.path.resolve().parent
     wanted = Wanted(AssetKind.OBJECT, name, digest, source, folder=folder)
     return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
+
+
+def placed_of_shard(shard: Shard) -> Placed | None:
+    """The scenes that the grasps of a base shard were planned in; None: they were planned around a free object.
+
+    Raises:
+        InputError: what the shard says of its scene is no scene.
+    """
+    if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
+        return None
+    try:
+        spec = SceneSpec(**json.loads(str(shard.attributes.get("scene", ""))))
+    except (ValueError, TypeError):
+        raise InputError("the shard has grasps in scenes, but its attribute scene does not say which") from None
+    poses = np.asarray(shard["scene/object_pose"], float)
+    return Scenes(supports_of(spec), poses).placed(np.asarray(shard["grasp/scene_index"], np.intp))
 
 
 def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:

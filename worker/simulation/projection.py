@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.transforms import quat_from_axis_angle, quat_multiply
+from worker.simulation.kernels import obstacles
 from worker.simulation.kernels import projection as kernels
 from worker.simulation.simulation import HandState, Simulation, still_schedule
 
@@ -35,6 +36,10 @@ class ProjectionOptions:
     """Object samples nearer to a link than this are moved to `target`."""
     self_near: float = 2e-4
     self_target: float = 5e-4
+    obstacle_near: float = 2e-4
+    """Hand features nearer to an obstacle than their margin and this are moved ..."""
+    obstacle_target: float = 5e-4
+    """... to their margin and this."""
     damping: float = 1e-3
     """Times the number of residuals."""
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
@@ -82,7 +87,7 @@ class Projection:
         for step in range(iterations + 1):
             sim.set_state(current)
             sim.run()
-            now = np.max([a.numpy()[:n] for a in (sim.point_depth, sim.object_depth, sim.self_depth)], axis=0)
+            now = sim.depths(n)
             better = now < depth - 1e-5
             best = _where(better, current, best)
             depth = np.where(better, now, depth)
@@ -129,6 +134,13 @@ class Projection:
             [sim.active, o.self_near, o.self_target, sim.hand.pieces, sim.body_points, sim.body_p, sim.body_q, r],
             device=sim.device,
         )  # fmt: skip
+        if sim.obstacles is not None:
+            wp.launch(
+                obstacles.residuals, (B, sim.obstacles.count),
+                [sim.obstacles.features, sim.obstacles.solids, sim.active, sim.scene, o.obstacle_near,
+                 o.obstacle_target, sim.body_p, sim.body_q, r],
+                device=sim.device,
+            )  # fmt: skip
         wp.launch(
             kernels.normal_equations, B,
             [sim.hand.tree, sim.active, sim.pivot, sim.body_p, sim.axis, r, self.row, self.matrix, self.vector],

@@ -17,6 +17,8 @@ from service.errors import InputError
 from worker.hands.model import SurfacePoints
 from worker.simulation.device import DeviceHand, DeviceObject, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact, kinematics, optimizers, penalties, pieces, surface
+from worker.simulation.kernels import obstacles as obstacle_kernels
+from worker.simulation.obstacles import DeviceObstacles
 
 Floats = NDArray[np.float64]
 
@@ -127,13 +129,17 @@ class Simulation:
 
     def __init__(
         self, hand: DeviceHand, obj: DeviceObject, points: SurfacePoints, self_points: SurfacePoints,
-        *, capacity: int, options: LossOptions,
+        *, capacity: int, options: LossOptions, obstacles: DeviceObstacles | None = None,
     ) -> None:  # fmt: skip
         if options.contact_solver not in _SOLVERS:
             raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(_SOLVERS)}")
         self.hand, self.obj, self.options, self.capacity = hand, obj, options, capacity
         self.device = hand.device
         self.dofs, self.bodies, self.count = hand.model.dofs, hand.model.bodies, len(points)
+        self.obstacles = obstacles
+        """What the hands must stay clear of; None: nothing."""
+        self.room = 0.0
+        """Distance to keep besides each feature's margin [m]."""
         self._graph: Any = None
         self._commands: list[tuple[str, Any]] = []
         with wp.ScopedDevice(self.device):
@@ -180,6 +186,8 @@ class Simulation:
         self.point_depth = wp.zeros(B, dtype=wp.float32)
         self.object_depth = wp.zeros(B, dtype=wp.float32)
         self.self_depth = wp.zeros(B, dtype=wp.float32)
+        self.obstacle_depth = wp.zeros(B, dtype=wp.float32)
+        self.scene = wp.full(B, -1, dtype=wp.int32)
         motions = initial_motions(M, self.options.step, self.obj.model.gyration_radius)
         self.motions = wp.array(motions, dtype=contact.vec6)
         self.states = None
@@ -227,6 +235,18 @@ class Simulation:
         self.second.zero_()
         self.best.fill_(1e9)
         self.waited.zero_()
+
+    def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
+        """The scene (n,) of each hand, among those of `obstacles`; -1: none. It stays when states change."""
+        padded = np.full(self.capacity, -1, dtype=np.int32)
+        padded[: len(index)] = index
+        self.scene.assign(padded)
+
+    def depths(self, n: int) -> Floats:
+        """(n,) deepest penetration of each hand at the last evaluation [m]: into the object, of the object into links,
+        of links into links, and what it lacks of its distance from obstacles."""
+        parts = (self.point_depth, self.object_depth, self.self_depth, self.obstacle_depth)
+        return np.max([part.numpy()[:n] for part in parts], axis=0)
 
     def _assign(self, array: Any, values: Floats) -> None:
         padded = np.zeros((self.capacity, values.shape[1]), dtype=np.float32)
@@ -322,6 +342,15 @@ class Simulation:
              self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
              self.contact_gradient, self.force, self.torque, self.point_depth],
         )  # fmt: skip
+
+        if self.obstacles is not None:
+            self._launch(obstacle_kernels.clear, B, [self.active, self.obstacle_depth])
+            self._launch(
+                obstacle_kernels.penalty, (B, self.obstacles.count),
+                [self.obstacles.features, self.obstacles.solids, self.active, self.scene, self.iteration,
+                 self.penetration_weight, self.room, self.body_p, self.body_q, self.force, self.torque,
+                 self.obstacle_depth],
+            )  # fmt: skip
 
     def _record_gradient(self) -> None:
         B, o = self.capacity, self.options

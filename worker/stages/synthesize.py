@@ -58,9 +58,14 @@ def verdict_attributes(level: str, key: str | None) -> dict[str, Attribute]:
 def postures(grasps: GraspSet) -> dict[str, Any]:
     """The posture columns of a base shard."""
     parts = {"grasp": grasps.grasp, "pregrasp": grasps.pregrasp, "squeeze": grasps.squeeze}
-    return {f"{name}/hand_pose": part.hand_pose for name, part in parts.items()} | {
-        f"{name}/joint_positions": part.joint_positions for name, part in parts.items()
-    }
+    columns: dict[str, Any] = {f"{name}/hand_pose": part.hand_pose for name, part in parts.items()}
+    columns |= {f"{name}/joint_positions": part.joint_positions for name, part in parts.items()}
+    if grasps.scene is not None and grasps.approach is not None and grasps.lift is not None:
+        columns |= {
+            "grasp/scene_index": grasps.scene, "grasp/approach": grasps.approach,
+            "grasp/approach_joint_positions": grasps.coming, "grasp/lift": grasps.lift.hand_pose,
+        }  # fmt: skip
+    return columns
 
 
 def _json(info: dict[str, object]) -> dict[str, object]:

@@ -203,7 +203,7 @@ def test_command_prints_a_table(shared_data: Path) -> None:
     assert "not judged" in done.stdout
 
 
-@pytest.mark.parametrize("option", [["--level", "quick"], ["--protocol", "lift"]])
+@pytest.mark.parametrize("option", [["--level", "quick"], ["--protocol", "throw"]])
 def test_wrong_choice_is_the_caller_s_mistake(option: list[str], tmp_path: Path) -> None:
     done = CliRunner().invoke(app, [str(tmp_path), *option])
     assert done.exit_code == 2

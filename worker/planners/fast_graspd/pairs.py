@@ -15,6 +15,7 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.schedule import loss_options
 from worker.simulation import kernels
 from worker.simulation.device import DeviceHand, DeviceObject
+from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.sampling import object_samples
 from worker.simulation.simulation import LossOptions, Simulation
 
@@ -47,8 +48,10 @@ class Pair:
     options: LossOptions
     hand: DeviceHand
 
-    def simulation(self, side: Side, capacity: int) -> Simulation:
-        return Simulation(self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options)
+    def simulation(self, side: Side, capacity: int, obstacles: DeviceObstacles | None = None) -> Simulation:
+        return Simulation(
+            self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options, obstacles=obstacles
+        )
 
 
 _pairs: LRUCache[tuple[str, str, str, str], Pair] = LRUCache(KEPT)

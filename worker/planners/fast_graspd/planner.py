@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import warp as wp
@@ -14,15 +14,18 @@ from service.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd import scene_starts
 from worker.planners.fast_graspd.merit import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
 from worker.planners.fast_graspd.starts import RETREATS, nearest_distances, sample_starts
 from worker.planners.parts import Steps, cut, run_parts
 from worker.planners.port import Cancelled, Progress
 from worker.quality.postures import pregrasp, squeeze
+from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
@@ -54,37 +57,49 @@ def plan(
     device: str,
     progress: Progress,
     cancelled: Cancelled,
+    placed: Placed | None = None,
 ) -> GraspSet:
     """See `worker.planners.Planner`."""
     began = time.perf_counter()
     parts = optimise_batch(
         hand, obj, count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads, device=device,
-        progress=progress, cancelled=cancelled,
+        progress=progress, cancelled=cancelled, placed=placed,
     )  # fmt: skip
-    return grasps_of(hand, obj, parts, time.perf_counter() - began)
+    return grasps_of(hand, obj, parts, time.perf_counter() - began, placed)
 
 
 def optimise_batch(
     hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int, threads: int,
     device: str, progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
+    placed: Placed | None = None,
 ) -> list[Part]:  # fmt: skip
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     return optimise_pair(
         pair_of(hand, obj, fidelity, device), count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads,
-        progress=progress, cancelled=cancelled,
+        progress=progress, cancelled=cancelled, placed=placed,
     )  # fmt: skip
 
 
 def optimise_pair(
     pair: Pair, *, count: int, fidelity: Fidelity, seed: int, batch: int, threads: int,
     progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
+    placed: Placed | None = None,
 ) -> list[Part]:  # fmt: skip
     """The same for a pair that is on its device already, and need not be as the fidelity would make it."""
+    fidelity = fidelity if placed is None else in_scene(fidelity)
     steps = Steps(count * (_hands(fidelity) + 1), progress, cancelled)
 
     def work(indices: range) -> Part:
         part = Part(indices)
-        _work(pair, part, fidelity, seed, batch, steps)
+        _work(
+            pair,
+            part,
+            fidelity,
+            seed,
+            batch,
+            steps,
+            placed.take(slice(indices.start, indices.stop)) if placed else None,
+        )
         return part
 
     return run_parts(cut(count, threads, pair.hand.device, least=PART), work)
@@ -100,21 +115,29 @@ def _finalists(fidelity: Fidelity) -> int:
     return min(fidelity.finalists, fidelity.starts)
 
 
-def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: Steps) -> None:
+def _work(
+    pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: Steps, placed: Placed | None
+) -> None:
     n, hand, obj = len(part.indices), pair.hand.model, pair.fine.obj.model
     finalists = _finalists(fidelity)
-    probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
-    state = sample_starts(hand, obj, probe, seed=seed, batch=batch, indices=part.indices, each=fidelity.starts)
+    obstacles = _obstacles(pair, placed)
+    which: dict[str, Any] = {"seed": seed, "batch": batch, "indices": part.indices, "each": fidelity.starts}
+    if placed is None:
+        probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
+        state = sample_starts(hand, obj, probe, **which)
+    else:
+        probe = pair.simulation(pair.coarse, n * fidelity.starts * len(scene_starts.RETREATS), obstacles)
+        state = scene_starts.sample_scene_starts(hand, obj, probe, placed=placed, **which)
     touch = nearest_distances(probe, state) / DILATION if fidelity.dilation == "touch" else None
     steps(n, "starts")
     part.curve = []
-    simulation = pair.simulation(pair.coarse, n * fidelity.starts)
+    simulation = _in_scenes(pair.simulation(pair.coarse, n * fidelity.starts, obstacles), placed, fidelity.starts)
     state = _optimize(simulation, state, coarse_schedule(fidelity), fidelity, steps, "coarse", part.curve, touch)
     losses = _losses(simulation, state)
     if finalists < fidelity.starts:
         chosen = best_of_each(merits(hand, obj, state, losses), n, finalists)
         state, losses = state[chosen], losses[chosen]
-    simulation = pair.simulation(pair.fine, n * finalists)
+    simulation = _in_scenes(pair.simulation(pair.fine, n * finalists, obstacles), placed, finalists)
     state = _optimize(simulation, state, fine_schedule(fidelity), fidelity, steps, "fine", part.curve)
     if fidelity.fine_iterations:
         losses = _losses(simulation, state)
@@ -124,6 +147,20 @@ def _work(pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, ste
         winners = best_of_each(merits(hand, obj, state, losses, depths), n, 1)
         state, losses = state[winners], losses[winners]
     part.state, part.loss = state, losses
+
+
+def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:
+    if placed is None:
+        return None
+    centre = pair.fine.obj.model.centre_of_mass
+    return DeviceObstacles.create(pair.hand.model, placed.scenes, centre, pair.hand.device)
+
+
+def _in_scenes(simulation: Simulation, placed: Placed | None, each: int) -> Simulation:
+    """The simulation with the scene of every hand, `each` hands a grasp."""
+    if placed is not None:
+        simulation.set_scenes(np.repeat(placed.index, each))
+    return simulation
 
 
 def _losses(simulation: Simulation, state: HandState) -> Floats:
@@ -152,7 +189,9 @@ def _optimize(
     return simulation.state(n)
 
 
-def grasps_of(hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float) -> GraspSet:
+def grasps_of(
+    hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float, placed: Placed | None = None
+) -> GraspSet:
     """The parts of a batch as grasps with the postures around them."""
     states = [part.state for part in parts if part.state is not None]
     pivot, rotation, q = (np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q"))
@@ -161,7 +200,7 @@ def grasps_of(hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: flo
     curve = np.mean(curves, axis=0).round(5).tolist() if curves else []
     return GraspSet(
         grasp=grasp,
-        pregrasp=pregrasp(hand, obj, grasp),
+        pregrasp=pregrasp(hand, obj, grasp, placed),
         squeeze=squeeze(hand, obj, grasp),
         stability_loss=np.concatenate([part.loss for part in parts if part.loss is not None]),
         seconds=seconds,

@@ -38,6 +38,18 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
     )
 
 
+def in_scene(fidelity: Fidelity) -> Fidelity:
+    """The fidelity of grasps in scenes: obstacles leave fewer good approaches, so more hands set out, a shorter way
+    each, and only the best goes on. Coarse iterations are cheap against what follows them."""
+    return fidelity.model_copy(
+        update={
+            "starts": min(4 * fidelity.starts, 64),
+            "finalists": 1,
+            "coarse_iterations": -(-3 * fidelity.coarse_iterations // 5),
+        }
+    )
+
+
 def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats:
     return np.array(rates) * np.geomspace(1.0, to, max(count, 1))[:count, None]
 

@@ -134,12 +134,12 @@ def sample_starts(
 
 
 def probe_depths(probe: Simulation, states: HandState) -> Floats:
-    """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links."""
+    """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links,
+    and what it lacks of its distance from obstacles."""
     n = len(states.pivot)
     probe.set_state(states)
     probe.run()
-    parts = (probe.point_depth, probe.object_depth, probe.self_depth)
-    return np.max([part.numpy()[:n] for part in parts], axis=0).astype(float)
+    return probe.depths(n).astype(float)
 
 
 def nearest_distances(probe: Simulation, states: HandState) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -15,6 +16,7 @@ from worker.hands.model import ConvexPiece, HandModel, JointType
 from worker.mujoco_warnings import ARENA
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
+from worker.surroundings import Obstacle
 
 Floats = NDArray[np.float64]
 
@@ -79,6 +81,8 @@ class Scene:
     dof_shift: Floats
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
+    support_geoms: NDArray[np.bool_]
+    """(G,) geoms of the scene's supports; the scene frame is the mocap body 1."""
 
     def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
         """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
@@ -96,8 +100,10 @@ class Scene:
         data.ctrl[:] = self.hand.reduce(joints) * self.dof_gain + self.dof_shift
 
 
-def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Physics) -> Scene:
-    """Compile the scene of a hand and an object."""
+def build(
+    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Physics, supports: Sequence[Obstacle] = ()
+) -> Scene:
+    """Compile the scene of a hand and an object, with the supports that it stands on or between, if any."""
     spec = mujoco.MjSpec()
     # MJCF angles are degrees by default: radians there freeze every finger silently.
     spec.compiler.degree = False
@@ -112,15 +118,18 @@ def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Phys
     friction = [*physics.friction, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
     add_object(spec, obj, pieces, friction, OBJECT_MASS)
+    if supports:
+        _add_supports(spec, supports, friction)
     model = spec.compile()
     gain, shift = _leading(hand)
     body_of_geom = model.geom_bodyid
     object_body = model.body("object").id
+    support = body_of_geom == (model.body("supports").id if supports else -1)
     return Scene(
         model=model,
         hand=hand,
         physics=physics,
-        hand_geoms=np.asarray(body_of_geom != object_body),
+        hand_geoms=np.asarray((body_of_geom != object_body) & ~support),
         object_body=object_body,
         object_qpos=int(model.joint("object").qposadr[0]),
         root_qpos=int(model.joint("root").qposadr[0]) if physics.root == "weld" else -1,
@@ -128,6 +137,7 @@ def build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Phys
         dof_gain=gain,
         dof_shift=shift,
         centre=obj.centre_of_mass,
+        support_geoms=np.asarray(support),
     )
 
 
@@ -284,6 +294,21 @@ def add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list
     for i, corners in enumerate(pieces.vertices):
         geom = body.add_geom(condim=4, friction=friction, name=f"object{i}")
         _mesh(spec, geom, corners - obj.centre_of_mass, f"object{i}")
+
+
+def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:
+    """Planes and convex solids on a mocap body, which is put where the scene is as seen from the object."""
+    body = spec.worldbody.add_body(name="supports", mocap=True)
+    for i, support in enumerate(supports):
+        geom = body.add_geom(condim=4, friction=friction, name=f"support{i}")
+        if len(support.corners):
+            _mesh(spec, geom, support.corners, f"support{i}")
+            continue
+        normal, offset = support.planes[0, :3], support.planes[0, 3]
+        geom.type = mujoco.mjtGeom.mjGEOM_PLANE
+        geom.size = [0, 0, 0.1]
+        geom.pos = offset * normal
+        mujoco.mju_quatZ2Vec(geom.quat, normal)
 
 
 def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:

@@ -16,7 +16,7 @@ from worker import backend
 
 backend.start()
 
-MODULES: Final = ("kinematics", "surface", "contact", "pieces", "penalties", "optimizers", "projection")
+MODULES: Final = ("kinematics", "surface", "contact", "pieces", "penalties", "optimizers", "projection", "obstacles")
 _lock = threading.Lock()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from worker.planners.fast_graspd.pairs import Pair, Side
+from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.simulation import Simulation
 from worker.studies.chart import kernels
 
@@ -15,8 +16,10 @@ class VariantPair(Pair):
 
     kind: type[Simulation]
 
-    def simulation(self, side: Side, capacity: int) -> Simulation:
-        return self.kind(self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options)
+    def simulation(self, side: Side, capacity: int, obstacles: DeviceObstacles | None = None) -> Simulation:
+        return self.kind(
+            self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options, obstacles=obstacles
+        )
 
 
 class AskingEach(Simulation):

@@ -1,0 +1,90 @@
+"""The lift test on a gripper of two plates and a box that stands on a table."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.worker.models import object_from_mesh
+from tests.worker.quality.helpers import pad_hand, posture
+from worker.grasps import GraspSet, Posture
+from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.lift import Lift, LiftOutcome
+from worker.quality.referee.model import Physics, build
+from worker.surroundings import Obstacle, Placed
+
+HALF, HEIGHT = 0.03, 0.05
+HAND = pad_hand()
+BOX = object_from_mesh(trimesh.creation.box((2 * HALF, 0.04, HEIGHT)))
+WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
+#: The hand's base is at -z of the object: the box stands on its head, so that the hand comes from above.
+PLACED = Placed((Obstacle.half_space([0, 0, 1], 0.0),), np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]]), np.zeros(1, int))
+#: Joint value at which the pads touch.
+TOUCH = 0.065
+
+
+def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
+    """Pads 5 mm open, in touch, then commanded `squeeze` [m] past the touch; the hand comes straight from above."""
+    open_, touch, press = (posture(((0.0, 0.0, 0.0), (q, q))) for q in (TOUCH - 0.005, TOUCH, TOUCH + squeeze))
+    approach = np.repeat(open_.hand_pose[:, None], 6, axis=1)
+    approach[..., :3] += np.linspace(0.1, 0, 6)[:, None] * (np.array([0, 0, -1.0]) if way is None else way)
+    raised = press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0])
+    lift = Posture(raised, press.joint_positions)
+    return dataclasses.replace(
+        GraspSet(touch, open_, press, np.full(1, np.nan)), approach=approach, coming=open_.joint_positions, lift=lift
+    )
+
+
+def lift_test(physics: Physics | None = None) -> Lift:
+    return Lift(build(HAND, BOX, WHOLE, physics or Physics(), PLACED.supports), PLACED)
+
+
+@pytest.mark.parametrize("level", ["letter", "lift"])
+def test_a_firm_squeeze_lifts_the_box(level: str) -> None:
+    trial = getattr(lift_test(), level)(grasp(0.05), 0)
+    assert trial.outcome is LiftOutcome.LIFTED
+    assert trial.margin < 0.5
+
+
+@pytest.mark.parametrize("level", ["letter", "lift"])
+def test_without_a_squeeze_the_box_stays(level: str) -> None:
+    trial = getattr(lift_test(), level)(grasp(-0.005), 0)
+    assert trial.outcome is LiftOutcome.NOT_LIFTED
+
+
+def test_glue_lifts_what_the_same_squeeze_does_not_hold() -> None:
+    weak = grasp(0.0005)
+    assert lift_test(Physics(friction=(0.05, 0.001))).lift(weak, 0).outcome is LiftOutcome.NOT_LIFTED
+    assert lift_test(Physics(friction=(50.0, 1.0))).lift(weak, 0).outcome is LiftOutcome.LIFTED
+
+
+def test_a_slippery_table_changes_nothing_once_the_box_is_lifted() -> None:
+    test = lift_test()
+    rough = test.lift(grasp(0.05), 0)
+    model = test.scene.model
+    model.geom_priority[test.scene.support_geoms] = 1
+    model.geom_friction[test.scene.support_geoms] = 1e-6
+    smooth = test.lift(grasp(0.05), 0)
+    assert smooth.outcome is rough.outcome is LiftOutcome.LIFTED
+    assert smooth.margin == pytest.approx(rough.margin, abs=0.05)
+
+
+def test_a_hand_that_comes_through_the_box_has_touched_it() -> None:
+    assert lift_test().lift(grasp(0.05, np.array([1.0, 0, 0])), 0).outcome is LiftOutcome.TOUCHED_ON_THE_WAY
+
+
+def test_a_hand_that_comes_from_below_has_touched_the_table() -> None:
+    assert lift_test().lift(grasp(0.05, np.array([0, 0, 1.0])), 0).outcome is LiftOutcome.TOUCHED_ON_THE_WAY
+
+
+def test_the_letter_does_not_look_at_the_way() -> None:
+    assert lift_test().letter(grasp(0.05, np.array([1.0, 0, 0])), 0).outcome is LiftOutcome.LIFTED
+
+
+def test_two_lifts_of_one_grasp_say_the_same() -> None:
+    test = lift_test()
+    first, second = test.lift(grasp(0.05), 0), test.lift(grasp(0.05), 0)
+    assert first == second

@@ -1,0 +1,119 @@
+"""Grasps planned in a scene: never nearer to it than stated, by MuJoCo's own distances, at a hundred postures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from graspd import build
+from service.domain import resolve_fidelity
+from service.shards import read_shard
+from tests.worker.test_surroundings import mujoco_distances
+from worker.grasps import Posture
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.scenes.clearance import approach
+from worker.scenes.way import MARGIN_M, STANDOFF_M, plan_way
+from worker.surroundings import Obstacle, Placed
+
+QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
+
+
+@pytest.fixture(scope="module")
+def planned():
+    hand = hand_from_path("barrett")
+    obj = object_from_path("block", face_error_m=QUICK.face_error_m)
+    from service.scene_spec import SceneSpec
+    from worker.scenes.kinds import rest_poses, supports_of
+
+    spec = SceneSpec(kind="table")
+    placed = Placed(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(8) % 2)
+    return hand, obj, placed, synthesize(hand, obj, count=8, fidelity=QUICK, seed=4, placed=placed)
+
+
+def test_every_grasp_is_clear_of_the_table_by_mujocos_distances(planned) -> None:
+    hand, _, placed, grasps = planned
+    for number, scene in enumerate(placed.scenes):
+        rows = np.flatnonzero(placed.index == number)
+        found = mujoco_distances(hand, grasps.grasp.take(rows), scene.obstacles[0])
+        assert found.min() >= MARGIN_M
+
+
+def test_the_whole_way_is_as_clear_as_it_says(planned) -> None:
+    hand, obj, placed, grasps = planned
+    way = plan_way(hand, obj, grasps, placed)
+    assert way.clear.any()
+    for row in np.flatnonzero(way.clear):
+        scene = placed.scenes[placed.index[row]]
+        coming = approach(
+            Posture(way.approach[row, -1:], way.open[row : row + 1]),
+            Posture(way.approach[row, :1], way.open[row : row + 1]),
+            40,
+        )
+        one = grasps.take(slice(row, row + 1))
+        closing = approach(one.grasp, one.pregrasp, 30)
+        lifting = Posture(np.repeat(one.grasp.hand_pose, 30, axis=0), np.repeat(one.grasp.joint_positions, 30, axis=0))
+        lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
+        least = min(mujoco_distances(hand, part, scene.obstacles[0]).min() for part in (coming, closing, lifting))
+        # Postures between those that were looked at may be nearer by what a finger's arc deviates from its chord.
+        assert least >= MARGIN_M - 5e-4
+        assert np.linalg.norm(way.approach[row, 0, :3] - way.approach[row, -1, :3]) == pytest.approx(STANDOFF_M)
+
+
+def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
+    hand, obj, placed, grasps = planned
+    alone = Placed(placed.supports, placed.object_pose, placed.index[:3])
+    found = synthesize(hand, obj, count=3, fidelity=QUICK, seed=4, placed=alone)
+    assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
+
+
+def test_a_scene_without_obstacles_leaves_the_hand_free_to_come_from_below() -> None:
+    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
+    nothing = Placed((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
+    found = synthesize(hand, obj, count=8, fidelity=QUICK, seed=4, placed=nothing)
+    below = Obstacle.half_space([0, 0, 1], -0.03)
+    assert (mujoco_distances(hand, found.grasp, below) < 0).any()
+
+
+def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
+    out = tmp_path / "g.h5"
+    result = CliRunner().invoke(
+        build(),
+        ["synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "-n", "3",
+         "--budget", "8", "--fidelity", "draft", "-o", str(out), "--json"],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    said = json.loads(result.stdout.splitlines()[-1])
+    assert {"scene", "scenes", "clear_share", "lift_share", "lift_hard_share"} <= set(said)
+    assert said["lift_share"] <= said["clear_share"]
+    shard = read_shard(out, kind="base")
+    assert np.array_equal(shard["quality/valid"], shard["quality/success"] == 1)
+    assert (np.asarray(shard["quality/clearance_m"]) >= MARGIN_M).all()
+    judged = CliRunner().invoke(build(), ["evaluate", str(out), "--protocol", "lift", "--json"])
+    again = json.loads(judged.stdout.splitlines()[-1])
+    assert again["gsr"] == said["valid"] / said["grasps"]
+    assert again["clear_share"] == 1.0
+
+
+def test_lifting_grasps_of_a_free_object_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "g.h5"
+    args = ["--hand", "barrett", "--object", "block", "-n", "1", "--want", "raw", "--referee", "none"]
+    CliRunner().invoke(build(), ["synth", *args, "--fidelity", "draft", "-o", str(out)])
+    result = CliRunner().invoke(build(), ["evaluate", str(out), "--protocol", "lift"])
+    assert result.exit_code == 2
+    assert "synth --scene" in result.output
+
+
+def test_a_method_for_free_objects_says_so(tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        build(),
+        ["synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--method", "dfc", "-o",
+         str(tmp_path / "g.h5")],
+    )  # fmt: skip
+    assert result.exit_code == 2
+    assert "floating objects only" in result.output

@@ -1,0 +1,112 @@
+"""The penalty against obstacles: its gradient against central differences of a float64 energy, its depth, its rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.transforms import quat_rotate
+from tests.worker.simulation.rigs import ball, rig, still
+from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.simulation.obstacles import DeviceObstacles, HandFeatures
+from worker.simulation.projection import Projection, ProjectionOptions
+from worker.simulation.simulation import HandState, LossOptions, Simulation
+from worker.surroundings import Obstacle, Surroundings
+
+MARGIN = 0.004
+SCENES = {
+    "table": (Obstacle.half_space([0.1, -0.2, 1.0], -0.02),),
+    "corner of two walls": (
+        Obstacle.half_space([0, 0, 1], -0.03),
+        Obstacle.box([0.327, 0.013, 0.011, 0.9, 0.1, 0.2, 0.3], [0.11, 0.6, 0.4]),
+    ),
+}
+
+
+def distances(hand: HandModel, state: HandState, obstacle: Obstacle) -> np.ndarray:
+    """(F,) signed distance of each feature from an obstacle in float64, the object's centre being the origin."""
+    features, poses = HandFeatures.of(hand), bodies_of(hand, state)[HandFeatures.of(hand).body]
+    centre = quat_rotate(poses[:, 3:], features.centre) + poses[:, :3]
+    axis = quat_rotate(poses[:, 3:], features.axis)
+    rim = np.linalg.norm(axis, axis=1) > 0.5
+    per_plane = []
+    for plane in obstacle.planes:
+        sine = np.sqrt(np.maximum(0, 1 - (axis @ plane[:3]) ** 2))
+        per_plane.append(centre @ plane[:3] - plane[3] - features.radius * np.where(rim, sine, 1.0))
+    return np.max(per_plane, axis=0)
+
+
+def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> Simulation:
+    obj = ball()
+    simulation = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
+    up = np.array([0.0, 0, 1])
+    simulation.obstacles = DeviceObstacles.create(
+        hand, [Surroundings(obstacles, up)], obj.centre_of_mass, "cpu", margin=MARGIN
+    )
+    simulation.set_scenes(np.zeros(1, int))
+    return simulation
+
+
+def reaching(hand: HandModel) -> HandState:
+    """A hand beside the ball whose fingers reach into the obstacles; it does not touch the ball."""
+    q = hand.lower + 0.45 * (hand.upper - hand.lower)
+    rotation = np.array([0.4, 0.5, -0.3, 0.7])
+    return HandState(np.array([[0.3, 0.02, 0.0]]), (rotation / np.linalg.norm(rotation))[None], q[None])
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) -> None:
+    hand, obstacles = hand_from_path(name), SCENES[scene]
+    state = reaching(hand)
+
+    def energy(at: HandState) -> float:
+        short = [np.minimum(distances(hand, at, o) - MARGIN, 0.0) for o in obstacles]
+        return float(sum((s**2).sum() for s in short))
+
+    simulation = simulation_in(hand, obstacles)
+    schedule = still()
+    schedule.penetration[:] = 1.0
+    simulation.set_schedule(schedule)
+    simulation.set_state(state)
+    simulation.record_evaluation()
+    simulation.run()
+    assert simulation.point_depth.numpy()[0] == 0.0, "the object pushes nothing here"
+    found = simulation.gradient.numpy()[0]
+    expected = differences(energy, state, len(found))
+    assert np.linalg.norm(expected) > 1e-3, "the state is too near"
+    np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) -> None:
+    hand, obstacles = hand_from_path(name), SCENES["table"]
+    simulation = simulation_in(hand, obstacles)
+    simulation.set_state(reaching(hand))
+    simulation.record_placement()
+    simulation.run()
+    expected = max(0.0, MARGIN - distances(hand, reaching(hand), obstacles[0]).min())
+    # float32 coordinates of 0.1 m.
+    np.testing.assert_allclose(simulation.depths(1)[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_projection_brings_a_hand_out_of_an_obstacle(name: str) -> None:
+    hand, obstacles = hand_from_path(name), SCENES["table"]
+    state = reaching(hand)
+    state.pivot += (-0.003 - distances(hand, state, obstacles[0]).min()) * obstacles[0].planes[0, :3]
+    simulation = simulation_in(hand, obstacles)
+    found, _ = Projection(simulation, ProjectionOptions()).run(state, 40)
+    assert distances(hand, found, obstacles[0]).min() > MARGIN
+
+
+def test_a_hand_without_a_scene_feels_no_obstacle() -> None:
+    hand = hand_from_path("allegro")
+    simulation = simulation_in(hand, SCENES["table"])
+    simulation.set_scenes(np.full(1, -1))
+    simulation.set_state(reaching(hand))
+    simulation.record_placement()
+    simulation.run()
+    assert simulation.obstacle_depth.numpy()[0] == 0.0

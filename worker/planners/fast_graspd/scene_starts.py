@@ -1,0 +1,181 @@
+"""Approach sampling in scenes: as `starts`, from the directions that a scene leaves free, all hands drawn at once.
+
+A start keeps `ROOM` from obstacles besides the margin it has later, so that the descent can turn the hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError
+from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, probe_depths, start_generator
+from worker.simulation.simulation import HandState, Simulation, still_schedule
+from worker.surroundings import Placed, Surroundings
+
+Floats = NDArray[np.float64]
+
+#: Distance from obstacles that a start has besides the margin it keeps later [m].
+ROOM: Final = 0.006
+#: Steps of retreat while something touches [m]: farther than for a free object, for fingers must not reach the table.
+RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
+#: Draws per start before the least penetrating one is taken.
+DRAWS: Final = 96
+#: Way along which a hand must be able to come [m], half the width of a palm [m], directions that are looked at, and
+#: how near one of the free ones is (cosine).
+STANDOFF_M: Final = 0.10
+PALM_RADIUS: Final = 0.04
+DIRECTIONS: Final = 256
+NEAR_WAY: Final = 0.98
+#: Uniform numbers of one draw: face, two for the point, roll, gap, share and goal of a turn.
+_UNIFORM: Final = 7
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """The object's faces as draws need them."""
+
+    corners: Floats
+    normals: Floats
+    sums: Floats
+    """(F,) cumulative share of the area."""
+
+    @classmethod
+    def of(cls, obj: ObjectModel) -> _Surface:
+        corners = obj.vertices[obj.faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1)
+        return cls(corners, cross / np.maximum(area, 1e-20)[:, None], np.cumsum(area) / area.sum())
+
+
+def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
+    """(K, 3) unit vectors, object frame, along which a ball as wide as a palm leaves the object without touching an
+    obstacle on `STANDOFF_M`.
+
+    Raises:
+        InputError: there is none.
+    """
+    ways = _sphere(DIRECTIONS)
+    out = ((obj.vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
+    path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
+    points = obj.centre_of_mass + path[..., None] * ways[:, None]
+    free = np.ones(DIRECTIONS, bool)
+    for obstacle in scene.obstacles:
+        free &= obstacle.distance(points).min(axis=1) > 0.5 * PALM_RADIUS
+    if not free.any():
+        raise InputError(f"nothing can reach {obj.name} in this scene: obstacles stand on every side of it")
+    return np.asarray(ways[free])
+
+
+def sample_scene_starts(
+    hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range, each: int,
+    placed: Placed,
+) -> HandState:  # fmt: skip
+    """Starts of the grasps `indices` of a batch in their scenes, `each` per grasp, those of one grasp side by side.
+
+    `probe` is a simulation with the scenes' obstacles, of capacity len(indices) * each * len(RETREATS) at least.
+
+    Raises:
+        InputError: a scene leaves no way to the object, or not one draw of some grasp came within 10 mm of being clear.
+    """
+    probe.set_schedule(still_schedule())
+    probe.room = ROOM
+    probe.record_placement()
+    ways = [free_ways(scene, obj) for scene in placed.scenes]
+    scene = np.repeat(placed.index, each)
+    count, surface = len(scene), _Surface.of(obj)
+    generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
+    uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
+    normal = np.array([g.standard_normal((DRAWS, 2 + hand.dofs)) for g in generators])
+    best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
+    depth = np.full(count, np.inf)
+    for number in range(DRAWS):
+        rows = np.flatnonzero(depth > CLEAR)
+        if not len(rows):
+            break
+        states = _draws(hand, obj, surface, uniform[rows, number], normal[rows, number], [ways[s] for s in scene[rows]])
+        probe.set_scenes(np.repeat(scene[rows], len(RETREATS)))
+        found = probe_depths(probe, states).reshape(len(rows), len(RETREATS))
+        # The nearest clear distance, or else the least deep.
+        clear = found <= CLEAR
+        pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
+        least = found[np.arange(len(rows)), pick]
+        better = least < depth[rows]
+        taken = states[(np.arange(len(rows)) * len(RETREATS) + pick)[better]]
+        depth[rows[better]] = least[better]
+        best.pivot[rows[better]], best.rotation[rows[better]], best.q[rows[better]] = (
+            taken.pivot,
+            taken.rotation,
+            taken.q,
+        )
+    if depth.max() > 0.01:
+        raise InputError(
+            f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
+            "around it leaves no room"
+        )
+    return best
+
+
+def _draws(
+    hand: HandModel, obj: ObjectModel, surface: _Surface, uniform: Floats, normal: Floats, ways: list[Floats]
+) -> HandState:
+    """Candidates (n * len(RETREATS) hands), each at each distance, from random numbers (n, 7) and (n, 2 + D)."""
+    face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
+    u, v = uniform[:, 1:2], uniform[:, 2:3]
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    corner = surface.corners[face]
+    point = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
+    away = _tilted(surface.normals[face], TILT * normal[:, :2])
+    away = np.array([_turned(a, w, t) for a, w, t in zip(away, ways, uniform[:, 5:7], strict=True)])
+    align = _frames(-away) @ _frames(hand.palm.approach[None])[0].T
+    roll = quat_from_axis_angle(-away, 2 * np.pi * uniform[:, 3])
+    rotation = quat_multiply(roll, quat_from_matrix(align))
+    span = hand.upper - hand.lower
+    q = np.clip(hand.preshape + POSTURE_NOISE * span * normal[:, 2:], hand.lower, hand.upper)
+    gap = GAP[0] + (GAP[1] - GAP[0]) * uniform[:, 4:5] + np.array(RETREATS)[None]
+    pivot = (point - obj.centre_of_mass)[:, None] + gap[..., None] * away[:, None]
+    repeat = len(RETREATS)
+    return HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
+
+
+def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
+    """The direction (3,) itself where it is near a free way, or else turned towards a random free one until it is."""
+    if (ways @ away).max() >= NEAR_WAY:
+        return away
+    goal = ways[int(random[1] * len(ways))]
+    for share in np.linspace(0.2 + 0.8 * random[0], 1.0, 4):
+        mixed = (1 - share) * away + share * goal
+        length = float(np.linalg.norm(mixed))
+        if length > 1e-6 and (ways @ mixed).max() >= NEAR_WAY * length:
+            return np.asarray(mixed / length)
+    return goal
+
+
+def _tilted(normals: Floats, angles: Floats) -> Floats:
+    """(n, 3) unit vectors turned about two axes across them by `angles` (n, 2) [rad]."""
+    axis = np.einsum("nij,nj->ni", _frames(normals)[..., :2], angles)
+    angle = np.linalg.norm(axis, axis=1, keepdims=True)
+    unit = axis / np.maximum(angle, 1e-12)
+    return np.asarray(normals * np.cos(angle) + np.cross(unit, normals) * np.sin(angle))
+
+
+def _frames(z: Floats) -> Floats:
+    """(n, 3, 3) rotation matrices with third columns z (n, 3) and arbitrary but fixed first ones."""
+    helper = np.eye(3)[np.argmin(np.abs(z), axis=1)]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _sphere(count: int) -> Floats:
+    """(count, 3) unit vectors spread evenly: a golden spiral."""
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])

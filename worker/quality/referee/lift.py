@@ -1,0 +1,207 @@
+"""The lift test: the object stands in its scene, the hand closes, squeezes, lifts it and holds it.
+
+letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
+lift: the hand comes from its standoff and must touch nothing on the way; after the lift it holds for 2 s, cut short as
+the certificate's pushes are.
+The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from service.transforms import invert, slerp
+from worker.grasps import GraspSet, Posture
+from worker.mujoco_warnings import void
+from worker.quality.referee.model import Scene, blend
+from worker.quality.referee.protocol import (
+    LOST_ROTATION,
+    MAX_DISPLACEMENT_M,
+    MAX_PENETRATION_M,
+    PUSH,
+    STAGE_S,
+    STAGES,
+    Outcome,
+    Test,
+    Trial,
+)
+from worker.surroundings import Placed
+
+Floats = NDArray[np.float64]
+
+#: How far the root rises [m].
+RISE_M: Final = 0.10
+#: Postures looked at between two waypoints of an approach.
+LOOKS: Final = 4
+#: The open hand may be this deep in the object's convex pieces on its way [m]: they stand out from its surface, where
+#: the hand is clear, by up to this much. Supports are exact.
+OVERHANG_M: Final = 0.002
+
+
+class LiftOutcome(IntEnum):
+    """What became of a lift."""
+
+    NOT_TRIED = 0
+    LIFTED = 1
+    PENETRATION = 2
+    TOUCHED_ON_THE_WAY = 3
+    LOST_WHILE_CLOSING = 4
+    NOT_LIFTED = 5
+    TURNED = 6
+    DIVERGED = 7
+
+
+@dataclass
+class LiftTrial:
+    """Verdict on one grasp."""
+
+    outcome: LiftOutcome = LiftOutcome.NOT_TRIED
+    margin: float = 0.0
+    """Worst displacement or rotation from where it should be over its limit, at the end of the lift and after."""
+    steps: int = 0
+
+    @property
+    def success(self) -> bool:
+        return self.outcome is LiftOutcome.LIFTED
+
+
+class Lift(Test):
+    """Runs lifts of grasps in one scene with supports. Not for several threads at once."""
+
+    def __init__(self, scene: Scene, placed: Placed) -> None:
+        super().__init__(scene)
+        self.placed = placed
+        self._goal = np.zeros(3)
+
+    def letter(self, grasps: GraspSet, row: int) -> LiftTrial:  # type: ignore[override]
+        """As published: success is read once, when the root has risen."""
+        if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+            return trial
+        self._close(grasps, row)
+        self._rise(grasps, row)
+        return self._ended(trial, self._judge(Trial()))
+
+    def lift(self, grasps: GraspSet, row: int) -> LiftTrial:
+        """From the standoff to the end of the hold; `grasps.approach` says how the hand comes."""
+        if (trial := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+            return trial
+        if self._touches(grasps, row):
+            trial.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
+            return trial
+        if not self._close(grasps, row, give_up=True):
+            trial.outcome = LiftOutcome.DIVERGED if void(self.data) else LiftOutcome.LOST_WHILE_CLOSING
+            trial.steps = self._steps
+            return trial
+        self._rise(grasps, row)
+        inner = Trial()
+        outcome = self._judge(inner)
+        if outcome is Outcome.HELD:
+            outcome = self._hold(inner)
+        return self._ended(trial, outcome)
+
+    def _begin(self, grasps: GraspSet, row: int) -> LiftTrial:
+        """The scene as this grasp has it; the object at rest; gravity on the object alone, as published."""
+        self._steps, number = 0, int(self.placed.index[row])
+        self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
+        self._up = self.placed.scenes[number].up
+        self._goal = np.zeros(3)
+        self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        mujoco.mj_forward(self.scene.model, self.data)
+        trial = LiftTrial()
+        if max(self._depths_here()) > MAX_PENETRATION_M:
+            trial.outcome = LiftOutcome.PENETRATION
+        return trial
+
+    def _put(self, hand_pose: Floats, joints: Floats) -> None:
+        self.scene.place(self.data, hand_pose, joints)
+        self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
+        self.data.xfrc_applied[self.scene.object_body, :3] = -PUSH * self._up
+
+    def _depths_here(self) -> tuple[float, float]:
+        """Deepest penetration of the hand into the object, and into itself or a support [m]."""
+        contact = self.data.contact
+        if not len(contact.dist):
+            return 0.0, 0.0
+        ours, support = self.scene.hand_geoms[contact.geom], self.scene.support_geoms[contact.geom]
+        hand, within = ours.any(axis=1), ours.all(axis=1) | (ours | support).all(axis=1)
+        depth = np.maximum(0.0, -np.asarray(contact.dist))
+        return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
+
+    def _touches(self, grasps: GraspSet, row: int) -> bool:
+        """Whether the open hand, on its way, reaches into the object or a support."""
+        assert grasps.approach is not None, "a lift needs the grasps' approach"
+        assert grasps.coming is not None
+        path, joints = grasps.approach[row], grasps.coming[row]
+        for a, b in pairwise(path):
+            for share in np.arange(LOOKS) / LOOKS:
+                pose = np.concatenate([(1 - share) * a[:3] + share * b[:3], slerp(a[3:], b[3:], float(share))])
+                self._put(pose, joints)
+                mujoco.mj_kinematics(self.scene.model, self.data)
+                mujoco.mj_collision(self.scene.model, self.data)
+                if self._in_touch():
+                    return True
+        wide, closed = Posture(path[-1:], joints[None]), grasps.pregrasp.take(slice(row, row + 1))
+        for share in np.arange(LOOKS) / LOOKS:
+            self._put(*blend(wide, closed, 0, float(share)))
+            mujoco.mj_kinematics(self.scene.model, self.data)
+            mujoco.mj_collision(self.scene.model, self.data)
+            if self._in_touch():
+                return True
+        return False
+
+    def _in_touch(self) -> bool:
+        contact = self.data.contact
+        if not len(contact.dist):
+            return False
+        distance, geom = np.asarray(contact.dist), contact.geom
+        ours, support = self.scene.hand_geoms[geom], self.scene.support_geoms[geom]
+        of_hand = ours.any(axis=1) & ~ours.all(axis=1)
+        on_support = of_hand & support.any(axis=1)
+        return bool((distance[on_support] < 0).any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
+
+    def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False) -> bool:
+        pose, joints = grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row]
+        self._put(pose, joints)
+        for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
+            for stage in range(1, STAGES + 1):
+                self.scene.command(self.data, *blend(a, b, row, stage / STAGES))
+                self._run(STAGE_S)
+                if give_up:
+                    moved, turned = self._motion()
+                    if moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
+                        return False
+        return True
+
+    def _rise(self, grasps: GraspSet, row: int) -> None:
+        squeeze = grasps.squeeze.take(slice(row, row + 1))
+        pose = squeeze.hand_pose.copy()
+        pose[:, :3] += RISE_M * self._up
+        raised = Posture(pose, squeeze.joint_positions)
+        for stage in range(1, STAGES + 1):
+            self.scene.command(self.data, *blend(squeeze, raised, 0, stage / STAGES))
+            self._run(STAGE_S)
+        self._goal = RISE_M * self._up
+
+    def _offset(self) -> Floats:
+        """(3,) of the object's frame from where it should be [m]."""
+        return np.asarray(super()._offset() - self._goal)
+
+    def _ended(self, trial: LiftTrial, outcome: Outcome) -> LiftTrial:
+        trial.steps, trial.margin = self._steps, self._excess()
+        trial.outcome = _OUTCOMES[outcome]
+        return trial
+
+
+_OUTCOMES: Final[dict[Any, LiftOutcome]] = {
+    Outcome.HELD: LiftOutcome.LIFTED,
+    Outcome.DISPLACED: LiftOutcome.NOT_LIFTED,
+    Outcome.ROTATED: LiftOutcome.TURNED,
+    Outcome.DIVERGED: LiftOutcome.DIVERGED,
+}

@@ -1,0 +1,143 @@
+"""Verdicts of the lift test on many grasps in their scenes, all cores used."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.cores import available_cores
+from service.digests import digest_bytes, digest_json
+from service.errors import InputError, TaskCancelled
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality import postures
+from worker.quality.referee import lift as protocol
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.key import verdict_key
+from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
+from worker.quality.referee.model import Physics, build
+from worker.surroundings import Placed
+
+LiftLevel = Literal["letter", "lift"]
+LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
+#: Raise when the code of the lift test changes what it says, constants aside.
+REVISION: Final = 1
+_MOVES: Final = {protocol: ("RISE_M", "LOOKS", "OVERHANG_M"), postures: ("ROOM_M", "WIDE")}
+
+
+@dataclass(frozen=True)
+class LiftVerdicts:
+    """What the lift test says of N grasps."""
+
+    success: NDArray[np.int8]
+    """(N,) 1 lifted and held, 0 not."""
+    outcome: NDArray[np.uint8]
+    """(N,) `LiftOutcome`."""
+    margin: NDArray[np.float64]
+    """(N,) worst displacement or rotation over its limit."""
+    level: LiftLevel
+    hard: bool
+    terms: str
+    """Digest of all that moves a verdict but the grasp and its scene."""
+    seconds: float
+
+    @property
+    def reasons(self) -> list[str]:
+        """Per grasp what became of it, in words."""
+        return [LiftOutcome(int(value)).name.lower().replace("_", " ") for value in self.outcome]
+
+
+def judge_lifts(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    placed: Placed,
+    *,
+    level: LiftLevel = "lift",
+    hard: bool = False,
+    threads: int = 0,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+    progress: Callable[[float, float, str], None] = lambda done, total, message: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> LiftVerdicts:
+    """Lift grasps out of their scenes; see `worker.quality.referee.lift`.
+
+    Args:
+        hand: the hand; its stiffness and effort are the actuators' gains and limits.
+        obj: the object, 0.1 kg whatever it is made of.
+        grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
+        placed: their scenes; `index` has a scene for each.
+        level: letter or lift.
+        hard: sliding friction halved, torsional friction a tenth, of supports too.
+        threads: 0: all cores.
+        pieces: convex pieces of the object; by default its CoACD pieces.
+        cache: folder of the pieces.
+        progress: called with grasps done.
+        cancelled: polled between grasps.
+
+    Raises:
+        InputError: unknown level, or no scene or approach to lift from.
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `cancelled()` answers True.
+    """
+    if level not in LEVELS:
+        raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
+    if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
+        raise InputError("the lift test needs a scene and, but for the letter, an approach of each grasp")
+    began = time.perf_counter()
+    pieces = pieces or decompose(obj, cache=cache)
+    physics = Physics().hardened() if hard else Physics()
+    scene = build(hand, obj, pieces, physics, placed.supports)
+    tests: queue.SimpleQueue[Lift] = queue.SimpleQueue()
+    workers = max(1, min(threads or available_cores(), len(grasps)))
+    for _ in range(workers):
+        tests.put(Lift(scene, placed))
+    done, lock = 0, threading.Lock()
+
+    def work(row: int) -> LiftTrial:
+        nonlocal done
+        if cancelled():
+            raise TaskCancelled("the referee was cancelled")
+        test = tests.get()
+        try:
+            trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
+        finally:
+            tests.put(test)
+        with lock:
+            done += 1
+            progress(done, len(grasps), "lifts")
+        return trial
+
+    with ThreadPoolExecutor(workers, thread_name_prefix="lift") as pool:
+        trials = list(pool.map(work, range(len(grasps))))
+    return LiftVerdicts(
+        success=np.array([t.success for t in trials], np.int8),
+        outcome=np.array([t.outcome for t in trials], np.uint8),
+        margin=np.array([t.margin for t in trials], float),
+        level=level,
+        hard=hard,
+        terms=lift_key(hand, obj, placed, level, hard, pieces=pieces),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def lift_key(
+    hand: HandModel, obj: ObjectModel, placed: Placed, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
+) -> str:
+    """Digest of the terms of a lift: those of the six pushes, the supports, and the constants of the lift."""
+    pushes = verdict_key(hand, obj, "letter" if level == "letter" else "certificate", hard, pieces=pieces)
+    supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
+    constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}
+    physics = asdict(Physics().hardened() if hard else Physics())
+    return digest_json([REVISION, pushes, level, physics, digest_bytes(supports), constants])

@@ -1,0 +1,151 @@
+"""From a scene as a user says it to supports and rest poses: tables, bins, shelves, and what a file says."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import InputError
+from service.scene_spec import Box, SceneSpec
+from service.transforms import compose, quat_from_axis_angle, quat_rotate
+from worker.objects.model import ObjectModel
+from worker.scenes.rest import lay_flat, resting_faces
+from worker.scenes.simulate import drop, rest_probability
+from worker.surroundings import Obstacle
+
+Floats = NDArray[np.float64]
+
+#: Inner size of a bin, height of its walls and their thickness [m].
+BIN_SIZE: Final = (0.40, 0.30)
+BIN_HEIGHT: Final = 0.15
+WALL: Final = 0.02
+#: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
+SHELF_SIZE: Final = (0.80, 0.35)
+SHELF_HEIGHT: Final = 0.35
+#: Least gap between an object and a wall [m].
+GAP: Final = 0.01
+#: A face that fewer drops end on is not looked at with `faces all`.
+LEAST_PROBABILITY: Final = 0.03
+#: An object may reach into its support by this much: rest poses are exact, a file's are rounded [m].
+SUNK: Final = 5e-4
+
+
+def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
+    """Supports in the scene frame; none for a free object."""
+    if spec.kind == "free":
+        return ()
+    if spec.kind == "file":
+        return tuple(
+            Obstacle.box(s.pose, s.size) if isinstance(s, Box) else Obstacle.half_space(s.normal, s.offset)
+            for s in spec.supports
+        )
+    if spec.kind == "table":
+        return (Obstacle.half_space([0, 0, 1], 0.0),)
+    return _bin() if spec.kind == "bin" else _shelf()
+
+
+def _at(x: float, y: float, z: float) -> Floats:
+    return np.array([x, y, z, 1.0, 0, 0, 0])
+
+
+def _bin() -> tuple[Obstacle, ...]:
+    (x, y), z = BIN_SIZE, BIN_HEIGHT / 2
+    along, across = (WALL, y + 2 * WALL, BIN_HEIGHT), (x, WALL, BIN_HEIGHT)
+    walls = [(_at(s * (x + WALL) / 2, 0, z), along) for s in (-1, 1)]
+    walls += [(_at(0, s * (y + WALL) / 2, z), across) for s in (-1, 1)]
+    return (Obstacle.half_space([0, 0, 1], 0.0), *(Obstacle.box(pose, size) for pose, size in walls))
+
+
+def _shelf() -> tuple[Obstacle, ...]:
+    width, depth = SHELF_SIZE
+    board = (depth, width, WALL)
+    return (
+        Obstacle.box(_at(0, 0, -WALL / 2), board),
+        Obstacle.box(_at((depth + WALL) / 2, 0, SHELF_HEIGHT / 2), (WALL, width, SHELF_HEIGHT + 2 * WALL)),
+        Obstacle.box(_at(0, 0, SHELF_HEIGHT + WALL / 2), board),
+    )
+
+
+def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
+    """Where the object stands in `count` scenes (with `faces all`, in as many as it has stable faces).
+
+    Returns:
+        `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
+
+    Raises:
+        InputError: the object does not fit between the supports, or stands in one.
+        MeshError: it never comes to rest.
+    """
+    if spec.target is not None:
+        poses = np.tile(np.asarray(spec.target, float), (count, 1))
+        found = {
+            "scene/object_pose": poses,
+            "scene/rest_probability": np.ones(count),
+            "scene/drop_seconds": np.zeros(count),
+        }
+    elif spec.faces == "all":
+        found = _each_face(obj, seed)
+    else:
+        found = drop(obj, count=count, seed=seed)
+    poses = found["scene/object_pose"]
+    supports = supports_of(spec)
+    if spec.kind in ("bin", "shelf"):
+        size = BIN_SIZE if spec.kind == "bin" else SHELF_SIZE[::-1]
+        poses = np.array([_inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)])
+    _check_free(obj, poses, supports)
+    return {**found, "scene/object_pose": poses}
+
+
+def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
+    """One scene for each face that holds the object and that at least `LEAST_PROBABILITY` of drops end on."""
+    faces = resting_faces(obj)
+    stable = faces.stable
+    share = rest_probability(obj, stable.tolist())
+    kept = stable[share >= LEAST_PROBABILITY]
+    if not len(kept):
+        kept = stable[[int(np.argmax(share))]]
+    poses = []
+    for number, face in enumerate(kept):
+        turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)
+        pose = lay_flat(faces, int(face), np.array([0.0, 0, 0, 1, 0, 0, 0]))
+        about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(turn))])
+        pose = compose(about, pose)
+        pose[:2] -= (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[:2]
+        poses.append(pose)
+    return {
+        "scene/object_pose": np.array(poses),
+        "scene/rest_probability": rest_probability(obj, kept.tolist()),
+        "scene/drop_seconds": np.zeros(len(poses)),
+    }
+
+
+def _inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
+    """The pose moved to a random place within a rectangle of x by y [m] about the origin.
+
+    Raises:
+        InputError: the object is too large for it.
+    """
+    corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    room = np.asarray(size) / 2 - GAP
+    if (high - low > 2 * room).any():
+        need, have = 1e3 * (high - low), 1e3 * 2 * room
+        raise InputError(
+            f"{obj.name} lies {need[0]:.0f} x {need[1]:.0f} mm and there is room for {have[0]:.0f} x {have[1]:.0f} mm "
+            "between the walls; choose scene table, or a file with larger supports"
+        )
+    return np.concatenate([rng.uniform(-room - low, room - high), pose[2:]])
+
+
+def _check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
+    for pose in poses:
+        corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
+        for number, support in enumerate(supports):
+            depth = -float(support.distance(corners).min())
+            if depth > SUNK:
+                raise InputError(
+                    f"{obj.name} stands {1e3 * depth:.1f} mm deep in support {number} of its scene; move the target or "
+                    "the support"
+                )

@@ -1,0 +1,103 @@
+"""What grasps are worth in their scenes: are they clear, do they lift the object, at half the friction too, and hold it
+against six pushes?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.judge import judge
+from worker.quality.referee.lift import LiftOutcome
+from worker.quality.referee.lifting import LiftLevel, judge_lifts
+from worker.quality.referee.protocol import DIRECTIONS
+from worker.scenes.way import plan_way
+from worker.surroundings import Scenes
+
+Arrays = dict[str, NDArray[Any]]
+
+#: Clearances beyond this are not told apart [m].
+FARTHEST_M: Final = 1.0
+
+
+def lift_level(referee: str) -> LiftLevel:
+    """The level of the lift test at which a job's referee judges in scenes: the letter is the letter there too."""
+    return "letter" if referee == "letter" else "lift"
+
+
+def scene_verdicts(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    scenes: Scenes,
+    *,
+    level: LiftLevel,
+    pieces: ConvexPieces | None,
+    threads: int,
+    progress: Callable[[float, float, str], None],
+    cancelled: Callable[[], bool],
+) -> tuple[GraspSet, Arrays, dict[str, int]]:
+    """Plan the way of grasps in their scenes, and judge those that are clear.
+
+    A grasp that does not lift is asked nothing more: the six pushes and half the friction are for those that do.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps with `scene`.
+        scenes: the scenes.
+        level: of the lift test.
+        pieces: the object's convex pieces; None: nobody judges, and grasps are only told clear or not.
+        threads: 0: all cores.
+        progress: called with the share that is judged.
+        cancelled: polled between grasps.
+
+    Returns:
+        The grasps with `approach`, `coming` and `lift`; columns of the base shard, `quality/success` being the
+        verdict of the lift (-1: not clear); how many are clear, lift, and lift_hard.
+    """
+    assert grasps.scene is not None
+    placed = scenes.placed(grasps.scene)
+    way = plan_way(hand, obj, grasps, placed)
+    grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+    count, clear = len(grasps), np.flatnonzero(way.clear)
+    columns: Arrays = {"quality/clearance_m": np.minimum(way.least, FARTHEST_M)}
+    counts = {"clear": len(clear), "lift": 0, "lift_hard": 0}
+    success = np.where(way.clear, 0, -1).astype(np.int8)
+    columns["quality/success"] = success
+    if pieces is None:
+        return grasps, columns, counts
+    common: dict[str, Any] = {"threads": threads, "pieces": pieces, "progress": progress, "cancelled": cancelled}
+    lifts = judge_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, **common)
+    success[clear] = lifts.success
+    outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)
+    outcome[clear], margin[clear] = lifts.outcome, lifts.margin
+    lifted = clear[outcome[clear] == LiftOutcome.LIFTED]
+    hard, held = (np.full(count, -1, np.int8) for _ in range(2))
+    pushed = np.zeros((count, len(DIRECTIONS)), np.uint8)
+    if len(lifted):
+        hard[lifted] = judge_lifts(
+            hand, obj, grasps.take(lifted), placed.take(lifted), level=level, hard=True, **common
+        ).success
+        pushes = judge(hand, obj, grasps.take(lifted), **common)
+        held[lifted], pushed[lifted] = pushes.success, pushes.outcome.reshape(-1, len(DIRECTIONS))
+    counts |= {"lift": len(lifted), "lift_hard": int((hard == 1).sum())}
+    return (
+        grasps,
+        columns
+        | {
+            "quality/lift_outcome": outcome,
+            "quality/lift_hard": hard,
+            "quality/pushes": held,
+            "quality/verdict_outcome": pushed,
+            "quality/verdict_margin": margin,
+        },
+        counts,
+    )

@@ -1,0 +1,135 @@
+"""The hand's way in a scene: from a standoff to the pregrasp, closing, the lift; and what it stays clear of.
+
+Against half-spaces distances are exact. Against boxes and neighbours' pieces they are those of the hand's features from
+the obstacle's planes: exact where a corner is nearest, else a lower bound of the features' distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.transforms import quat_rotate
+from worker.grasps import GraspSet, Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.postures import wide_open
+from worker.quality.probe import Probe, probe_of
+from worker.scenes.clearance import approach
+from worker.simulation.obstacles import obstacle_distances
+from worker.surroundings import Placed, Surroundings
+
+Floats = NDArray[np.float64]
+
+#: A way is free if the hand stays this far from every obstacle [m], and its points this far from the object.
+MARGIN_M: Final = 0.002
+OBJECT_MARGIN_M: Final = 0.001
+#: Length of the straight way to the pregrasp, and of the lift [m].
+STANDOFF_M: Final = 0.10
+RISE_M: Final = 0.10
+#: Postures stored on the approach, the standoff first, the pregrasp last, and between them others that are looked at.
+WAYPOINTS: Final = 6
+_LOOKS: Final = 4
+#: Directions of retreat that are tried: the palm's own, mixed with these shares of the direction against gravity.
+SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
+_POINTS: Final = 600
+
+
+@dataclass(frozen=True)
+class Way:
+    """How N grasps are reached and lifted, in the object frame."""
+
+    approach: Floats
+    """(N, W, 7) hand poses from the standoff to the pregrasp, in the joint positions `open`."""
+    open: Floats
+    """(N, J) joint positions of the hand that comes."""
+    lift: Posture
+    """N squeeze postures raised against gravity."""
+    contact: Floats
+    """(N,) least distance from obstacles at the grasp [m]."""
+    closing: Floats
+    """(N,) from the pregrasp to the grasp."""
+    coming: Floats
+    """(N,) on the approach; the hand's points also stay clear of the object where `touching` is False."""
+    lifting: Floats
+    """(N,) on the lift."""
+    touching: NDArray[np.bool_]
+    """(N,) whether the open hand touches the object on its way."""
+
+    @property
+    def least(self) -> Floats:
+        """(N,) least distance from obstacles anywhere on the way [m]."""
+        return np.minimum(np.minimum(self.contact, self.closing), np.minimum(self.coming, self.lifting))
+
+    @property
+    def clear(self) -> NDArray[np.bool_]:
+        """(N,) whether the whole way is free."""
+        return np.asarray((self.least >= MARGIN_M) & ~self.touching)
+
+
+def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed) -> Way:
+    """The way of every grasp in its scene: the first direction of retreat that is free, or else the freest."""
+    probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
+    count = len(grasps)
+    path = np.zeros((count, WAYPOINTS, 7))
+    contact, closing, coming, lifting = (np.full(count, np.inf) for _ in range(4))
+    touching = np.zeros(count, bool)
+    raised = np.array(grasps.squeeze.hand_pose, float)
+    wide = Posture(grasps.pregrasp.hand_pose, wide_open(hand, obj, grasps.pregrasp, placed))
+    for number, scene in enumerate(placed.scenes):
+        rows = np.flatnonzero(placed.index == number)
+        if not len(rows):
+            continue
+        mine = grasps.take(rows)
+        between = obstacle_distances(hand, approach(mine.grasp, mine.pregrasp), scene).reshape(len(rows), -1)
+        before = obstacle_distances(hand, approach(mine.pregrasp, wide.take(rows)), scene).reshape(len(rows), -1)
+        contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
+        path[rows], coming[rows], touching[rows] = _coming(probe, wide.take(rows), scene)
+        rise = RISE_M * scene.up
+        raised[rows, :3] += rise
+        lifted = np.repeat(mine.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
+        lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise
+        joints = np.repeat(mine.grasp.joint_positions, WAYPOINTS, axis=0)
+        lifting[rows] = (
+            obstacle_distances(hand, Posture(lifted.reshape(-1, 7), joints), scene).reshape(len(rows), -1).min(axis=1)
+        )
+    lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
+    return Way(path, wide.joint_positions, lift, contact, closing, coming, lifting, touching)
+
+
+def _coming(probe: Probe, pregrasp: Posture, scene: Surroundings) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Waypoints (n, W, 7), least distance from obstacles (n,) and whether the object is touched (n,)."""
+    count, looks = len(pregrasp), (WAYPOINTS - 1) * _LOOKS + 1
+    back = -quat_rotate(pregrasp.hand_pose[:, 3:], probe.hand.palm.approach)
+    best = np.full(count, -np.inf)
+    least = np.zeros(count)
+    touching = np.ones(count, bool)
+    chosen = np.zeros((count, 3))
+    open_ = np.arange(count)
+    for share in SHARES_UP:
+        way = (1 - share) * back[open_] + share * scene.up
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), scene.up)
+        poses = np.repeat(pregrasp.hand_pose[open_, None], looks, axis=1)
+        poses[..., :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
+        joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
+        postures = Posture(poses.reshape(-1, 7), joints)
+        room = obstacle_distances(probe.hand, postures, scene).reshape(len(open_), looks).min(axis=1)
+        points = probe.posed_points(body_poses(probe.hand, postures.hand_pose, postures.joint_positions))
+        gap = probe.signed_distance(points.reshape(-1, 3))[0].reshape(len(open_), looks, -1).min(axis=2)
+        # The pregrasp itself may stand nearer than the margin: coming must not be nearer than it is.
+        hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
+        score = np.minimum(room, MARGIN_M) - hits
+        better = score > best[open_]
+        rows = open_[better]
+        best[rows], least[rows], touching[rows], chosen[rows] = score[better], room[better], hits[better], way[better]
+        open_ = open_[best[open_] < MARGIN_M]
+        if not len(open_):
+            break
+    poses = np.repeat(pregrasp.hand_pose[:, None], WAYPOINTS, axis=1)
+    poses[..., :3] += np.linspace(STANDOFF_M, 0.0, WAYPOINTS)[:, None] * chosen[:, None]
+    return poses, least, touching

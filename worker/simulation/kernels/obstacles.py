@@ -1,0 +1,160 @@
+"""Hands against the obstacles of their scene: distances, penalties, residuals.
+
+The hand stands in by its features: corners of boxes and hulls, spheres and ends of capsules (balls), rims of cylinders.
+Against a half-space they are exact; of larger obstacles than a link no link can pass between its corners.
+"""
+
+import warp as wp
+
+from worker.simulation.kernels.projection import Residuals, emit
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Features:
+    """F balls (axis zero) and rims (circles about an axis) fixed to bodies."""
+
+    body: wp.array(dtype=wp.int32)
+    centre: wp.array(dtype=wp.vec3)  # body frame
+    axis: wp.array(dtype=wp.vec3)  # body frame; zero: a ball
+    radius: wp.array(dtype=wp.float32)
+    margin: wp.array(dtype=wp.float32)  # distance to keep [m]; negative: it may sink in
+    weight: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Obstacles:
+    """Convex obstacles of all scenes, one after the other; a scene -1 has none."""
+
+    first: wp.array(dtype=wp.int32)  # (S + 1,) into planes_of
+    first_plane: wp.array(dtype=wp.int32)  # (O + 1,)
+    planes: wp.array(dtype=wp.vec4)  # outward unit normal and offset
+    centre: wp.array(dtype=wp.vec3)  # (O,) bounding sphere
+    radius: wp.array(dtype=wp.float32)  # (O,) 1e9: without end
+
+
+@wp.func
+def reach_of(axis: wp.vec3, radius: wp.float32, n: wp.vec3):
+    """How far a feature reaches from its centre towards -n."""
+    along = wp.dot(axis, n)
+    if wp.dot(axis, axis) > 0.5:
+        return radius * wp.sqrt(wp.max(0.0, 1.0 - along * along))
+    return radius
+
+
+@wp.func
+def lowest_point(centre: wp.vec3, axis: wp.vec3, radius: wp.float32, n: wp.vec3):
+    """The feature's point that is farthest along -n."""
+    way = n
+    if wp.dot(axis, axis) > 0.5:
+        way = n - wp.dot(axis, n) * axis
+        length = wp.length(way)
+        if length < 1.0e-9:
+            return centre
+        way = way / length
+    return centre - radius * way
+
+
+@wp.func
+def obstacle_distance(obstacles: Obstacles, k: wp.int32, centre: wp.vec3, axis: wp.vec3, radius: wp.float32):
+    """(normal, distance) of a feature from obstacle k: the largest of its planes' distances."""
+    d = float(-1.0e9)
+    n = wp.vec3(0.0, 0.0, 1.0)
+    for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
+        plane = obstacles.planes[i]
+        normal = wp.vec3(plane[0], plane[1], plane[2])
+        value = wp.dot(normal, centre) - plane[3] - reach_of(axis, radius, normal)
+        if value > d:
+            d = value
+            n = normal
+    return wp.vec4(n[0], n[1], n[2], d)
+
+
+@wp.func
+def outside_sphere(obstacles: Obstacles, k: wp.int32, centre: wp.vec3, reach: wp.float32):
+    """Whether the bounding sphere of obstacle k is farther than `reach` from a point."""
+    if obstacles.radius[k] > 1.0e8:
+        return False
+    offset = centre - obstacles.centre[k]
+    r = obstacles.radius[k] + reach
+    return wp.dot(offset, offset) > r * r
+
+
+@wp.kernel
+def clear(active_in: wp.array(dtype=wp.int32), depth_out: wp.array(dtype=wp.float32)):
+    """No depth yet. Launch over B."""
+    b = wp.tid()
+    if active_in[b] != 0:
+        depth_out[b] = 0.0
+
+
+@wp.kernel
+def penalty(
+    features_in: Features,
+    obstacles_in: Obstacles,
+    active_in: wp.array(dtype=wp.int32),
+    scene_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    weight_in: wp.array(dtype=wp.float32),
+    room_in: wp.float32,
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    force_inout: wp.array2d(dtype=wp.vec3),
+    torque_inout: wp.array2d(dtype=wp.vec3),
+    depth_inout: wp.array(dtype=wp.float32),
+):
+    """Gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, F)."""
+    b, i = wp.tid()
+    if active_in[b] == 0 or scene_in[b] < 0:
+        return
+    body = features_in.body[i]
+    rotation = body_q_in[b, body]
+    centre = body_p_in[b, body] + wp.quat_rotate(rotation, features_in.centre[i])
+    axis = wp.quat_rotate(rotation, features_in.axis[i])
+    radius = features_in.radius[i]
+    margin = features_in.margin[i]
+    weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
+    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+        if outside_sphere(obstacles_in, k, centre, radius + wp.max(margin + room_in, 0.0)):
+            continue
+        nd = obstacle_distance(obstacles_in, k, centre, axis, radius)
+        short = nd[3] - margin - room_in
+        if short < 0.0:
+            n = wp.vec3(nd[0], nd[1], nd[2])
+            if weight != 0.0:
+                f = (weight * short) * n
+                wp.atomic_add(force_inout, b, body, f)
+                wp.atomic_add(torque_inout, b, body, wp.cross(lowest_point(centre, axis, radius, n), f))
+            wp.atomic_max(depth_inout, b, -short)
+
+
+@wp.kernel
+def residuals(
+    features_in: Features,
+    obstacles_in: Obstacles,
+    active_in: wp.array(dtype=wp.int32),
+    scene_in: wp.array(dtype=wp.int32),
+    near_in: wp.float32,
+    target_in: wp.float32,
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    residuals_out: Residuals,
+):
+    """Features nearer to an obstacle than margin + near go to margin + target. Over (B, F)."""
+    b, i = wp.tid()
+    if active_in[b] == 0 or scene_in[b] < 0:
+        return
+    body = features_in.body[i]
+    rotation = body_q_in[b, body]
+    centre = body_p_in[b, body] + wp.quat_rotate(rotation, features_in.centre[i])
+    axis = wp.quat_rotate(rotation, features_in.axis[i])
+    radius = features_in.radius[i]
+    margin = features_in.margin[i]
+    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+        if outside_sphere(obstacles_in, k, centre, radius + wp.max(margin + near_in, 0.0)):
+            continue
+        nd = obstacle_distance(obstacles_in, k, centre, axis, radius)
+        if nd[3] < margin + near_in:
+            n = wp.vec3(nd[0], nd[1], nd[2])
+            emit(residuals_out, b, body, -1, lowest_point(centre, axis, radius, n), n, nd[3] - margin - target_in, 1.0)
