@@ -162,7 +162,7 @@ class Runner:
 
     def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
         try:
-            if isinstance(message, TaskMessage) and shard_exists(context.store, message.stage, message.output):
+            if isinstance(message, TaskMessage) and _has_manifest(message, context):
                 # The task has succeeded already: another worker was faster, or a lost file could not be made again.
                 return self._event(EventKind.CANCELLED, message, message=attempt.reason)
             put_record(context.store, names.attempt(attempt.task_id, attempt.number), attempt)
@@ -183,6 +183,17 @@ class Runner:
             worker=self._worker,
             **facts | more,
         )
+
+
+def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
+    """Whether a readable manifest says that the task has succeeded; a damaged one says nothing."""
+    try:
+        return (
+            shard_exists(context.store, message.stage, message.output)
+            and load_manifest(context.store, message.stage, message.output).shard_id == message.output
+        )
+    except DamagedError:
+        return False
 
 
 def parse_message(raw: Mapping[str, Any]) -> Message:
