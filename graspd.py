@@ -9,7 +9,7 @@ from typing import Any, Final
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from service.version import PACKAGE_VERSION
+from service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
@@ -19,41 +19,46 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
         "Start here",
         "The main job on built-in data: grasps, scenes, pictures, and a page that shows them.",
     ),
-    ("up", "service.commands", "Start here", "The whole service on this machine, until Ctrl-C."),
-    ("submit", "api.commands", "Jobs", "Submit a job: one hand on one object."),
-    ("jobs", "api.commands", "Jobs", "List jobs, the newest first."),
-    ("status", "api.commands", "Jobs", "Stages, progress and quality of a job."),
-    ("cancel", "api.commands", "Jobs", "Stop a job; what is written stays."),
-    ("retry", "api.commands", "Jobs", "Run again what failed or was cancelled."),
-    ("logs", "api.commands", "Jobs", "Failed attempts of a job, with their reasons."),
-    ("hands", "api.commands", "Jobs", "Check, add, list and show hands."),
-    ("objects", "api.commands", "Jobs", "Check, add, list and show objects."),
-    ("datasets", "api.dataset_commands", "Jobs", "Hands x objects as one dataset: cost, status, snapshots, files."),
-    ("api", "api.commands", "Parts of the service", "The HTTP API and the dashboard."),
-    ("keeper", "service.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
-    ("worker", "worker.commands", "Parts of the service", "One worker on one device."),
-    ("index", "service.commands", "Parts of the service", "Rebuild the index from the store."),
-    ("store", "service.store_commands", "Parts of the service", "Check the store, and mend it."),
-    ("keys", "api.commands", "Parts of the service", "Make, list and revoke API keys."),
-    ("synth", "worker.planners.commands", "Without a server", "Grasps of a hand file on an object file."),
-    ("evaluate", "worker.quality.commands", "Without a server", "Quality of grasps, judged by an independent engine."),
-    ("scene", "worker.scenes.commands", "Without a server", "The object at rest on a table; grasps that fit there."),
-    ("render", "worker.rendering.commands", "Without a server", "Pictures of scenes with their labels."),
-    ("chart", "worker.studies.chart.commands", "Studies", "Speed against accuracy of methods and fidelities."),
-    ("bench", "worker.studies.commands", "Studies", "Grasps per second, and where the time goes."),
-    ("pictures", "worker.rendering.commands", "Without a server", "The best grasps of a file on one sheet."),
-    ("export", "worker.exchange.commands", "Without a server", "Grasps and pictures in the formats of others."),
-    ("import", "worker.exchange.commands", "Without a server", "Grasps of others, judged and measured like ours."),
-    ("stability", "worker.studies.stability.commands", "Studies", "Where integrators and the planner fail."),
-    ("gallery", "worker.rendering.studies", "Studies", "Hands and objects at rest, as a camera sees them."),
-    ("bench-render", "worker.rendering.studies", "Studies", "Images per second, and where the time goes."),
+    ("up", "service.run.commands", "Start here", "The whole service on this machine, until Ctrl-C."),
+    ("submit", "api.client.commands", "Jobs", "Submit a job: one hand on one object."),
+    ("jobs", "api.client.commands", "Jobs", "List jobs, the newest first."),
+    ("status", "api.client.commands", "Jobs", "Stages, progress and quality of a job."),
+    ("cancel", "api.client.commands", "Jobs", "Stop a job; what is written stays."),
+    ("retry", "api.client.commands", "Jobs", "Run again what failed or was cancelled."),
+    ("logs", "api.client.commands", "Jobs", "Failed attempts of a job, with their reasons."),
+    ("hands", "api.client.commands", "Jobs", "Check, add, list and show hands."),
+    ("objects", "api.client.commands", "Jobs", "Check, add, list and show objects."),
+    (
+        "datasets",
+        "api.client.dataset_commands",
+        "Jobs",
+        "Hands x objects as one dataset: cost, status, snapshots, files.",
+    ),
+    ("api", "api.server_command", "Parts of the service", "The HTTP API and the dashboard."),
+    ("keeper", "service.run.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
+    ("worker", "worker.commands.worker", "Parts of the service", "One worker on one device."),
+    ("index", "service.run.commands", "Parts of the service", "Rebuild the index from the store."),
+    ("store", "service.run.store_commands", "Parts of the service", "Check the store, and mend it."),
+    ("keys", "api.client.commands", "Parts of the service", "Make, list and revoke API keys."),
+    ("synth", "worker.commands.synth", "Without a server", "Grasps of a hand file on an object file."),
+    ("evaluate", "worker.commands.evaluate", "Without a server", "Quality of grasps, judged by an independent engine."),
+    ("scene", "worker.commands.scene", "Without a server", "The object at rest on a table; grasps that fit there."),
+    ("render", "worker.commands.render", "Without a server", "Pictures of scenes with their labels."),
+    ("chart", "worker.commands.chart", "Studies", "Speed against accuracy of methods and fidelities."),
+    ("bench", "worker.commands.bench", "Studies", "Grasps per second, and where the time goes."),
+    ("pictures", "worker.commands.render", "Without a server", "The best grasps of a file on one sheet."),
+    ("export", "worker.commands.exchange", "Without a server", "Grasps and pictures in the formats of others."),
+    ("import", "worker.commands.exchange", "Without a server", "Grasps of others, judged and measured like ours."),
+    ("stability", "worker.commands.stability", "Studies", "Where integrators and the planner fail."),
+    ("gallery", "worker.commands.gallery", "Studies", "Hands and objects at rest, as a camera sees them."),
+    ("bench-render", "worker.commands.gallery", "Studies", "Images per second, and where the time goes."),
 )
 
 #: Group of one room, command in it, module of the room that has it, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
-    ("hands", "check", "worker.hands.commands", "Say whether a hand can be used, and what was guessed about it."),
-    ("objects", "check", "worker.objects.commands", "Say whether a mesh can be used, and what was repaired."),
-    ("datasets", "card", "worker.cards.commands", "Write a dataset's card: contents, quality, biases, plots."),
+    ("hands", "check", "worker.commands.hands", "Say whether a hand can be used, and what was guessed about it."),
+    ("objects", "check", "worker.commands.objects", "Say whether a mesh can be used, and what was repaired."),
+    ("datasets", "card", "worker.commands.card", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
 #: What a room cannot work without, and the extra that brings it: an image has only the rooms it needs.

@@ -12,19 +12,19 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from api.client import Client
-from api.dashboard.filters import count, duration, metric
+from api.client.client import Client
+from api.client.reports import job_request, job_summary, means_of, yield_of
+from api.client.watching import JobDisplay
+from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
-from api.reports import job_request, job_summary, means_of, yield_of
-from api.watching import JobDisplay
-from service import standing
-from service.assets import builtin_files
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
-from service.domain import AssetKind, JobRequest, State
-from service.errors import TaskError
 from service.index.views import GraspView
-from service.shards import Shard, read_shard
-from service.supervisor import Supervisor
+from service.model.domain import AssetKind, JobRequest, State
+from service.model.errors import TaskError
+from service.run.supervisor import Supervisor
+from service.store import standing
+from service.store.assets import builtin_files
+from service.store.shards import Shard, read_shard
 
 app = typer.Typer()
 
@@ -136,7 +136,7 @@ def print_results(console: Console, best: list[GraspView], job: JobDetail, paths
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     """The contact sheet of the best grasps, the views of the first batch, and an index.html that shows both."""
-    from worker.rendering.sheets import views_page
+    from worker.rendering.pages.sheets import views_page
 
     pictures = []
     bases = [path for path in shards if path.name.startswith("base")]
@@ -155,11 +155,11 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     """PNG of the best grasps of a shard, ranked by ε."""
     # Warp takes seconds to import; a mistake in an option must not wait for it.
-    from worker import backend
+    from worker.engines import backend
     from worker.hands.load import load_hand
     from worker.objects.prepare import load_object
-    from worker.rendering.pictures import grasp_pictures
-    from worker.rendering.sheets import best, contact_sheet, figures
+    from worker.rendering.pages.pictures import grasp_pictures
+    from worker.rendering.pages.sheets import best, contact_sheet, figures
 
     backend.start()
     hand_files, object_files = (

@@ -12,25 +12,27 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.staticfiles import StaticFiles
 
 from api import problems
-from api.catalog import Catalog
+from api.access.keys import KeyFile
+from api.catalog.catalog import Catalog
 from api.dashboard import pages
 from api.dashboard.rendering import STATIC, problem_page
-from api.guard import RequestContext, SameOrigin, host_name, is_loopback
-from api.keys import KeyFile
-from api.limits import BodyLimit
+from api.hosts import host_name, is_loopback
 from api.metrics import Metrics
-from api.rates import Rates
+from api.middleware.body_limit import BodyLimit
+from api.middleware.rates import Rates
+from api.middleware.request_context import RequestContext
+from api.middleware.same_origin import SameOrigin
+from api.middleware.turnstile import Turnstile
 from api.routes import datasets, grasps, jobs, shards, system
 from api.routes.assets import asset_router
-from api.turns import FORMS, UPLOADS, Turns
-from api.turnstile import Turnstile
-from service.domain import AssetKind
-from service.embedded import redis_url
-from service.errors import InputError, UnavailableError
+from api.routes.long_requests import FORMS, UPLOADS, Turns
 from service.index.rebuild import complete_if_new
-from service.parts import Parts
+from service.model.domain import AssetKind
+from service.model.errors import InputError, UnavailableError
+from service.model.version import PACKAGE_VERSION
+from service.pipeline.backends import Parts
+from service.queue.address import redis_url
 from service.settings import Settings
-from service.version import PACKAGE_VERSION
 
 _log = logging.getLogger("graspd.api")
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})

@@ -9,10 +9,10 @@ from typing import Any, Final
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
-from service.metrics.index_now import IndexNow
-from service.metrics.queue_now import QueueNow
-from service.metrics.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
-from service.metrics.tally import parse_field
+from service.index.at_scrape import IndexNow
+from service.pipeline.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
+from service.pipeline.tally import parse_field
+from service.queue.at_scrape import QueueNow
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.domain import JobRequest, Stage, State
 from service.index.views import AttemptView, GraspView, ShardView, StageProgress, WorkerView
+from service.model.domain import JobRequest, Stage, State
 
 
 class StageStatus(StageProgress):

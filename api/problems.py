@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from service.errors import (
+from service.model.errors import (
     BusyError,
     ConflictError,
     DamagedError,

@@ -12,8 +12,8 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from api.app import create_app
-from api.protocol import TimedProtocol
-from service.errors import BusyError, InputError
+from api.middleware.protocol import TimedProtocol
+from service.model.errors import BusyError, InputError
 from service.settings import Settings
 
 #: Open event streams end with their clients; a stop does not wait longer than this.

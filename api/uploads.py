@@ -9,10 +9,10 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
 from typing import IO, Final
 
-from service.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
-from service.descriptions import json_object
-from service.domain import AssetKind
-from service.errors import InputError, LimitError
+from service.model.domain import AssetKind
+from service.model.errors import InputError, LimitError
+from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
+from service.store.descriptions import json_object
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: (".urdf", ".xml"),

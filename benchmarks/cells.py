@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from service.domain import FIDELITIES
+from service.model.domain import FIDELITIES
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

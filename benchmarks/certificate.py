@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from cells import HANDS, cells, write_json
 
-from worker.intervals import wilson
+from worker.quality.intervals import wilson
 
 CORES = 2
 LEVELS = ("letter", "certificate", "screen")

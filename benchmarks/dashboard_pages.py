@@ -27,9 +27,9 @@ import uvicorn
 from api.app import create_app
 from api.server import bind
 from service.index.index import Index
-from service.parts import Parts
+from service.pipeline.backends import Parts
 from service.settings import Settings
-from service.store import open_store
+from service.store.store import open_store
 from tests.memory_queue import MemoryQueue
 
 _CHROMIUM = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic")

@@ -20,21 +20,21 @@ from typing import Any, Final
 import numpy as np
 from sqlalchemy import Connection, Table
 
-from service import names
-from service.digests import digest_json, job_id
-from service.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.index.changes.rows import attempt_row, job_row, shard_row, task_rows
+from service.index.changes.states import settle
 from service.index.database import upsert
 from service.index.index import Index
-from service.index.rows import attempt_row, job_row, shard_row, task_rows
-from service.index.states import settle
 from service.index.tables import METRICS, attempts, grasps, jobs, shards, tasks
-from service.library import publish_builtins
-from service.manifests import ShardManifest
-from service.planning import PlannedTask, plan
-from service.records import AttemptRecord, JobRecord
+from service.model import names
+from service.model.digests import digest_json, job_id
+from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.model.planning import PlannedTask, plan
+from service.model.records import AttemptRecord, JobRecord
+from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.settings import Settings
-from service.store import Store, open_store
-from service.version import PACKAGE_VERSION, STAGE_REVISIONS
+from service.store.library import publish_builtins
+from service.store.manifests import ShardManifest
+from service.store.store import Store, open_store
 
 _CHUNK: Final = 20_000
 #: Of a hundred jobs so many are in each state; the running ones are half done.

@@ -23,12 +23,12 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from api.client import Client
-from api.dashboard.filters import duration, size
-from api.dataset_client import DatasetClient
-from service.cores import available_cores
+from api.client.client import Client
+from api.client.datasets import DatasetClient
+from api.formatting import duration, size
 from service.index.dataset_views import CellView, DatasetView
-from service.version import PACKAGE_VERSION
+from service.model.cores import available_cores
+from service.model.version import PACKAGE_VERSION
 
 #: Name in the service and URDF of each hand.
 HANDS: Final = {

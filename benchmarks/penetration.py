@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from service.domain import FIDELITIES
-from service.transforms import apply
+from service.model.domain import FIDELITIES
+from service.model.transforms import apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from cells import HANDS, SEED, Cell, cells, write_json
 
-from service.version import PACKAGE_VERSION
+from service.model.version import PACKAGE_VERSION
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of

@@ -21,16 +21,18 @@ from typing import Any, Final
 
 import httpx
 
-import worker.main
-from service import names, pipeline
-from service.domain import Lane, State
+import worker.process.main
 from service.index.index import Index
-from service.parts import Parts
-from service.planning import message_of, plan
-from service.records import JobRecord, read_record
+from service.model import names
+from service.model.domain import Lane, State
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.run.supervisor import Supervisor
 from service.settings import Settings
-from service.store import open_store
-from service.supervisor import Supervisor
+from service.store.records import read_record
+from service.store.store import open_store
 from tests.fakes import add_assets, fake_stages, make_shard, request
 from tests.memory_queue import MemoryQueue
 
@@ -71,7 +73,7 @@ def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[P
 def run(parts: Parts, batches: int, seed: int) -> float:
     """Seconds from the submission of a bulk job to its end."""
     start = time.perf_counter()
-    job = pipeline.submit(parts, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
+    job = job_actions.submit(parts, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
     while parts.index.job(job).state is not State.SUCCEEDED:
         time.sleep(0.05)
     return time.perf_counter() - start
@@ -81,7 +83,7 @@ def queue() -> None:
     """What a task costs beyond its work: the queue alone, then with its shard, manifest and place in the index."""
     spent: list[float] = []
 
-    class Timed(worker.main.Runner):
+    class Timed(worker.process.main.Runner):
         def run(self, *args: Any) -> Any:
             start = time.perf_counter()
             try:
@@ -90,10 +92,10 @@ def queue() -> None:
                 spent.append(time.perf_counter() - start)
 
     with service(workers=0) as parts:
-        pipeline.submit(parts, request(grasps=32 * 500), lane=Lane.BULK)
-        worker.main.Runner = Timed  # type: ignore[misc]
+        job_actions.submit(parts, request(grasps=32 * 500), lane=Lane.BULK)
+        worker.process.main.Runner = Timed  # type: ignore[misc]
         start = time.perf_counter()
-        worker.main.run_worker(parts.settings, table=fake_stages(), max_tasks=400)
+        worker.process.main.run_worker(parts.settings, table=fake_stages(), max_tasks=400)
         whole = (time.perf_counter() - start) / len(spent)
     alone = whole - statistics.fmean(spent)
     say(f"| queue, lease and events | {1000 * alone:.1f} ms | {alone / BATCH_S:.1%} of a batch of {BATCH_S:g} s |")
@@ -118,7 +120,7 @@ def indexer(url: str | None) -> None:
         index = Index(url or f"sqlite:///{folder}/index.sqlite")
         parts = Parts(Settings(data_dir=Path(folder)), open_store("memory://"), index, MemoryQueue())
         add_assets(parts)
-        job = pipeline.submit(parts, request(grasps=32 * 1000, seed=time.time_ns() % 10**6))[0].id
+        job = job_actions.submit(parts, request(grasps=32 * 1000, seed=time.time_ns() % 10**6))[0].id
         record = read_record(JobRecord, parts.store, names.job_record(job))
         made = [make_shard(parts.store, message_of(record, t, attempt=1, max_attempt=3)) for t in plan(record)]
         start = time.perf_counter()

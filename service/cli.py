@@ -15,7 +15,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from service import logs
-from service.errors import GraspdError, InputError
+from service.model.errors import GraspdError, InputError
 from service.settings import Settings
 
 P = ParamSpec("P")

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from service.metrics.series import series_table
+from service.pipeline.series import series_table
 from service.settings import Settings
-from service.shards import SCHEMAS, ShardKind
+from service.store.shards import SCHEMAS, ShardKind
 
 
 def schema_table(kind: ShardKind) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import obstore
 from numpy.typing import NDArray
 
-from service.store import Store
+from service.store.store import Store
 
 
 def overwrite(store: Store, key: str, data: bytes) -> None:

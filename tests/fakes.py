@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from service import names
-from service.clock import timestamp
-from service.domain import AssetKind, JobRequest, Lane, Stage, TaskMessage
-from service.library import publish_asset
-from service.manifests import ShardManifest, publish_shard
-from service.parts import Parts
-from service.planning import message_of, plan
-from service.records import JobRecord
-from service.store import Store
-from worker.context import TaskContext
-from worker.selfcheck import EngineError
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import AssetKind, JobRequest, Lane, Stage, TaskMessage
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.store.library import publish_asset
+from service.store.manifests import ShardManifest, publish_shard
+from service.store.store import Store
+from worker.process.selfcheck import EngineError
+from worker.stages.context import TaskContext
 from worker.stages.output import Output, shard_of
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
@@ -135,7 +135,7 @@ def main() -> None:
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
-    from worker.main import run_worker
+    from worker.process.main import run_worker
 
     settings = Settings()
     log_to_stderr(settings, "worker")

@@ -9,9 +9,10 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from service.domain import Lane, Stage
-from service.metrics.queue_now import QueueNow, WorkerPulse
-from service.queue.port import Event, Lease, Message, WorkerBeat, lane_order
+from service.model.domain import Lane, Stage
+from service.model.worker_beat import WorkerBeat
+from service.queue.at_scrape import QueueNow, WorkerPulse
+from service.queue.port import Event, Lease, Message, lane_order
 
 
 @dataclass

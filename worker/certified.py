@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.domain import BATCH_SIZE, JobOptions
+from service.model.domain import BATCH_SIZE, JobOptions
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -32,7 +32,7 @@ from worker.quality.referee.protocol import DIRECTIONS
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
 from worker.scenes.verdicts import lift_level, scene_verdicts
-from worker.surroundings import Scenes
+from worker.simulation.surroundings import Scenes
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -12,19 +12,19 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
-from api import dataset_quota
-from api.auth import NotYours
-from api.catalog import Catalog
-from api.dashboard import matrix
+from api.access.auth import NotYours
+from api.catalog import dataset_quota
+from api.catalog.catalog import Catalog
+from api.dashboard.figures import matrix
 from api.dashboard.form_uploads import asset_choices
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
-from api.dependencies import CatalogOf, may_read, may_submit
-from service.datasets import actions
-from service.datasets.spec import DatasetRequest
-from service.domain import OFFERED, AssetKind, JobRequest, State
-from service.errors import ConflictError, InputError
+from api.routes.dependencies import CatalogOf, may_read, may_submit
 from service.index.dataset_views import CellView
+from service.model.domain import OFFERED, AssetKind, JobRequest, State
+from service.model.errors import ConflictError, InputError
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
 #: A matrix of more cells is shown as a list, a page at a time: nobody reads a table of ten thousand fields.

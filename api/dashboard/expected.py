@@ -10,12 +10,12 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service.datasets.cost import estimate
-from service.datasets.spec import Matrix
-from service.domain import OFFERED, Stage
-from service.errors import GraspdError
-from service.index.cost_queries import BatchCost
 from service.index.index import Index
+from service.index.queries.costs import BatchCost
+from service.model.domain import OFFERED, Stage
+from service.model.errors import GraspdError
+from service.pipeline.datasets.cost import estimate
+from service.pipeline.datasets.spec import Matrix
 
 #: Costs of batches change slowly, and reading two thousand of them takes as long as a page may.
 KEPT_S: Final = 60.0

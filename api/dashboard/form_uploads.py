@@ -14,13 +14,13 @@ from typing import Any, Final
 from fastapi import Request
 from starlette.datastructures import FormData, UploadFile
 
-from api.catalog import Catalog
+from api.catalog.catalog import Catalog
 from api.routes.assets import store_upload
-from service.descriptions import json_object
-from service.domain import AssetKind
-from service.errors import GraspdError, InputError
 from service.index.views import AssetView
-from service.library import load_asset_files
+from service.model.domain import AssetKind
+from service.model.errors import GraspdError, InputError
+from service.store.descriptions import json_object
+from service.store.library import load_asset_files
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))

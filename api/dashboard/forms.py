@@ -10,12 +10,12 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
-from api.catalog import Catalog
+from api.catalog.catalog import Catalog
 from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen
 from api.dashboard.rendering import render
-from api.dependencies import CatalogOf, may_read, may_submit
-from service.domain import AssetKind, JobRequest
-from service.errors import InputError
+from api.routes.dependencies import CatalogOf, may_read, may_submit
+from service.model.domain import AssetKind, JobRequest
+from service.model.errors import InputError
 
 router = APIRouter(include_in_schema=False)
 

@@ -10,10 +10,10 @@ from fastapi.responses import HTMLResponse
 from api.dashboard import snippets
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
-from api.dependencies import CatalogOf, may_read
 from api.models import GraspDetail, GraspQuery
-from api.paging import next_address
-from service.domain import AssetKind
+from api.routes.dependencies import CatalogOf, may_read
+from api.routes.paging import next_address
+from service.model.domain import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 #: Sort key, label, unit of the metrics that lists of grasps show.

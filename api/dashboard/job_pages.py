@@ -7,12 +7,13 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from api.dashboard import charts, snippets
+from api.dashboard import snippets
+from api.dashboard.figures import charts
 from api.dashboard.grasp_pages import COLUMNS
 from api.dashboard.pictures import Channel
 from api.dashboard.rendering import render
-from api.dependencies import CatalogOf, may_read
 from api.models import GraspQuery, JobDetail
+from api.routes.dependencies import CatalogOf, may_read
 
 _SHOWN_PICTURES: Final = 8
 _SHOWN_GRASPS: Final = 10

@@ -9,13 +9,13 @@ from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.responses import HTMLResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from api import events
+from api.catalog import events
 from api.dashboard import dataset_pages, forms, grasp_pages, job_pages, service_pages, session
 from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
-from api.dependencies import CatalogOf, may_read
 from api.problems import ERRORS
+from api.routes.dependencies import CatalogOf, may_read
 
 router = APIRouter(include_in_schema=False)
 

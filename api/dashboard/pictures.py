@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.errors import NotFoundError
-from service.integrity import read_checked
-from service.shards import open_shard
-from service.store import Store
+from service.model.errors import NotFoundError
+from service.store.integrity import read_checked
+from service.store.shards import open_shard
+from service.store.store import Store
 
 Channel = Literal["rgb", "depth", "segmentation"]
 

@@ -9,10 +9,10 @@ from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
-from api.auth import is_allowed, may_change
-from api.dashboard import filters
-from api.keys import Scope
-from service.version import PACKAGE_VERSION
+from api import formatting
+from api.access.auth import is_allowed, may_change
+from api.access.keys import Scope
+from service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
@@ -35,7 +35,7 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters.install(made)
+    made.filters.update(formatting.FILTERS)
     return made
 
 

@@ -9,15 +9,15 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 
-from api.catalog import Catalog
-from api.dashboard import charts, stability, tradeoff
+from api.catalog.catalog import Catalog
+from api.dashboard.figures import charts, stability, tradeoff
 from api.dashboard.rendering import render
-from api.dependencies import CatalogOf, may_read
 from api.models import STAGE_LABELS
-from service.domain import State
-from service.errors import NotFoundError, UnavailableError
+from api.routes.dependencies import CatalogOf, may_read
 from service.index.dataset_views import DatasetView
 from service.index.views import TaskView, WorkerView
+from service.model.domain import State
+from service.model.errors import NotFoundError, UnavailableError
 
 PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)

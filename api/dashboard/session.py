@@ -7,9 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from api.auth import SESSION_COOKIE
+from api.access.auth import SESSION_COOKIE
+from api.access.keys import SESSION_S, KeyFile
 from api.dashboard.rendering import render
-from api.keys import SESSION_S, KeyFile
 
 router = APIRouter(include_in_schema=False)
 

@@ -9,17 +9,17 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
 from starlette.datastructures import UploadFile as AnyUpload
 
-from api.catalog import Catalog
-from api.conditions import is_known
-from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
-from api.paging import link_next
+from api.catalog.catalog import Catalog
 from api.problems import responses
-from api.turns import UPLOADS, Turns
+from api.routes.conditions import is_known
+from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.routes.long_requests import UPLOADS, Turns
+from api.routes.paging import link_next
 from api.uploads import files_of_upload, name_of_upload
-from service import names
-from service.domain import AssetKind, Name
-from service.errors import RateError
 from service.index.views import AssetView, Page
+from service.model import names
+from service.model.domain import AssetKind, Name
+from service.model.errors import RateError
 
 _GLB: Final = "model/gltf-binary"
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.

@@ -7,19 +7,20 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from api import dataset_quota
-from api.auth import caller, must_own
-from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
-from api.paging import link_next
+from api.access.auth import caller, must_own
+from api.catalog import dataset_quota
 from api.problems import ApiError, responses
-from service.charts import Resolver
-from service.datasets import actions
-from service.datasets.cost import Estimate, estimate
-from service.datasets.records import Snapshot, load_snapshot
-from service.datasets.spec import DatasetRequest, Matrix, Names
-from service.domain import Name, State
+from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.routes.paging import link_next
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import Page
+from service.model.dataset_records import Snapshot
+from service.model.domain import Name, State
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.cost import Estimate, estimate
+from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
+from service.pipeline.fidelity_choice import Resolver
+from service.store.datasets import load_snapshot
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 sets_router = APIRouter(prefix="/v1/object-sets", tags=["object sets"])

@@ -6,10 +6,10 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from api.dependencies import CatalogOf, may_read
 from api.models import GraspDetail, GraspPageQuery
-from api.paging import link_next
 from api.problems import responses
+from api.routes.dependencies import CatalogOf, may_read
+from api.routes.paging import link_next
 from service.index.views import GraspView, Page
 
 router = APIRouter(prefix="/v1/grasps", tags=["grasps"])

@@ -8,13 +8,13 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from api import events
-from api.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.catalog import events
 from api.models import Job, JobDetail
-from api.paging import link_next
 from api.problems import responses
-from service.domain import JobRequest, State
+from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.routes.paging import link_next
 from service.index.views import Page
+from service.model.domain import JobRequest, State
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 
-from api.conditions import is_known, range_applies
-from api.dependencies import CatalogOf, Cursor, Limit, may_read
 from api.models import Shard
-from api.paging import link_next
 from api.problems import ApiError, responses
+from api.routes.conditions import is_known, range_applies
+from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read
+from api.routes.paging import link_next
 from service.index.views import Page
 
 router = APIRouter(prefix="/v1/shards", tags=["shards"])

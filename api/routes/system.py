@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Depends, Request, Response
 
-from api.auth import is_allowed
-from api.dependencies import CatalogOf, may_read, may_scrape
-from api.keys import Scope
+from api.access.auth import is_allowed
+from api.access.keys import Scope
 from api.metrics import CONTENT_TYPE, Metrics
 from api.models import Health, Worker
 from api.problems import responses
+from api.routes.dependencies import CatalogOf, may_read, may_scrape
 from service.index.views import Stats
 
 router = APIRouter(tags=["system"])

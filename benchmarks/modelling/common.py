@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from service.domain import FIDELITIES
+from service.model.domain import FIDELITIES
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.intervals import wilson
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import Scene
 from worker.quality.referee.protocol import Test

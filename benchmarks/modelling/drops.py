@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.modelling.common import SEED, Floats, Row, Subject, cpu, share
-from service.transforms import compose, quat_rotate
+from service.model.transforms import compose, quat_rotate
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.scenes import simulate

@@ -15,12 +15,12 @@ from scipy.stats import rankdata
 
 from benchmarks.modelling.common import Bools, Floats, Row, Subject, cpu, ranking, share, verdicts
 from benchmarks.modelling.steps import rollout
-from worker.planners.fast_graspd.merit import FRICTION
+from worker.planners.fast_graspd.selection import FRICTION
 from worker.quality.postures import hold_forces
 from worker.quality.probe import probe_of
 from worker.quality.referee.decomposition import ConvexPieces, union_volume
 from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.model import Physics, Scene, build
+from worker.quality.referee.model import MujocoOptions, Scene, build
 from worker.quality.table import measure
 from worker.simulation.reference import World
 
@@ -92,9 +92,9 @@ def _hull(subject: Subject) -> ConvexPieces:
     return ConvexPieces((corners,), volume / subject.obj.volume, 0.0, "hull")
 
 
-def engines() -> dict[str, tuple[Physics, Callable[[Scene], None] | None, bool]]:
+def engines() -> dict[str, tuple[MujocoOptions, Callable[[Scene], None] | None, bool]]:
     """Variants of the referee: physics, what is done to the compiled scene, whether the object is one hull."""
-    base = Physics()
+    base = MujocoOptions()
     slide, _ = base.friction
     return {
         "certificate": (base, None, False),

@@ -10,10 +10,10 @@ import numpy as np
 import trimesh
 
 from benchmarks.modelling.common import SEED, Row, cpu, object_of
-from service.transforms import apply, invert
+from service.model.transforms import apply, invert
 from worker.rendering.cameras import Cameras
+from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.rendering.scenery import Pictures
-from worker.rendering.setting import CameraPlan, Setting
 from worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
 from worker.scenes.simulate import drop
 

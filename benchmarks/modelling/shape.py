@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of, share, verdicts
-from service.domain import FIDELITIES
+from service.model.domain import FIDELITIES
 from worker.planners import synthesize
 from worker.quality.penetration import penetration_depth
 from worker.quality.probe import probe_of
 from worker.quality.referee.decomposition import decompose
-from worker.quality.referee.model import Physics, build
+from worker.quality.referee.model import MujocoOptions, build
 
 STANDARD = FIDELITIES["standard"]
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -34,7 +34,7 @@ def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
     for name in objects:
         # One judge for all settings: pieces of the standard object, whose digest is in the cache.
         standard = object_of(data, name)
-        scenes[name] = build(hand, standard, decompose(standard), Physics())
+        scenes[name] = build(hand, standard, decompose(standard), MujocoOptions())
     rows: list[Row] = []
     for setting, change in SETTINGS.items():
         fidelity = STANDARD.model_copy(update=change)

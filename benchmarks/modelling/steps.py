@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import quat_from_axis_angle, quat_to_matrix
+from service.model.transforms import quat_from_axis_angle, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.quality.probe import Probe

@@ -19,7 +19,7 @@ from examples.train_grasp_predictor.sheet import page
 from examples.train_grasp_predictor.table import CARRIED_OUT, DATA, PROPOSED, Row, markdown
 from examples.train_grasp_predictor.training import train
 from service.readers import Shards, open_shards
-from worker import backend
+from worker.engines import backend
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

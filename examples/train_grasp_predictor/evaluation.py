@@ -10,7 +10,7 @@ import numpy as np
 
 from examples.train_grasp_predictor.samples import Example
 from service.readers import Grasps, Shards
-from service.shards import read_shard
+from service.store.shards import read_shard
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from examples.train_grasp_predictor.network import Predictor
 from examples.train_grasp_predictor.samples import Example
-from service.transforms import compose, invert, quat_from_matrix, quat_rotate
+from service.model.transforms import compose, invert, quat_from_matrix, quat_rotate
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import Closer
 from worker.planners.fast_graspd.pairs import Pair
-from worker.planners.ground import free_starts, grasp_set, ground_of
+from worker.planners.peers import free_starts, grasp_set, ground_of
 from worker.simulation.simulation import HandState
 
 Floats = NDArray[np.float64]

@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
+from service.model.transforms import quat_rotate, quat_to_matrix
 from service.readers import Pictures, Shards
-from service.shards import read_shard
-from service.transforms import quat_rotate, quat_to_matrix
+from service.store.shards import read_shard
 
 #: Side of the crop [px], and how much larger than the object's box it is.
 SIZE: Final = 64

@@ -12,8 +12,8 @@ from examples.train_grasp_predictor.evaluation import Held
 from examples.train_grasp_predictor.execution import TAKEN
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
-from worker.rendering.pictures import grasp_pictures
-from worker.rendering.sheets import label_page
+from worker.rendering.pages.pictures import grasp_pictures
+from worker.rendering.pages.sheets import label_page
 
 SIDE: Final = 240
 #: Proposals of a source drawn for each object: the best of its first pictures.

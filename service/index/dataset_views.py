@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.domain import JobOptions, State
 from service.index.views import View
+from service.model.domain import JobOptions, State
 
 
 class DatasetView(View):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.domain import Model
+from service.model.domain import Model
 
 Metric = Literal[
     "epsilon",

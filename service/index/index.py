@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from service.index.changes import Changes
-from service.index.cost_queries import CostQueries
-from service.index.dataset_changes import DatasetChanges
-from service.index.dataset_queries import DatasetQueries
-from service.index.feed import Feed
-from service.index.grasp_queries import GraspQueries
-from service.index.job_queries import JobQueries
+from service.index.changes.datasets import DatasetChanges
+from service.index.changes.records import Changes
+from service.index.changes.removals import Removals
 from service.index.notes import Notes
-from service.index.removals import Removals
-from service.index.service_queries import ServiceQueries
-from service.index.summaries import Summaries
+from service.index.queries.costs import CostQueries
+from service.index.queries.datasets import DatasetQueries
+from service.index.queries.feed import Feed
+from service.index.queries.grasps import GraspQueries
+from service.index.queries.jobs import JobQueries
+from service.index.queries.service import ServiceQueries
+from service.index.queries.summaries import Summaries
 
 
 class Index(

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select
 
-from service.clock import timestamp
 from service.index.database import Database, upsert
 from service.index.tables import damage, notes
+from service.model.clock import timestamp
 
 _REBUILT: Final = "rebuilt"
 _SCRUB: Final = "scrub"

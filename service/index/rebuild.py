@@ -13,17 +13,18 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import Connection, Table, delete, select
 from sqlalchemy.exc import DataError
 
-from service import names
-from service.datasets.records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
-from service.deletion import pending
-from service.domain import State
-from service.errors import DamagedError, InputError, NotFoundError
 from service.index.index import Index
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
-from service.library import load_asset, load_check, stored_assets
-from service.manifests import ShardManifest
-from service.records import AttemptRecord, JobEvent, JobRecord, Record, parse_record
-from service.store import Store
+from service.model import names
+from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
+from service.model.domain import State
+from service.model.errors import DamagedError, InputError, NotFoundError
+from service.model.records import AttemptRecord, JobEvent, JobRecord, Record
+from service.store.deletions import pending
+from service.store.library import load_asset, load_check, stored_assets
+from service.store.manifests import ShardManifest
+from service.store.records import parse_record
+from service.store.store import Store
 
 log = logging.getLogger(__name__)
 EventT = TypeVar("EventT", bound=Record)

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from service.errors import IndexUnavailable
+from service.model.errors import IndexUnavailable
 
 log = logging.getLogger(__name__)
 #: What SQLite keeps beside the file while it is open: the log of writes and its shared memory.

@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
-from service.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
 
 T = TypeVar("T")
 

@@ -1,0 +1,1 @@
+"""The queue: tasks to workers, leases and events back."""

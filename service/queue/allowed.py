@@ -15,7 +15,7 @@ from rq.exceptions import NoSuchJobError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from service.errors import TaskRefused
+from service.model.errors import TaskRefused
 from service.queue.entries import is_wrong_type, text
 
 #: The one function name a job may carry.

@@ -8,7 +8,7 @@ from redis import Redis
 from redis.backoff import ExponentialBackoff
 from redis.retry import Retry
 
-from service.errors import QueueUnavailable
+from service.model.errors import QueueUnavailable
 
 _SOCKET_TIMEOUT_S: Final = 10.0
 _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}

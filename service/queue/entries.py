@@ -15,8 +15,9 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 from redis.exceptions import ResponseError
 
-from service.domain import IngestMessage, Stage, TaskMessage
-from service.queue.port import Event, Message, WorkerBeat
+from service.model.domain import IngestMessage, Stage, TaskMessage
+from service.model.worker_beat import WorkerBeat
+from service.queue.port import Event, Message
 
 _BEAT: Final = TypeAdapter(WorkerBeat)
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")

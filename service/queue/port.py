@@ -9,8 +9,9 @@ from typing import Annotated, Final, Protocol
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from service.domain import IngestMessage, Lane, Model, Stage, TaskMessage, Word
-from service.metrics.queue_now import QueueNow
+from service.model.domain import IngestMessage, Lane, Model, Stage, TaskMessage, Word
+from service.model.worker_beat import Count, HostWord, WorkerBeat
+from service.queue.at_scrape import QueueNow
 
 Message = TaskMessage | IngestMessage
 
@@ -48,9 +49,6 @@ def _cut(value: object) -> object:
     return value[:_LONGEST_MESSAGE] if isinstance(value, str) else value
 
 
-#: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
-HostWord = Annotated[str, Field(max_length=300)]
-Count = Annotated[int, Field(ge=0, lt=2**31)]
 Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 _LONGEST_MESSAGE: Final = 2000
 
@@ -89,26 +87,6 @@ class Lease:
     beat: str
     message: Message | None
     """What was asked of the worker; None if Redis no longer knows."""
-
-
-@dataclass(frozen=True)
-class WorkerBeat:
-    """What a living worker says about itself."""
-
-    name: HostWord
-    host: HostWord
-    pid: Count
-    device: HostWord
-    device_name: HostWord
-    stages: tuple[Stage, ...]
-    version: Annotated[str, Field(max_length=64)]
-    state: Annotated[str, Field(max_length=32)]
-    """checking, idle, busy, stopping or quarantined."""
-    task_id: Word
-    started: Annotated[str, Field(max_length=32)]
-    seen: Annotated[str, Field(max_length=32)]
-    reason: Annotated[str, Field(max_length=300)] = ""
-    """Why it is in quarantine."""
 
 
 class TaskQueue(Protocol):

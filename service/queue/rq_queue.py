@@ -16,14 +16,15 @@ from redis import Redis
 from redis.exceptions import RedisError, ResponseError
 from rq.exceptions import DuplicateJobError
 
-from service.domain import Lane, Stage
-from service.embedded import redis_url
-from service.errors import QueueUnavailable
-from service.metrics.queue_now import QueueNow, read_queue
+from service.model.domain import Lane, Stage
+from service.model.errors import QueueUnavailable
+from service.model.worker_beat import WorkerBeat
 from service.queue import entries
+from service.queue.address import redis_url
 from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
+from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
-from service.queue.port import Event, Lease, Message, WorkerBeat, lane_order
+from service.queue.port import Event, Lease, Message, lane_order
 from service.settings import Settings
 
 EVENTS: Final = "graspd:events"
@@ -70,7 +71,7 @@ class RqQueue:
                 TASK_FUNCTION,
                 args=(message.model_dump(mode="json", by_alias=True),),
                 job_id=rq_id(message.task_id, message.attempt),
-                timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.main`
+                timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.process.main`
                 result_ttl=0,
                 failure_ttl=FAILURE_TTL_S,
                 description=f"{message.stage} {message.task_id}",

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from service.errors import DamagedShard, InputError, NotFoundError
-from service.integrity import check_content, check_digest, gone
-from service.store import Store
+from service.model.errors import DamagedShard, InputError, NotFoundError
+from service.store.integrity import check_content, check_digest, gone
+from service.store.store import Store
 
 DEFAULT_BYTES: Final = 20 << 30
 

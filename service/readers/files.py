@@ -7,16 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from service import names
-from service.datasets.records import newest_snapshot
-from service.errors import InputError, NotFoundError
-from service.integrity import check_file
-from service.manifests import load_manifest, shard_exists
-from service.planning import plan
+from service.model import names
+from service.model.errors import InputError, NotFoundError
+from service.model.planning import plan
+from service.model.records import JobRecord
 from service.readers.cache import DEFAULT_BYTES, ShardCache, default_folder
-from service.records import JobRecord, read_record
-from service.shards import ShardKind, kind_of, open_shard
-from service.store import Store, open_store
+from service.store.datasets import newest_snapshot
+from service.store.integrity import check_file
+from service.store.manifests import load_manifest, shard_exists
+from service.store.records import read_record
+from service.store.shards import ShardKind, kind_of, open_shard
+from service.store.store import Store, open_store
 
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 

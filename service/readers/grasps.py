@@ -9,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import standing
-from service.errors import InputError
+from service.model.errors import InputError
 from service.readers.files import ShardFile, Shards
-from service.shards import SCHEMAS, open_shard, read_column
+from service.store import standing
+from service.store.shards import SCHEMAS, open_shard, read_column
 
 Array = NDArray[Any]
 #: From the columns of one base shard to a mask (N,) of the grasps to keep.

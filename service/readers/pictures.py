@@ -9,10 +9,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import standing, transforms
-from service.errors import InputError
+from service.model import transforms
+from service.model.errors import InputError
 from service.readers.files import ShardFile, Shards
-from service.shards import SCHEMAS, open_shard, read_shard
+from service.store import standing
+from service.store.shards import SCHEMAS, open_shard, read_shard
 
 Array = NDArray[Any]
 

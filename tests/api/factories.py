@@ -5,18 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service import names
-from service.clock import timestamp
-from service.digests import job_id
-from service.domain import AssetKind, JobRequest, Lane, Stage
-from service.library import publish_builtins
-from service.manifests import ShardManifest, manifest_of, publish_shard
-from service.parts import Parts
-from service.planning import PlannedTask, message_of, plan
-from service.queue.port import WorkerBeat
-from service.records import AttemptRecord, JobRecord, put_record
-from service.shards import Attribute, check_columns, write_shard
-from service.transforms import pose_to_matrix
+from service.model import names
+from service.model.clock import timestamp
+from service.model.digests import job_id
+from service.model.domain import AssetKind, JobRequest, Lane, Stage
+from service.model.planning import PlannedTask, message_of, plan
+from service.model.records import AttemptRecord, JobRecord
+from service.model.transforms import pose_to_matrix
+from service.model.worker_beat import WorkerBeat
+from service.pipeline.backends import Parts
+from service.store.library import publish_builtins
+from service.store.manifests import ShardManifest, manifest_of, publish_shard
+from service.store.records import put_record
+from service.store.shards import Attribute, check_columns, write_shard
 
 JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]

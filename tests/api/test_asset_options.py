@@ -10,13 +10,13 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.uploads import files_of_upload
-from service.asset_options import hand_options, object_options
-from service.assets import builtin_files
-from service.domain import AssetKind, IngestMessage
-from service.library import load_asset, load_asset_files, load_check
-from service.parts import Parts
-from worker.context import TaskContext
+from service.model.domain import AssetKind, IngestMessage
+from service.pipeline.backends import Parts
+from service.store.asset_options import hand_options, object_options
+from service.store.assets import builtin_files
+from service.store.library import load_asset, load_asset_files, load_check
 from worker.stages import ingest
+from worker.stages.context import TaskContext
 
 
 def check(http: TestClient, parts: Parts, kind: AssetKind, file: tuple[str, bytes], options: dict[str, Any]) -> Any:

@@ -13,11 +13,11 @@ import pytest
 import uvicorn
 from fastapi import FastAPI, Request
 
-from api import events
-from api.keys import KeyFile, Scope
-from api.protocol import TimedProtocol
+from api.access.keys import KeyFile, Scope
+from api.catalog import events
+from api.middleware.protocol import TimedProtocol
 from api.server import bind, configuration
-from service.parts import Parts
+from service.pipeline.backends import Parts
 from service.settings import Settings
 from tests.api.factories import add_job
 

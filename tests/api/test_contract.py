@@ -30,11 +30,11 @@ from schemathesis.specs.openapi.checks import (
 
 from api.app import create_app
 from service.index.index import Index
-from service.parts import Parts
+from service.pipeline.backends import Parts
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
-from service.store import open_store
+from service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, add_worker, fail, finish_all
 
 _EXAMPLES = 10

@@ -16,9 +16,14 @@ def modules_after(statement: str) -> set[str]:
     return set(done.stdout.split())
 
 
-@pytest.mark.parametrize("statement", ["import api.app", "import api.commands", "import api.client"])
+@pytest.mark.parametrize("statement", ["import api.app", "import api.client.commands", "import api.client.client"])
 def test_the_front_door_imports_no_engine(statement: str) -> None:
     assert modules_after(statement).isdisjoint(HEAVY)
+
+
+@pytest.mark.parametrize("statement", ["import api.client.commands", "import api.client.dataset_commands"])
+def test_a_command_line_needs_no_templates_and_no_server(statement: str) -> None:
+    assert modules_after(statement).isdisjoint({"jinja2", "uvicorn", "worker"})
 
 
 OVERVIEW = """

@@ -15,15 +15,15 @@ import pytest
 from redis.exceptions import ConnectionError as RedisAway
 from starlette.testclient import TestClient
 
-from api.keys import Key, Scope
-from api.limits import MAX_BODY_BYTES
-from api.quotas import Quotas
-from service.domain import AssetKind
-from service.errors import QuotaError
-from service.index import cursors
-from service.library import load_asset, load_check
-from service.parts import Parts
+from api.access.keys import Key, Scope
+from api.access.quotas import Quotas
+from api.middleware.body_limit import MAX_BODY_BYTES
+from service.index.queries import cursors
+from service.model.domain import AssetKind
+from service.model.errors import QuotaError
+from service.pipeline.backends import Parts
 from service.settings import Settings
+from service.store.library import load_asset, load_check
 from tests.api.factories import add_job, finish_all
 
 STL = b"solid box\nendsolid box\n"
@@ -154,9 +154,9 @@ def test_a_full_disk_is_said_and_the_upload_may_come_again(
         if where == "the body":
             patch.setattr(tempfile.SpooledTemporaryFile, "write", full)
         elif where == "the archive":
-            patch.setattr("service.library.pack_into", full)
+            patch.setattr("service.store.library.pack_into", full)
         else:
-            patch.setattr("service.store.os.link", full)
+            patch.setattr("service.store.store.os.link", full)
         answer = http.post("/v1/objects", files={"file": ("box.stl", STL)})
     assert answer.status_code == 503, answer.text
     assert answer.json()["type"] == "/problems/store-unavailable"

@@ -8,8 +8,8 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from service.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
-from service.parts import Parts
+from service.model.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
+from service.pipeline.backends import Parts
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 

@@ -15,13 +15,14 @@ from typing import Any
 import httpx
 import pytest
 
-from api.keys import KeyFile, KeyLimits, Scope
-from service.embedded import redis_url, server_command
-from service.parts import Parts
+from api.access.keys import KeyFile, KeyLimits, Scope
+from service.pipeline.backends import Parts
+from service.queue.address import redis_url
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
+from service.run.embedded import server_command
+from service.run.supervisor import Supervisor
 from service.settings import Settings
-from service.supervisor import Supervisor
 from tests.api.factories import add_builtins
 from tests.fakes import add_assets
 from tests.service.conftest import wait_for_redis

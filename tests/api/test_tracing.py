@@ -10,14 +10,16 @@ import pytest
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from starlette.testclient import TestClient
 
-from service import names, tracing
-from service.domain import Stage
-from service.parts import Parts
-from service.planning import message_of, plan
-from service.records import JobRecord, read_record
+from service import tracing
+from service.model import names
+from service.model.domain import Stage
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.store.records import read_record
 from tests.fakes import fake_stages
-from worker.context import TaskContext
-from worker.runner import Runner
+from worker.process.runner import Runner
+from worker.stages.context import TaskContext
 
 _PARENT = "00-" + "a" * 32 + "-" + "b" * 16 + "-01"
 

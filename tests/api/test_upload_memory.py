@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from api.uploads import files_of_upload
-from service.assets import pack
-from service.digests import digest_files
-from service.domain import AssetKind
-from service.errors import InputError
-from service.library import load_asset_files, publish_asset
-from service.parts import Parts
+from service.model.digests import digest_files
+from service.model.domain import AssetKind
+from service.model.errors import InputError
+from service.pipeline.backends import Parts
+from service.store.assets import pack
+from service.store.library import load_asset_files, publish_asset
 
 MIB = 1 << 20
 

@@ -15,8 +15,8 @@ import uvicorn
 from fastapi import FastAPI
 
 from api.server import bind
+from service.run.supervisor import Supervisor
 from service.settings import Settings
-from service.supervisor import Supervisor
 from tests.api.conftest import app, parts, settings
 
 __all__ = ["app", "parts", "settings"]

@@ -13,9 +13,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from service.assets import builtin_files
-from service.domain import AssetKind
-from service.transforms import apply
+from service.model.domain import AssetKind
+from service.model.transforms import apply
+from service.store.assets import builtin_files
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface

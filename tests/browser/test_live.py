@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from service.datasets import actions
-from service.datasets.spec import DatasetRequest
-from service.parts import Parts
-from service.planning import plan
-from service.published import publish
+from service.model.planning import plan
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.spec import DatasetRequest
+from service.store.study_records import publish
+from tests.api.dashboard.test_stability_page import a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
-from tests.api.test_stability_page import a_record
 
 pytestmark = pytest.mark.browser
 

@@ -13,9 +13,9 @@ from starlette.testclient import TestClient
 
 from api.app import create_app
 from service.index.index import Index
-from service.parts import Parts
+from service.pipeline.backends import Parts
 from service.settings import Settings
-from service.store import open_store
+from service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, finish_all
 from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server

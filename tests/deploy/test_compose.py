@@ -129,7 +129,7 @@ def test_the_example_enables_profiles_that_exist() -> None:
 
 
 def test_the_version_is_that_of_the_package() -> None:
-    from service.version import PACKAGE_VERSION
+    from service.model.version import PACKAGE_VERSION
 
     assert composition.example()["GRASPD_VERSION"] == PACKAGE_VERSION
     assert all(SERVICES[name]["image"].endswith(f":{PACKAGE_VERSION}") for name in OURS)

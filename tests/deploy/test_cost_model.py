@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cost_model import Measured, Prices, Work, estimate, main, sizes, table
-from service import pipeline
-from service.parts import Parts
-from service.store import open_store
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.fakes import request
 from tests.service.conftest import parts  # noqa: F401
-from tests.service.test_index import run_all
+from tests.service.index.test_index import run_all
 
 PAGE = (REPOSITORY / "docs" / "scaling.md").read_text()
 ONE_OF_EACH = Measured(
@@ -87,7 +87,7 @@ def test_sizes_are_measured_on_a_data_folder(parts: Parts, tmp_path: Path) -> No
     kept = Parts(parts.settings, store, parts.index, parts.queue)
     for entry in [*parts.store.list("assets")]:
         store.put(entry.key, parts.store.get(entry.key))
-    run_all(kept, pipeline.submit(kept, request(grasps=64))[0].id)
+    run_all(kept, job_actions.submit(kept, request(grasps=64))[0].id)
     shards = list((tmp_path / "store" / "shards" / "base").glob("*.h5"))
     assert sizes(tmp_path)["base_bytes_per_grasp"] == sum(shard.stat().st_size for shard in shards) / 64
 

@@ -14,10 +14,10 @@ import pytest
 import yaml
 
 import graspd
-from service.domain import Lane, Stage
+from service.model.domain import Lane, Stage
+from service.model.version import PACKAGE_VERSION
 from service.queue.rq_queue import queue_name
 from service.settings import Settings
-from service.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 from tests.deploy import keda
 from tests.deploy.composition import SERVICES, seconds

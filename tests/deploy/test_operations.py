@@ -10,19 +10,19 @@ from typing import Any
 import pytest
 
 import graspd
-from service import pipeline
-from service.domain import State
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
-from service.library import publish_builtins
-from service.parts import Parts
+from service.model.domain import State
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
 from service.settings import Settings
-from service.store import open_store
+from service.store.library import publish_builtins
+from service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.deploy import composition, page
 from tests.fakes import add_assets, request
 from tests.memory_queue import MemoryQueue
-from tests.service.test_index import run_all
+from tests.service.index.test_index import run_all
 
 
 @pytest.fixture
@@ -33,8 +33,8 @@ def kept(tmp_path: Path) -> Iterator[Parts]:
     parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
     add_assets(parts)
     publish_builtins(parts.store)
-    run_all(parts, pipeline.submit(parts, request(grasps=64, scenes=1))[0].id)
-    pipeline.submit(parts, request(grasps=32, seed=5))
+    run_all(parts, job_actions.submit(parts, request(grasps=64, scenes=1))[0].id)
+    job_actions.submit(parts, request(grasps=32, seed=5))
     yield parts
     index.close()
 

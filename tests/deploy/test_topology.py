@@ -13,10 +13,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.embedded import find_server
 from service.index.index import Index
 from service.index.rebuild import differences
-from service.store import open_store
+from service.run.embedded import find_server
+from service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
 from tests.servers import PostgresServer, S3Server, free_ports

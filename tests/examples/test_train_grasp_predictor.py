@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.transforms import compose, invert, quat_to_matrix
+from service.model.transforms import compose, invert, quat_to_matrix
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from service.embedded import redis_url, server_command
-from service.errors import QueueUnavailable
 from service.index.index import Index
-from service.parts import Parts
+from service.model.errors import QueueUnavailable
+from service.pipeline.backends import Parts
+from service.queue.address import redis_url
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
+from service.run.embedded import server_command
 from service.settings import Settings
-from service.store import open_store
+from service.store.store import open_store
 from tests.fakes import add_assets
 from tests.memory_queue import MemoryQueue
 

@@ -1,8 +1,11 @@
-"""The failure table of ARCHITECTURE.md names tests that exist."""
+"""ARCHITECTURE.md is true: its fault table names tests that exist, its floors are kept, its files are there."""
 
 from __future__ import annotations
 
 import re
+import tomllib
+
+import pytest
 
 from tests.conftest import REPOSITORY
 
@@ -12,3 +15,28 @@ def test_every_fault_in_the_table_has_its_test() -> None:
     assert len(named) >= 15
     for file, test in named:
         assert f"def {test}" in (REPOSITORY / file).read_text(), f"{file}::{test}"
+
+
+def rows_of(heading: str) -> list[list[str]]:
+    """Cells of the table of ARCHITECTURE.md that begins with a heading."""
+    _, _, rest = (REPOSITORY / "ARCHITECTURE.md").read_text().partition(f"| {heading} |")
+    table = rest.partition("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table]
+
+
+@pytest.mark.parametrize("room", ["api", "worker", "service"])
+def test_the_floors_are_those_that_the_contracts_keep(room: str) -> None:
+    contracts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (kept,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [room]]
+    floors = [set(re.findall(r"`(\w+)`", first)) for first, _ in rows_of(f"floor of `{room}/` | what it is")]
+    assert floors == [set(re.findall(r"\w+", layer)) for layer in kept]
+
+
+def test_the_files_to_open_for_a_change_are_there_and_as_many_as_it_says() -> None:
+    rows = rows_of("I want to ... | open these files | files")
+    assert len(rows) >= 8
+    for wish, files, number in rows:
+        named = re.findall(r"`([\w./]+)`", files)
+        assert len(named) == int(number), wish
+        missing = [name for name in named if not (REPOSITORY / name).exists()]
+        assert not missing, f"{wish}: {missing}"

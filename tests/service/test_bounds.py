@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.large_index import fill
-from service.clock import timestamp
-from service.domain import Lane
 from service.index.index import Index
+from service.model.clock import timestamp
+from service.model.domain import Lane
 from service.queue.port import Event, EventKind
 from service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
-from service.store import open_store
+from service.store.store import open_store
 from tests.fakes import message_for
 
 #: Redis memory of a waiting task [bytes]; at most GRASPD_QUEUE_WINDOW of them wait in each lane.

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from service import pipeline
-from service.domain import JobRequest
 from service.index.views import JobView
-from service.parts import Parts
+from service.model.domain import JobRequest
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.run.supervisor import Supervisor
 from service.settings import Settings
-from service.supervisor import Supervisor
 from tests.fakes import add_assets
 
 READY_S = 30.0
@@ -33,7 +33,7 @@ class System:
             add_assets(self.parts)
 
     def submit(self, wanted: JobRequest) -> str:
-        return pipeline.submit(self.parts, wanted)[0].id
+        return job_actions.submit(self.parts, wanted)[0].id
 
     def until(self, met: Callable[[], Any], seconds: float, what: str) -> float:
         """Seconds until a condition is met; fails when it takes longer than that."""

@@ -16,9 +16,9 @@ import trimesh
 
 from service.index.index import Index
 from service.index.rebuild import differences
+from service.run.supervisor import Supervisor
 from service.settings import Settings
-from service.store import open_store
-from service.supervisor import Supervisor
+from service.store.store import open_store
 
 GRIPPER = """\
 <robot name="pincer">

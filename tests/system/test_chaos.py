@@ -17,20 +17,21 @@ import pytest
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from service import names, pipeline
-from service.domain import State
-from service.errors import BusyError
 from service.index.filters import GraspFilter
 from service.index.rebuild import differences, rebuild
+from service.model import names
+from service.model.domain import State
+from service.model.errors import BusyError
+from service.pipeline import job_actions
 from service.queue.allowed import TASK_FUNCTION
 from service.queue.rq_queue import RqQueue
+from service.run.supervisor import Supervisor
 from service.settings import Settings
-from service.shards import read_shard
-from service.supervisor import Supervisor
+from service.store.shards import read_shard
 from tests.fakes import fake_synthesize, message_for
 from tests.fakes import request as wanted
 from tests.system.conftest import System, alive
-from worker.context import TaskContext
+from worker.stages.context import TaskContext
 
 pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
@@ -113,7 +114,7 @@ def test_a_running_job_is_cancelled_long_before_its_task_would_end(start: Start)
     system = start(environment={"FAKE_SECONDS": "3600"})
     job = system.submit(wanted())
     system.until(lambda: running_on(system, job), PATIENCE_S, "the task runs")
-    assert pipeline.cancel(system.parts, job).state is State.CANCELLED
+    assert job_actions.cancel(system.parts, job).state is State.CANCELLED
     system.until(lambda: not system.parts.queue.leases(), PATIENCE_S, "the worker let go")
     assert system.parts.index.attempts(job=job) == []
     again = system.submit(wanted(grasps=1, seed=3))
@@ -180,8 +181,8 @@ _UP_IN_A_PROCESS = """
 import json, sys, time
 from pathlib import Path
 from service.settings import Settings
-from service.shards import read_shard
-from service.supervisor import Supervisor
+from service.store.shards import read_shard
+from service.run.supervisor import Supervisor
 up = Supervisor(Settings(data_dir=Path(sys.argv[1]), port=0, device="cpu"), api=False,
                 worker_command=(sys.executable, "-m", "tests.fakes"))
 up.start()

@@ -9,14 +9,14 @@ from collections.abc import Callable
 
 import pytest
 
-from service import names
-from service.datasets import actions
-from service.datasets.status import status
-from service.domain import State
 from service.index.rebuild import differences
-from service.manifests import ShardManifest
-from service.records import read_record
-from tests.service.datasets.makers import add_asset, wanted
+from service.model import names
+from service.model.domain import State
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.status import status
+from service.store.manifests import ShardManifest
+from service.store.records import read_record
+from tests.service.pipeline.datasets.makers import add_asset, wanted
 from tests.system.conftest import System
 
 pytestmark = pytest.mark.chaos

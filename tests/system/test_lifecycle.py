@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import pytest
 
-from service import pipeline
-from service.domain import Lane, State
+from service.model.domain import Lane, State
+from service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.conftest import System
 
@@ -71,7 +71,7 @@ def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
 
 def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
-    bulk = pipeline.submit(system.parts, request(grasps=100_000), lane=Lane.BULK)[0].id
+    bulk = job_actions.submit(system.parts, request(grasps=100_000), lane=Lane.BULK)[0].id
     system.until(lambda: system.parts.index.job(bulk).grasps, 15, "the dataset runs")
     job = system.submit(request(grasps=32, seed=1))
     (done,) = system.finish(job, seconds=120)
@@ -83,7 +83,7 @@ def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
 
 def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     system = start(environment={"FAKE_SECONDS": "0.05"})
-    bulk = pipeline.submit(system.parts, request(grasps=3200), lane=Lane.BULK)[0].id
+    bulk = job_actions.submit(system.parts, request(grasps=3200), lane=Lane.BULK)[0].id
     ended = threading.Event()
 
     def keep_busy() -> None:

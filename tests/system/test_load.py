@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from service.domain import State
+from service.model.domain import State
 from tests.fakes import request
 from tests.system.conftest import System
 
@@ -25,7 +25,7 @@ _BUSY = f"import time\nend = time.monotonic() + {_LONGEST_S}\nwhile time.monoton
 def load() -> Iterator[int]:
     """So many busy processes: 15 on two cores."""
     count = round(BUSY * len(os.sched_getaffinity(0)))
-    command = [sys.executable, "-m", "service.launch", str(os.getpid()), sys.executable, "-c", _BUSY]
+    command = [sys.executable, "-m", "service.run.launch", str(os.getpid()), sys.executable, "-c", _BUSY]
     busy = [subprocess.Popen(command) for _ in range(count)]
     yield count
     for process in busy:

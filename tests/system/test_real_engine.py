@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.domain import AssetKind, JobRequest, State
 from service.index.rebuild import differences
-from service.shards import read_shard
+from service.model.domain import AssetKind, JobRequest, State
+from service.store.shards import read_shard
 from tests.system.conftest import System
 from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.domain import JobRequest
-from service.errors import InputError
+from service.model.domain import JobRequest
+from service.model.errors import InputError
 from worker import certified
 from worker.certified import Certified, certified_grasps, next_round
 from worker.grasps import GraspSet, Posture

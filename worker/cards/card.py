@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from service.datasets.export import path_of
-from service.errors import InputError
+from service.model.errors import InputError
+from service.pipeline.datasets.export import path_of
 from worker.cards.contents import Contents
 from worker.cards.numbers import numbers
 from worker.cards.page import page

@@ -11,17 +11,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.assets import builtin_asset, builtin_files, builtin_names
-from service.datasets.records import DatasetRecord, Snapshot, job_of, load_dataset, newest_snapshot
-from service.domain import AssetKind
-from service.errors import InputError, NotFoundError
-from service.library import load_asset, load_asset_files, load_check
-from service.planning import plan
+from service.model.dataset_records import DatasetRecord, Snapshot, job_of
+from service.model.domain import AssetKind
+from service.model.errors import InputError, NotFoundError
+from service.model.planning import plan
+from service.model.version import PACKAGE_VERSION
 from service.readers import Shards, open_shards
-from service.records import parse_record, task_attempts
-from service.shards import open_shard
-from service.store import Store
-from service.version import PACKAGE_VERSION
+from service.store.assets import builtin_asset, builtin_files, builtin_names
+from service.store.datasets import load_dataset, newest_snapshot
+from service.store.library import load_asset, load_asset_files, load_check
+from service.store.records import parse_record, task_attempts
+from service.store.shards import open_shard
+from service.store.store import Store
 
 Pair = tuple[str, str]
 _BUILTIN_LICENCE: Final = "Apache-2.0"

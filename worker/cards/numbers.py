@@ -10,15 +10,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.clock import timestamp
-from service.domain import AssetKind
-from service.version import PACKAGE_VERSION
+from service.model.clock import timestamp
+from service.model.domain import AssetKind
+from service.model.version import PACKAGE_VERSION
 from worker.cards.contents import AssetFacts, Contents
 from worker.cards.directions import CELLS, ELEVATION_BINS, ENOUGH, cell_counts, evenness
 from worker.cards.tally import QUALITIES, CellTally, Tally
 from worker.grasps import Posture
-from worker.intervals import wilson
 from worker.quality.diversity import explained_variance
+from worker.quality.intervals import wilson
 
 Row = dict[str, Any]
 #: Codes of `grasp/rejection`: what the hand is too near to, and when.

@@ -11,11 +11,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import names, standing
-from service.errors import NotFoundError
-from service.manifests import ShardManifest, load_manifest
+from service.model import names
+from service.model.errors import NotFoundError
 from service.readers import ShardFile
-from service.shards import json_attribute, open_shard, read_column
+from service.store import standing
+from service.store.manifests import ShardManifest, load_manifest
+from service.store.shards import json_attribute, open_shard, read_column
 from worker.cards.contents import Contents
 
 #: Columns of which a card is made; those that a shard lacks are left out.

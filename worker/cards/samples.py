@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from service.readers import ShardFile, Shards
-from service.shards import open_shard
-from worker.rendering import typography
+from service.store.shards import open_shard
+from worker.rendering.pages import typography
 
 MOST: Final = 12
 _COLUMNS: Final = 4

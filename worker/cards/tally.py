@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service import standing
-from service.manifests import INDEX_THRESHOLD_M
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
+from service.store import standing
+from service.store.manifests import INDEX_THRESHOLD_M
 from worker.cards.contents import AssetFacts, Contents, Pair
 from worker.cards.directions import ELEVATION_BINS, elevations
 from worker.cards.joints import JointUse

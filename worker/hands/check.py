@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
 from worker.hands.options import HandOptions, parse_options

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from scipy.optimize import nnls
 
-from service.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import HandError
-from service.transforms import IDENTITY_POSE, apply, compose, quat_rotate
+from service.model.errors import HandError
+from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel, PalmFrame
 from worker.hands.options import HandOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from worker.hands.model import Floats, HandModel, JointType
 
 

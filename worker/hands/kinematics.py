@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.transforms import compose, quat_from_axis_angle
+from service.model.transforms import compose, quat_from_axis_angle
 from worker.hands.model import Floats, HandModel, JointType
 
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from service.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
-from service.digests import digest_files, digest_variant
-from service.domain import AssetKind
-from service.errors import HandError, NotFoundError
-from service.hand_files import files_of_hand
+from service.model.digests import digest_files, digest_variant
+from service.model.domain import AssetKind
+from service.model.errors import HandError, NotFoundError
+from service.model.transforms import compose
 from service.settings import Settings
-from service.transforms import compose
+from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
+from service.store.hand_files import files_of_hand
 from worker.hands.collisions import resting_neighbours
 from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from service.errors import HandError
+from service.model.errors import HandError
 from worker.hands.model import Floats, Ints
 
 #: Corners of a circle in tessellations: the chord stays within 0.5 % of the radius.

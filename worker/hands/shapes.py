@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from service.assets import check_path
-from service.errors import HandError, InputError, MeshError
-from service.transforms import IDENTITY_POSE, apply
+from service.model.errors import HandError, InputError, MeshError
+from service.model.transforms import IDENTITY_POSE, apply
+from service.store.assets import check_path
 from worker.hands.model import ConvexPiece, Floats, Ints
 from worker.hands.primitives import hull, signed_distance, tessellate, volume
 from worker.hands.urdf import Shape

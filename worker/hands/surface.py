@@ -10,8 +10,8 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.errors import HandError
-from service.transforms import IDENTITY_POSE, apply, invert, quat_rotate
+from service.model.errors import HandError
+from service.model.transforms import IDENTITY_POSE, apply, invert, quat_rotate
 from worker.hands import primitives
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.errors import HandError
-from service.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
+from service.model.errors import HandError
+from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
 from worker.hands.urdf import Joint, Mimic, Urdf

@@ -16,8 +16,8 @@ import numpy as np
 from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
-from service.errors import HandError, LimitError
-from service.transforms import Floats, quat_from_axis_angle, quat_multiply
+from service.model.errors import HandError, LimitError
+from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
 
 MAX_BYTES: Final = 4 * 2**20
 MAX_LINKS: Final = 256

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.objects.options import ObjectOptions, parse_options
 from worker.objects.prepare import build, main_file, repaired_mesh
 from worker.objects.repair import Repaired

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.content import content_of
+from worker.objects.content import content_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

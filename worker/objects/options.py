@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from service.errors import MeshError
+from service.model.errors import MeshError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 

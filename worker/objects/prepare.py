@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from service.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
-from service.digests import digest_files, digest_variant
-from service.domain import AssetKind
-from service.errors import GraspdError, MeshError, NotFoundError
+from service.model.digests import digest_files, digest_variant
+from service.model.domain import AssetKind
+from service.model.errors import GraspdError, MeshError, NotFoundError
 from service.settings import Settings
+from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.mass import mass_properties
 from worker.objects.model import Floats, Ints, ObjectModel

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from service.errors import MeshError
+from service.model.errors import MeshError
 from worker.objects import solid, topology
 from worker.objects.distance import MeshDistance, surface_points
 from worker.objects.formats import Soup

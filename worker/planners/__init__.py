@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from service.domain import Fidelity
+from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
 from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner, scene_planner
-from worker.surroundings import Placed
+from worker.simulation.surroundings import Placed
 
 __all__ = [
     "GROUP",

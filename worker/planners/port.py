@@ -8,11 +8,11 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
-from service.domain import Fidelity
+from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.surroundings import Placed
+from worker.simulation.surroundings import Placed
 
 Progress = Callable[[float, float, str], None]
 Cancelled = Callable[[], bool]

@@ -10,7 +10,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from service.cli import validation_line
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.planners.port import Method, Options, Planner, ScenePlanner
 
 #: Entry-point group of planners of other packages.
@@ -19,10 +19,10 @@ GROUP: Final = "graspd.planners"
 #: Method name -> module and attribute of its `Method`. Modules are imported when used.
 PLANNERS: Final[dict[str, tuple[str, str]]] = {
     "fast_graspd": ("worker.planners.fast_graspd.method", "METHOD"),
-    "graspit": ("worker.planners.graspit.planner", "METHOD"),
-    "graspd2022": ("worker.planners.graspd2022.planner", "METHOD"),
-    "dfc": ("worker.planners.dfc.planner", "METHOD"),
-    "autograsp": ("worker.planners.autograsp.planner", "METHOD"),
+    "graspit": ("worker.planners.graspit.method", "METHOD"),
+    "graspd2022": ("worker.planners.graspd2022.method", "METHOD"),
+    "dfc": ("worker.planners.dfc.method", "METHOD"),
+    "autograsp": ("worker.planners.autograsp.method", "METHOD"),
 }
 
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from worker.grasps import Posture
 from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
@@ -20,7 +20,7 @@ from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, hold
 from worker.simulation.obstacles import HandFeatures, feature_distances
-from worker.surroundings import Placed
+from worker.simulation.surroundings import Placed
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
 #: comes back faster and kicks the object away more often.

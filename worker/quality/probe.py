@@ -12,7 +12,7 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.transforms import compose, quat_to_matrix
+from service.model.transforms import compose, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints

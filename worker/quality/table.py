@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.cores import available_cores
-from service.errors import InputError, TaskCancelled
+from service.model.cores import available_cores
+from service.model.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -9,7 +9,7 @@ import manifold3d as m3d
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import pose_to_matrix
+from service.model.transforms import pose_to_matrix
 from worker.hands.model import ConvexPiece, HandModel
 from worker.hands.surface import piece_distance
 from worker.objects.model import ObjectModel

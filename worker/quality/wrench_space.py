@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.quality.hull import MAX_POINTS, radius_and_volume
 
 Floats = NDArray[np.float64]

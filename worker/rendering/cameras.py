@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
+from service.model.errors import InputError
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.domain import EXTRA_CHANNELS
-from service.errors import InputError
+from service.model.domain import EXTRA_CHANNELS
+from service.model.errors import InputError
 from worker.rendering.annotate import OBJECT
 from worker.rendering.cameras import Floats, pixel_rays
 

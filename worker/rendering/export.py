@@ -12,8 +12,8 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
-from service.errors import InputError
-from service.shards import Shard
+from service.model.errors import InputError
+from service.store.shards import Shard
 from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 
 DepthFormat = Literal["exr", "png"]

@@ -9,16 +9,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
-from service.transforms import apply
+from service.model.errors import InputError
+from service.model.transforms import apply
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.annotate import box_corners, in_camera, loose_boxes, tight_boxes
+from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import BASELINE_M, Cameras
 from worker.rendering.channels import occlusion_ratio, ray_distance
-from worker.rendering.given import SAMPLED, GivenCameras
 from worker.rendering.hands import DrawnHand
+from worker.rendering.scene_setup import TABLE_SIZE, CameraPlan, Setting
 from worker.rendering.scenery import Pictures
-from worker.rendering.setting import TABLE_SIZE, CameraPlan, Setting
 from worker.scenes.neighbours import Neighbours
 
 __all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
@@ -35,7 +35,7 @@ class Extras:
     """What a render shows beyond an object alone from sampled cameras, in colour, depth and segmentation."""
 
     channels: Sequence[str] = ()
-    """Of `service.domain.EXTRA_CHANNELS`."""
+    """Of `service.model.domain.EXTRA_CHANNELS`."""
     cameras: GivenCameras = SAMPLED
     """Intrinsics and places that are given instead of sampled."""
     neighbours: Neighbours | None = None

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
-from service.transforms import compose, quat_rotate, quat_to_matrix
+from service.model.errors import InputError
+from service.model.transforms import compose, quat_rotate, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel

@@ -7,13 +7,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
-from service.scene_spec import Box, SceneSpec
-from service.transforms import compose, quat_from_axis_angle, quat_rotate
+from service.model.errors import InputError
+from service.model.scene_spec import Box, SceneSpec
+from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import lay_flat, resting_faces
 from worker.scenes.simulate import drop, rest_probability
-from worker.surroundings import Obstacle
+from worker.simulation.surroundings import Obstacle
 
 Floats = NDArray[np.float64]
 

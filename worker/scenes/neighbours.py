@@ -13,12 +13,12 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from service.errors import InputError, MeshError
-from service.transforms import compose, quat_rotate
+from service.model.errors import InputError, MeshError
+from service.model.transforms import compose, quat_rotate
+from worker.engines.mujoco_warnings import void
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel
-from worker.mujoco_warnings import void
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, settle
 from worker.scenes.simulate import (

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from service.errors import MeshError
-from service.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
+from service.model.errors import MeshError
+from service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from worker.objects.model import Floats, Ints, ObjectModel
 
 #: Hull triangles within this angle of each other are one flat face [rad].

@@ -13,9 +13,9 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from service.errors import InputError, MeshError
-from service.transforms import quat_rotate
-from worker.mujoco_warnings import void
+from service.model.errors import InputError, MeshError
+from service.model.transforms import quat_rotate
+from worker.engines.mujoco_warnings import void
 from worker.objects.model import Floats, ObjectModel
 from worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
 

@@ -19,7 +19,7 @@ from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import LiftLevel, judge_lifts
 from worker.quality.referee.protocol import DIRECTIONS
 from worker.scenes.way import plan_way
-from worker.surroundings import Scenes
+from worker.simulation.surroundings import Scenes
 
 Arrays = dict[str, NDArray[Any]]
 

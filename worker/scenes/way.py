@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from worker.grasps import GraspSet, Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -21,7 +21,7 @@ from worker.quality.postures import wide_open
 from worker.quality.probe import Probe, probe_of
 from worker.scenes.clearance import approach
 from worker.simulation.obstacles import obstacle_distances
-from worker.surroundings import Placed, Surroundings
+from worker.simulation.surroundings import Placed, Surroundings
 
 Floats = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.simulation.kernels import obstacles as kernels
-from worker.surroundings import Surroundings
+from worker.simulation.surroundings import Surroundings
 
 Floats = NDArray[np.float64]
 

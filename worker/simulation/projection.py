@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.transforms import quat_from_axis_angle, quat_multiply
+from service.model.transforms import quat_from_axis_angle, quat_multiply
 from worker.simulation.kernels import obstacles
 from worker.simulation.kernels import projection as kernels
 from worker.simulation.simulation import HandState, Simulation, still_schedule

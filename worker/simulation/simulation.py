@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.hands.model import SurfacePoints
 from worker.simulation.device import DeviceHand, DeviceObject, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact, kinematics, optimizers, penalties, pieces, surface

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from service.domain import Stage
+from service.model.domain import Stage
 
 if TYPE_CHECKING:
-    from worker.context import TaskContext
-    from worker.runner import StageFunction
-    from worker.stages.output import Output
+    from worker.stages.context import TaskContext
+    from worker.stages.output import Output, StageFunction
 
 _MODULES: Final = {
     Stage.INGEST: "worker.stages.ingest",

@@ -7,10 +7,10 @@ from typing import TypeVar, cast
 
 from cachetools import LRUCache
 
-from service import names
-from service.domain import AssetKind, TaskMessage
-from service.library import load_asset_files
-from service.store import Store
+from service.model import names
+from service.model.domain import AssetKind, TaskMessage
+from service.store.library import load_asset_files
+from service.store.store import Store
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

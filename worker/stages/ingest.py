@@ -15,11 +15,11 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from service import names
-from service.assets import pack, unpack
-from service.domain import AssetKind, IngestMessage
-from service.library import UNPACKED_LIMIT_BYTES, load_asset_files
-from worker.context import TaskContext
+from service.model import names
+from service.model.domain import AssetKind, IngestMessage
+from service.store.assets import pack, unpack
+from service.store.library import UNPACKED_LIMIT_BYTES, load_asset_files
+from worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
 MEMORY_LIMIT_BYTES: Final = 4 * 2**30

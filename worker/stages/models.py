@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from service import names
-from service.assets import builtin_files, builtin_names
-from service.domain import AssetKind, Fidelity
-from service.store import Store
+from service.model import names
+from service.model.domain import AssetKind, Fidelity
+from service.store.assets import builtin_files, builtin_names
+from service.store.store import Store
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

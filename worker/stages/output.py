@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.clock import timestamp
-from service.digests import digest_json
-from service.domain import TaskMessage
-from service.manifests import ShardManifest, manifest_of
-from service.names import SHARD_KINDS
-from service.shards import Attribute, check_columns, json_attribute, write_shard
-from service.version import PACKAGE_VERSION
+from service.model.clock import timestamp
+from service.model.digests import digest_json
+from service.model.domain import TaskMessage
+from service.model.names import SHARD_KINDS
+from service.model.version import PACKAGE_VERSION
+from service.store.manifests import ShardManifest, manifest_of
+from service.store.shards import Attribute, check_columns, json_attribute, write_shard
+from worker.stages.context import TaskContext
 
 
 @dataclass(frozen=True)
@@ -87,3 +88,7 @@ def batch_seed(message: TaskMessage) -> int:
     """
     pair = [message.hand_digest, message.object_digest]
     return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
+
+
+#: What a stage is: it makes the arrays of a shard, or, as ingest does, writes what it found itself.
+StageFunction = Callable[[Any, TaskContext], Output | None]

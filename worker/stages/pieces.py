@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from service import names
-from service.errors import NotFoundError
-from service.store import Store
+from service.model import names
+from service.model.errors import NotFoundError
+from service.store.store import Store
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose, piece_file
 

@@ -10,13 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from service import names
-from service.digests import digest_json
-from service.domain import AssetKind
-from service.errors import NotFoundError
-from service.library import load_asset_files
-from service.store import Store
-from service.version import STAGE_REVISIONS
+from service.model import names
+from service.model.digests import digest_json
+from service.model.domain import AssetKind
+from service.model.errors import NotFoundError
+from service.model.version import STAGE_REVISIONS
+from service.store.library import load_asset_files
+from service.store.store import Store
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.domain import Stage, TaskMessage
-from service.manifests import load_shard
-from worker.context import TaskContext
+from service.model.domain import Stage, TaskMessage
+from service.store.manifests import load_shard
 from worker.rendering import Extras, render
 from worker.stages.assets import object_of
+from worker.stages.context import TaskContext
 from worker.stages.output import Output, batch_seed
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.domain import Stage, TaskMessage
-from service.manifests import load_shard
-from service.shards import Attribute
-from worker.context import TaskContext
+from service.model.domain import Stage, TaskMessage
+from service.store.manifests import load_shard
+from service.store.shards import Attribute
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
 from worker.scenes.clearance import count_rejections
 from worker.stages.assets import hand_of, object_of
+from worker.stages.context import TaskContext
 from worker.stages.output import Output, batch_seed
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from service.domain import TaskMessage
-from service.shards import Attribute
+from service.model.domain import TaskMessage
+from service.store.shards import Attribute
 from worker.certified import Certified, certified_grasps
-from worker.context import TaskContext
-from worker.grasps import GraspSet
+from worker.files.columns import postures, verdict_attributes
 from worker.hands.model import HandModel
 from worker.stages.assets import hand_of, object_of
+from worker.stages.context import TaskContext
 from worker.stages.output import Output
 from worker.stages.pieces import pieces_of
 
@@ -48,24 +48,6 @@ def attributes_of(hand: HandModel, message: TaskMessage, found: Certified) -> di
         "tried": found.tried,
     }
     return attributes | verdict_attributes(request.referee, found.verdict_key)
-
-
-def verdict_attributes(level: str, key: str | None) -> dict[str, Attribute]:
-    """Who judged the grasps of a base shard: the level and its key, or none."""
-    return {"verdict_level": "none"} if key is None else {"verdict_level": level, "verdict_key": key}
-
-
-def postures(grasps: GraspSet) -> dict[str, Any]:
-    """The posture columns of a base shard."""
-    parts = {"grasp": grasps.grasp, "pregrasp": grasps.pregrasp, "squeeze": grasps.squeeze}
-    columns: dict[str, Any] = {f"{name}/hand_pose": part.hand_pose for name, part in parts.items()}
-    columns |= {f"{name}/joint_positions": part.joint_positions for name, part in parts.items()}
-    if grasps.scene is not None and grasps.approach is not None and grasps.lift is not None:
-        columns |= {
-            "grasp/scene_index": grasps.scene, "grasp/approach": grasps.approach,
-            "grasp/approach_joint_positions": grasps.coming, "grasp/lift": grasps.lift.hand_pose,
-        }  # fmt: skip
-    return columns
 
 
 def _json(info: dict[str, object]) -> dict[str, object]:

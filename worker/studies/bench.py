@@ -10,9 +10,9 @@ from typing import Any
 
 import warp as wp
 
-from service.cores import available_cores
-from service.domain import Fidelity
-from service.version import PACKAGE_VERSION
+from service.model.cores import available_cores
+from service.model.domain import Fidelity
+from service.model.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import pairs

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
-from service.domain import Fidelity
+from service.model.domain import Fidelity
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import RETREATS, sample_starts

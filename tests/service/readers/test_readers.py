@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.datasets.records import Snapshot, SnapshotShard
-from service.errors import DamagedShard, InputError, NotFoundError
-from service.names import dataset_snapshot, shard_file
-from service.parts import Parts
+from service.model.dataset_records import Snapshot, SnapshotShard
+from service.model.errors import DamagedShard, InputError, NotFoundError
+from service.model.names import dataset_snapshot, shard_file
+from service.model.records import JobRecord
+from service.model.transforms import compose, pose_from_matrix
+from service.pipeline.backends import Parts
 from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
-from service.records import JobRecord, put_record
-from service.shards import Shard, read_shard
-from service.transforms import compose, pose_from_matrix
+from service.store.records import put_record
+from service.store.shards import Shard, read_shard
 from tests.api import factories
 from tests.damage import flipped, flipped_values
 
@@ -157,7 +158,7 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
 
 
 def test_a_full_cache_drops_what_was_unused_longest(parts: Parts, tmp_path: Path) -> None:
-    from service.domain import Stage
+    from service.model.domain import Stage
 
     data = [bytes([number]) * 1000 for number in range(3)]
     keys = [shard_file(Stage.SYNTHESIZE, f"{number:032x}") for number in range(3)]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from service.index.index import Index
-from service.parts import Parts
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
 from service.readers import Grasps, Pictures, open_shards
-from service.records import JobRecord
 from service.settings import Settings
-from service.store import open_store
+from service.store.store import open_store
 from tests.api import factories
 from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server

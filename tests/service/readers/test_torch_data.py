@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from service.parts import Parts
+from service.pipeline.backends import Parts
 from service.readers import Grasps, Pictures, Shards, open_shards
 from tests.api import factories
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from service.datasets.export import export_shards
+from service.pipeline.datasets.export import export_shards
 from tests.worker.cards.makers import Made, dataset
 from worker.cards.card import write_card
 from worker.cards.contents import Contents, contents_of_store

@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service import names
-from service.clock import timestamp
-from service.datasets import actions
-from service.datasets.planner import Planner
-from service.datasets.records import Snapshot
-from service.datasets.spec import DatasetRequest
-from service.domain import Stage
 from service.index.index import Index
-from service.manifests import publish_shard
-from service.parts import Parts
-from service.planning import message_of, plan
-from service.records import AttemptRecord, JobRecord, put_record, read_record
+from service.model import names
+from service.model.clock import timestamp
+from service.model.dataset_records import Snapshot
+from service.model.domain import Stage
+from service.model.planning import message_of, plan
+from service.model.records import AttemptRecord, JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.datasets.spec import DatasetRequest
 from service.settings import Settings
-from service.store import open_store
+from service.store.manifests import publish_shard
+from service.store.records import put_record, read_record
+from service.store.store import open_store
 from tests.api.factories import add_builtins, poses, scene_columns
 from tests.memory_queue import MemoryQueue
 from worker.stages.output import Output, shard_of
@@ -77,7 +78,7 @@ def dataset(
         {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}
     )
     actions.create(parts, wanted)
-    planner = Planner(parts)
+    planner = DatasetRounds(parts)
     while planner.advance(5.0):
         pass
     for cell in parts.index.dataset_cells(NAME, limit=200).items:

@@ -13,12 +13,12 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from service.errors import InputError, NotFoundError
+from service.model.errors import InputError, NotFoundError
 from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import HANDS, OBJECTS, dataset
 from worker.cards.card import write_card
-from worker.cards.commands import app
 from worker.cards.contents import contents_of_folder, contents_of_store, with_provenance
+from worker.commands.card import app
 
 
 def test_the_head_of_the_page_is_yaml_that_says_licence_and_size(kitchen: Case) -> None:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.domain import Stage
-from service.manifests import load_manifest
+from service.model.domain import Stage
+from service.model.transforms import quat_from_axis_angle
 from service.readers import Grasps
-from service.shards import read_shard
-from service.transforms import quat_from_axis_angle
+from service.store.manifests import load_manifest
+from service.store.shards import read_shard
 from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import SECONDS, STILL_HAND, STILL_JOINT, Array
 from worker.cards.directions import BANDS, SECTORS, cell_counts, elevations, evenness

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import HandError, LimitError
+from service.model.errors import HandError, LimitError
 from tests.worker.hands.urdfs import chain, joint, link, robot
+from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
-from worker.hands.commands import report_hand
 from worker.hands.urdf import MAX_BYTES, MAX_LINKS, read_urdf
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.assets import builtin_asset, builtin_files, builtin_names
-from service.domain import AssetKind
-from service.transforms import IDENTITY_POSE, compose, invert
+from service.model.domain import AssetKind
+from service.model.transforms import IDENTITY_POSE, compose, invert
+from service.store.assets import builtin_asset, builtin_files, builtin_names
 from worker.hands.builtins import HANDS, files_of
 from worker.hands.collisions import touching_bodies
 from worker.hands.kinematics import body_poses

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from api.hand_files import upload_of
+from api.client.hand_files import upload_of
 from api.uploads import files_of_upload
-from service.domain import AssetKind
-from service.errors import HandError
+from service.model.domain import AssetKind
+from service.model.errors import HandError
 from tests.worker.hands.urdfs import joint, link, robot
+from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
-from worker.hands.commands import report_hand
 from worker.hands.load import hand_from_path
 
 NOTES = {"urdf": "leap.urdf", "palm_link": "palm_lower", "palm_normal_in_palm_link": [0, 0, -1],

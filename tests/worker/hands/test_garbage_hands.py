@@ -6,9 +6,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.assets import builtin_files
-from service.domain import AssetKind
-from service.errors import InputError
+from service.model.domain import AssetKind
+from service.model.errors import InputError
+from service.store.assets import builtin_files
 from worker.hands.load import load_hand
 
 SOURCE = builtin_files(AssetKind.HAND, "barrett")

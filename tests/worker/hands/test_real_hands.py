@@ -11,7 +11,7 @@ import pytest
 import trimesh
 import yourdfpy
 
-from service.transforms import IDENTITY_POSE, pose_to_matrix
+from service.model.transforms import IDENTITY_POSE, pose_to_matrix
 from worker.hands.check import check_hand
 from worker.hands.kinematics import body_poses
 from worker.hands.load import files_from_path, hand_from_path, load_hand

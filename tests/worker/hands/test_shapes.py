@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.errors import HandError
+from service.model.errors import HandError
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands import primitives
 from worker.hands.collisions import hull_distance

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from service.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, apply
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.hands import surface
 from worker.hands.kinematics import body_poses

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.errors import HandError
-from service.transforms import IDENTITY_POSE
+from service.model.errors import HandError
+from service.model.transforms import IDENTITY_POSE
 from tests.worker.hands.urdfs import chain, joint, link, robot
 from worker.hands.kinematics import body_poses
 from worker.hands.load import load_hand

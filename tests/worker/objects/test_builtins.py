@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.assets import builtin_files, builtin_names
-from service.domain import AssetKind
+from service.model.domain import AssetKind
+from service.store.assets import builtin_files, builtin_names
 from worker.objects.builtin import OBJECTS, files_of
 from worker.objects.check import check_object
 from worker.objects.distance import deviation

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 import pytest
 
-from service.errors import LimitError, MeshError
+from service.model.errors import LimitError, MeshError
 from tests.worker.objects.shapes import Mesh, box
 from worker.objects.builtin import stl_bytes
 from worker.objects.check import check_object

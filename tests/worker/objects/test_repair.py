@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.errors import MeshError
+from service.model.errors import MeshError
 from tests.worker.objects.shapes import Mesh, box, join, sphere, stl
+from worker.commands.objects import report_object
 from worker.objects.check import check_object
-from worker.objects.commands import report_object
 from worker.objects.prepare import load_object
 from worker.objects.topology import is_closed
 

@@ -9,7 +9,7 @@ import trimesh
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import TOUCH_M, Closed, Closer
-from worker.planners.ground import ground_of
+from worker.planners.peers import ground_of
 from worker.simulation.simulation import HandState
 
 #: Hand points are 9 mm apart on these fingers: a curved link may come this much nearer between two of them [m].

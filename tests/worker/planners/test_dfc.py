@@ -12,8 +12,8 @@ from worker.planners.dfc import kernels
 from worker.planners.dfc.schedule import step_size, temperature
 from worker.planners.dfc.search import Descent
 from worker.planners.dfc.starts import DISTANCE, sample_starts
-from worker.planners.ground import ground_of
-from worker.planners.parts import Steps
+from worker.planners.peers import ground_of
+from worker.planners.threads import Steps
 from worker.simulation.simulation import HandState
 
 BOX = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05)))

@@ -13,8 +13,8 @@ from typing import Any
 
 import trimesh
 
-from service.digests import digest_bytes
-from service.domain import FIDELITIES, Fidelity
+from service.model.digests import digest_bytes
+from service.model.domain import FIDELITIES, Fidelity
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import load_object
 from worker.planners import PLANNERS, method, synthesize

@@ -14,8 +14,8 @@ from worker.planners.graspit.contacts import virtual_contacts
 from worker.planners.graspit.eigengrasps import eigengrasps
 from worker.planners.graspit.schedule import FIRST_STEP, acceptance, jump_share, temperature
 from worker.planners.graspit.search import Search
-from worker.planners.ground import ground_of
-from worker.planners.parts import Steps
+from worker.planners.peers import ground_of
+from worker.planners.threads import Steps
 
 
 def test_the_temperature_follows_ingbers_schedule() -> None:

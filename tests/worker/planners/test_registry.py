@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.planners import PLANNERS, method, method_names, planner, registry
 from worker.planners.port import Method
 from worker.planners.registry import parsed_options
@@ -51,13 +51,13 @@ def offer(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
 
 
 def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, "theirs", "worker.planners.autograsp.planner:METHOD")
+    offer(monkeypatch, "theirs", "worker.planners.autograsp.method:METHOD")
     assert "theirs" in method_names()
     assert isinstance(method("theirs"), Method)
 
 
 def test_another_package_cannot_take_the_name_of_a_method_of_graspds_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, "fast_graspd", "worker.planners.autograsp.planner:METHOD")
+    offer(monkeypatch, "fast_graspd", "worker.planners.autograsp.method:METHOD")
     assert "Fast-Grasp'D" in method("fast_graspd").source
 
 

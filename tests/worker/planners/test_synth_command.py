@@ -12,10 +12,10 @@ import trimesh
 from typer.testing import CliRunner
 
 from graspd import build
-from service.errors import ConflictError, NotFoundError
+from service.model.errors import ConflictError, NotFoundError
 from service.readers import Grasps, open_shards
-from service.shards import Shard, read_shard
-from worker.scenes.sources import object_of_shard
+from service.store.shards import Shard, read_shard
+from worker.files.of_shard import object_of_shard
 
 
 def run(*words: str | Path) -> Any:

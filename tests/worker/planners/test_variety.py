@@ -7,8 +7,8 @@ import resource
 import numpy as np
 import pytest
 
-from service.domain import FIDELITIES
-from service.transforms import apply
+from service.model.domain import FIDELITIES
+from service.model.transforms import apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.worker.quality.test_referee import BOX, PADS, WHOLE, grasp_of
-from worker.mujoco_warnings import void
+from worker.engines.mujoco_warnings import void
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
-from worker.quality.referee.model import Physics, build
+from worker.quality.referee.model import MujocoOptions, build
 from worker.quality.referee.protocol import Outcome, Test
 
 
@@ -26,7 +26,7 @@ class Exploding(Test):
 
 @pytest.mark.parametrize("level", ["letter", "certificate"])
 def test_a_blown_up_push_is_not_held(level: str) -> None:
-    test = Exploding(build(PADS, BOX, WHOLE, Physics()))
+    test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
     trial = test.letter(grasp_of(), 0) if level == "letter" else test.certificate(grasp_of(), 0)
     assert trial.outcomes[0] is Outcome.DIVERGED
     assert not trial.success
@@ -35,7 +35,7 @@ def test_a_blown_up_push_is_not_held(level: str) -> None:
 
 
 def test_the_next_grasp_is_judged_afresh() -> None:
-    test = Exploding(build(PADS, BOX, WHOLE, Physics()))
+    test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
     test.certificate(grasp_of(), 0)
     assert void(test.data)
     Test._start(test, grasp_of(), 0)
@@ -68,5 +68,5 @@ def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.Mo
 
 def test_warnings_leave_no_file_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Exploding(build(PADS, BOX, WHOLE, Physics())).certificate(grasp_of(), 0)
+    Exploding(build(PADS, BOX, WHOLE, MujocoOptions())).certificate(grasp_of(), 0)
     assert list(tmp_path.iterdir()) == []

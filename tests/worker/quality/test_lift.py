@@ -13,8 +13,8 @@ from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
-from worker.quality.referee.model import Physics, build
-from worker.surroundings import Obstacle, Placed
+from worker.quality.referee.model import MujocoOptions, build
+from worker.simulation.surroundings import Obstacle, Placed
 
 HALF, HEIGHT = 0.03, 0.05
 HAND = pad_hand()
@@ -38,8 +38,8 @@ def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
     )
 
 
-def lift_test(physics: Physics | None = None) -> Lift:
-    return Lift(build(HAND, BOX, WHOLE, physics or Physics(), PLACED.supports), PLACED)
+def lift_test(physics: MujocoOptions | None = None) -> Lift:
+    return Lift(build(HAND, BOX, WHOLE, physics or MujocoOptions(), PLACED.supports), PLACED)
 
 
 @pytest.mark.parametrize("level", ["letter", "lift"])
@@ -57,8 +57,8 @@ def test_without_a_squeeze_the_box_stays(level: str) -> None:
 
 def test_glue_lifts_what_the_same_squeeze_does_not_hold() -> None:
     weak = grasp(0.0005)
-    assert lift_test(Physics(friction=(0.05, 0.001))).lift(weak, 0).outcome is LiftOutcome.NOT_LIFTED
-    assert lift_test(Physics(friction=(50.0, 1.0))).lift(weak, 0).outcome is LiftOutcome.LIFTED
+    assert lift_test(MujocoOptions(friction=(0.05, 0.001))).lift(weak, 0).outcome is LiftOutcome.NOT_LIFTED
+    assert lift_test(MujocoOptions(friction=(50.0, 1.0))).lift(weak, 0).outcome is LiftOutcome.LIFTED
 
 
 def test_a_slippery_table_changes_nothing_once_the_box_is_lifted() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.errors import InputError, TaskCancelled
-from service.shards import SCHEMAS
-from service.transforms import compose
+from service.model.errors import InputError, TaskCancelled
+from service.model.transforms import compose
+from service.store.shards import SCHEMAS
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, plate_hand, posture
 from worker.grasps import Posture

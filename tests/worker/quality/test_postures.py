@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.transforms import apply
+from service.model.transforms import apply
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 from tests.worker.quality.helpers import plate_hand, posture
 from worker.grasps import Posture

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.errors import InputError, MeshError, TaskCancelled
+from service.model.errors import InputError, MeshError, TaskCancelled
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import pad_hand, plate_hand, posture
 from worker.grasps import GraspSet, Posture
@@ -27,7 +27,7 @@ from worker.quality.referee import protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose, union_volume
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from worker.quality.referee.model import OBJECT_MASS, Physics, blend, build
+from worker.quality.referee.model import OBJECT_MASS, MujocoOptions, blend, build
 from worker.quality.referee.protocol import Outcome, Test
 from worker.quality.referee.robustness import robustness
 
@@ -58,14 +58,14 @@ def test_a_box_between_pressing_pads_is_held() -> None:
 
 def test_the_same_box_slips_at_friction_0_04() -> None:
     # Two pads of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
-    scene = build(PADS, BOX, WHOLE, Physics(friction=(0.04, 0.001)))
+    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
     trial = Test(scene).letter(grasp_of(), 0)
     assert trial.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
 
 
 def test_the_same_box_holds_at_friction_0_06() -> None:
     # 1.2 N of friction against 1 N.
-    scene = build(PADS, BOX, WHOLE, Physics(friction=(0.06, 0.001)))
+    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
     assert Test(scene).letter(grasp_of(), 0).success
 
 
@@ -76,7 +76,7 @@ def test_a_free_object_falls() -> None:
 
 
 def test_a_free_object_moves_as_newton_says() -> None:
-    test = Test(build(PADS, BOX, WHOLE, Physics()))
+    test = Test(build(PADS, BOX, WHOLE, MujocoOptions()))
     away = grasp_of(contact=posture(((0, 0, -0.5), (0.0, 0.0))))
     test._close(away, 0)
     test._push(2)
@@ -106,7 +106,7 @@ def test_penetration_counts_at_the_pregrasp_where_the_simulation_starts(level: s
 
 
 def test_joints_have_the_damping_of_the_protocol_and_no_armature_nor_dry_friction() -> None:
-    model = build(PADS, BOX, WHOLE, Physics()).model
+    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
     assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness)
     assert not model.dof_armature.any()
@@ -114,7 +114,7 @@ def test_joints_have_the_damping_of_the_protocol_and_no_armature_nor_dry_frictio
 
 
 def test_a_pair_of_convex_pieces_has_one_contact_as_in_the_engine_that_the_protocol_pins() -> None:
-    scene = build(plate_hand(), BOX, WHOLE, Physics())
+    scene = build(plate_hand(), BOX, WHOLE, MujocoOptions())
     data = mujoco.MjData(scene.model)
     scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 1e-3)
     mujoco.mj_forward(scene.model, data)
@@ -126,7 +126,7 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
     mesh = trimesh.creation.box((0.06, 0.04, 0.05))
     mesh.apply_translation([0.3, 0, 0])
     far = object_from_mesh(mesh)
-    scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), Physics())
+    scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
     test = Test(scene)
     scene.place(test.data, np.array([0, 0, -0.5, 1.0, 0, 0, 0]), np.zeros(2))
     assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
@@ -151,7 +151,7 @@ def test_penetration_depth_is_that_of_the_pressed_pads() -> None:
 
 
 def test_a_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
-    grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, Physics()))
+    grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, MujocoOptions()))
     ends = []
     for anew in (False, True):
         test._close(grasps, 3)
@@ -276,25 +276,25 @@ def _assigned(module: ModuleType, name: str) -> bool:
 
 def test_joint_limits_reach_the_engine_in_radians() -> None:
     hand = two_finger_hand()
-    model = build(hand, BOX, WHOLE, Physics()).model
+    model = build(hand, BOX, WHOLE, MujocoOptions()).model
     assert model.joint("joint1").range == pytest.approx([hand.lower[0], hand.upper[0]])
 
 
 def test_object_weighs_100_grams_with_its_own_inertia() -> None:
-    model = build(PADS, BOX, WHOLE, Physics()).model
+    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     body = model.body("object")
     assert body.mass[0] == pytest.approx(OBJECT_MASS)
     assert sorted(body.inertia) == pytest.approx(sorted(OBJECT_MASS * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
 
 
 def test_hand_masses_are_the_model_s() -> None:
-    model = build(PADS, BOX, WHOLE, Physics()).model
+    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PADS.masses)
 
 
 def test_forward_kinematics_agree_with_ours() -> None:
     hand = two_finger_hand()
-    scene = build(hand, BOX, WHOLE, Physics())
+    scene = build(hand, BOX, WHOLE, MujocoOptions())
     data = mujoco.MjData(scene.model)
     pose, joints = np.array([0.1, 0.2, -0.3, 0.5, -0.5, 0.5, 0.5]), np.array([0.4, -0.2])
     scene.place(data, pose, joints)
@@ -316,7 +316,7 @@ def coupled_pads() -> HandModel:
 
 def test_coupled_joints_stay_coupled_while_moving() -> None:
     hand = coupled_pads()
-    scene = build(hand, BOX, WHOLE, Physics())
+    scene = build(hand, BOX, WHOLE, MujocoOptions())
     assert scene.model.nu == 1
     data = mujoco.MjData(scene.model)
     far = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
@@ -330,7 +330,7 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
 
 def test_actuators_never_exceed_the_effort() -> None:
     weak = dataclasses.replace(PADS, effort=np.array([2.0, 3.0]))
-    scene = build(weak, BOX, WHOLE, Physics())
+    scene = build(weak, BOX, WHOLE, MujocoOptions())
     data = mujoco.MjData(scene.model)
     scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0])
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from service.errors import InputError
+from service.model.errors import InputError
 from worker.quality.wrench_space import cone_edges, measure_space, tangents, wrenches
 
 #: The table of reference values is printed with six digits.

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.digests import shard_id
-from service.domain import JobRequest, Stage
-from service.errors import InputError
-from service.shards import check_columns
+from service.model.digests import shard_id
+from service.model.domain import JobRequest, Stage
+from service.model.errors import InputError
+from service.store.shards import check_columns
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.objects.model import ObjectModel
 from worker.rendering import Extras, render
+from worker.rendering.camera_file import GivenCameras, read_cameras
 from worker.rendering.cameras import intrinsics, look_at
 from worker.rendering.channels import parse_channels
-from worker.rendering.given import GivenCameras, read_cameras
 from worker.rendering.hands import DrawnHand
 from worker.scenes import Neighbours
 

@@ -10,8 +10,8 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from service.errors import InputError
-from service.shards import Shard
+from service.model.errors import InputError
+from service.store.shards import Shard
 from worker.rendering.export import PNG_STEP_M, export_images
 
 H, W = 6, 8

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.errors import InputError, TaskCancelled
-from service.shards import check_columns
-from service.transforms import apply, quat_from_axis_angle
+from service.model.errors import InputError, TaskCancelled
+from service.model.transforms import apply, quat_from_axis_angle
+from service.store.shards import check_columns
 from tests.worker.models import object_from_mesh
 from worker.objects.model import ObjectModel
 from worker.rendering import render
@@ -206,7 +206,7 @@ def test_a_scene_looks_the_same_whatever_other_scenes_are_rendered_with_it(mug, 
 
 
 def test_many_pictures_are_traced_in_parts_that_do_not_show(mug, mug_poses, mug_views, monkeypatch):
-    monkeypatch.setattr("worker.rendering.stage.PIXELS_TOGETHER", 3 * SIZE[0] * SIZE[1])
+    monkeypatch.setattr("worker.rendering.tracer.PIXELS_TOGETHER", 3 * SIZE[0] * SIZE[1])
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])
@@ -266,7 +266,7 @@ def test_memory_stays_flat_over_repeated_renders(ball):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_pixels_do_not_depend_on_the_number_of_cores(mug, mug_poses, mug_views, monkeypatch, cores):
-    monkeypatch.setattr("worker.rendering.stage.available_cores", lambda: cores)
+    monkeypatch.setattr("worker.rendering.tracer.available_cores", lambda: cores)
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])

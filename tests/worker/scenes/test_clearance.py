@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.errors import InputError
-from service.transforms import apply, compose, invert, quat_from_axis_angle
+from service.model.errors import InputError
+from service.model.transforms import apply, compose, invert, quat_from_axis_angle
 from tests.worker.models import two_finger_hand
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses

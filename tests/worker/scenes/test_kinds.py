@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.errors import InputError
-from service.scene_spec import SceneSpec
-from service.transforms import quat_rotate
+from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
+from service.model.transforms import quat_rotate
 from tests.worker.models import object_from_mesh
 from worker.scenes.kinds import rest_poses, supports_of
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.errors import InputError
-from service.transforms import apply, compose, quat_from_axis_angle
+from service.model.errors import InputError
+from service.model.transforms import apply, compose, quat_from_axis_angle
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.scenes.test_clearance import postures
 from worker.grasps import Posture

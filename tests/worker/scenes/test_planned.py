@@ -10,16 +10,16 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd import build
-from service.domain import resolve_fidelity
-from service.shards import read_shard
-from tests.worker.test_surroundings import mujoco_distances
+from service.model.domain import resolve_fidelity
+from service.store.shards import read_shard
+from tests.worker.simulation.test_surroundings import mujoco_distances
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.scenes.clearance import approach
 from worker.scenes.way import MARGIN_M, STANDOFF_M, plan_way
-from worker.surroundings import Obstacle, Placed
+from worker.simulation.surroundings import Obstacle, Placed
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 
@@ -28,7 +28,7 @@ QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 def planned():
     hand = hand_from_path("barrett")
     obj = object_from_path("block", face_error_m=QUICK.face_error_m)
-    from service.scene_spec import SceneSpec
+    from service.model.scene_spec import SceneSpec
     from worker.scenes.kinds import rest_poses, supports_of
 
     spec = SceneSpec(kind="table")

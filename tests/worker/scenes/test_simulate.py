@@ -8,8 +8,8 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.stats import chisquare
 
-from service.errors import InputError, MeshError
-from service.transforms import apply, quat_rotate
+from service.model.errors import InputError, MeshError
+from service.model.transforms import apply, quat_rotate
 from tests.worker.models import object_from_mesh
 from worker.objects.model import ObjectModel
 from worker.scenes import drop

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 import yourdfpy
 
-from service.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
+from service.model.transforms import apply, pose_to_matrix, quat_from_axis_angle, quat_multiply, quat_rotate
 from tests.worker.simulation.rigs import ball, rig
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path

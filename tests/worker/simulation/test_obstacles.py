@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
 from worker.hands.load import hand_from_path
@@ -13,7 +13,7 @@ from worker.hands.model import HandModel
 from worker.simulation.obstacles import DeviceObstacles, HandFeatures
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, LossOptions, Simulation
-from worker.surroundings import Obstacle, Surroundings
+from worker.simulation.surroundings import Obstacle, Surroundings
 
 MARGIN = 0.004
 SCENES = {

@@ -6,8 +6,8 @@ from typing import get_args
 
 import pytest
 
-from service.domain import Fidelity
-from service.errors import InputError
+from service.model.domain import Fidelity
+from service.model.errors import InputError
 from tests.worker.simulation.rigs import ball, rig
 from worker.hands.load import hand_from_path
 from worker.simulation.simulation import OPTIMIZERS, LossOptions, still_schedule

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.errors import InputError
-from service.transforms import apply, invert, quat_from_axis_angle, quat_multiply
+from service.model.errors import InputError
+from service.model.transforms import apply, invert, quat_from_axis_angle, quat_multiply
 from tests.worker.simulation.rigs import ball, evaluate, rig, still
 from tests.worker.simulation.test_kinematics import root_poses
 from worker.hands.kinematics import body_poses

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from service.transforms import apply, invert
+from service.model.transforms import apply, invert
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance

@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 
 from api.uploads import files_of_upload
-from service import names
-from service.domain import AssetKind, IngestMessage, Stage
-from service.errors import InputError
-from service.library import publish_asset
+from service.model import names
+from service.model.domain import AssetKind, IngestMessage, Stage
+from service.model.errors import InputError
+from service.model.version import TASK_SCHEMA
 from service.queue.port import EventKind
-from service.store import Store, open_store
-from service.version import TASK_SCHEMA
+from service.store.library import publish_asset
+from service.store.store import Store, open_store
 from tests.worker.objects.shapes import join, sphere, stl
-from worker.context import TaskContext
-from worker.runner import Runner
+from worker.process.runner import Runner
 from worker.stages import ingest
+from worker.stages.context import TaskContext
 
 UPLOAD_BYTES = 64 * 2**20
 #: What is promised for any upload, as time of computing [s].

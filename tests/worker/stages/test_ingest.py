@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from service import names
-from service.domain import AssetKind, IngestMessage
-from service.errors import TaskCancelled
-from service.library import publish_asset
-from service.store import Store, open_store
-from worker.context import StopReason, TaskContext
+from service.model import names
+from service.model.domain import AssetKind, IngestMessage
+from service.model.errors import TaskCancelled
+from service.store.library import publish_asset
+from service.store.store import Store, open_store
 from worker.stages import ingest
+from worker.stages.context import StopReason, TaskContext
 
 TETRAHEDRON = """\
 solid t

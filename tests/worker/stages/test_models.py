@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from service import names
-from service.assets import builtin_files, builtin_model, builtin_names
-from service.domain import AssetKind
-from service.store import open_store
-from service.transforms import IDENTITY_POSE, apply
+from service.model import names
+from service.model.domain import AssetKind
+from service.model.transforms import IDENTITY_POSE, apply
+from service.store.assets import builtin_files, builtin_model, builtin_names
+from service.store.store import open_store
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from service.domain import Stage, TaskMessage
+from service.model.domain import Stage, TaskMessage
 from tests.fakes import request
 from worker.stages.output import batch_seed
 

@@ -7,10 +7,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.digests import digest_files
-from service.domain import AssetKind
-from service.library import publish_asset
-from service.store import Store, open_store
+from service.model.digests import digest_files
+from service.model.domain import AssetKind
+from service.store.library import publish_asset
+from service.store.store import Store, open_store
 from tests.worker.objects.shapes import box, join, sphere, stl
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.domain import FIDELITIES
+from service.model.domain import FIDELITIES
+from worker.commands.bench import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import pair_of
-from worker.studies.commands import app
 from worker.studies.timing import kernel_shares
 
 RUN_KEYS = {

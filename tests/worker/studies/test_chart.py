@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.domain import FIDELITIES
-from service.published import latest
-from service.store import open_store
+from service.model.domain import FIDELITIES
+from service.store.store import open_store
+from service.store.study_records import latest
+from worker.commands.chart import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from worker.studies.chart.commands import app
 from worker.studies.chart.report import markdown
 from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed

@@ -16,7 +16,7 @@ from benchmarks.modelling.common import auc, ranking, share
 from benchmarks.modelling.drops import drops, forearm
 from benchmarks.modelling.steps import rollout, step
 from benchmarks.modelling.tables import tables
-from service.shards import write_shard
+from service.store.shards import write_shard
 from tests.conftest import REPOSITORY
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path

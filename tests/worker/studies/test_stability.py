@@ -13,20 +13,20 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from service.domain import FIDELITIES, JobRequest
-from service.errors import MeshError
-from service.published import latest
-from service.stability import Cell, Stability, StabilityMap, from_json, graded
-from service.store import open_store
-from worker import backend
+from service.model.domain import FIDELITIES, JobRequest
+from service.model.errors import MeshError
+from service.model.stability import MapCell, Stability, StabilityMap, from_json, graded
+from service.store.store import open_store
+from service.store.study_records import latest
 from worker.certified import certified_grasps
+from worker.commands.stability import STUDIES, app
+from worker.engines import backend
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.simulation.simulation import HandState, LossOptions
 from worker.studies.stability import descents, gradients, integrators, report, shapes, studies
-from worker.studies.stability.commands import STUDIES, app
 from worker.studies.stability.report import markdown, write
 
 
@@ -122,8 +122,11 @@ def test_what_is_no_number_is_broken() -> None:
 
 
 def a_map(**changes: object) -> StabilityMap:
-    cells = [Cell("a", 1.0, 10.0, 0.1, "good", reached=True), Cell("a", 2.0, 10.0, math.inf, "broken", "why", "", True)]
-    cells.append(Cell("a", 3.0, 10.0, 5.0, "broken"))
+    cells = [
+        MapCell("a", 1.0, 10.0, 0.1, "good", reached=True),
+        MapCell("a", 2.0, 10.0, math.inf, "broken", "why", "", True),
+    ]
+    cells.append(MapCell("a", 3.0, 10.0, 5.0, "broken"))
     one = StabilityMap("demo", "A demo", "x", "y", "m", "weak: 1", cells, "it flies", "g", "t", {"a": [(1.0, 10.0)]})
     return replace(one, **changes)
 
@@ -151,7 +154,7 @@ def test_a_report_says_what_still_breaks_and_how_a_user_sees_it() -> None:
 def test_numbers_on_a_picture_stay_within_their_cells(letters: str) -> None:
     figure = Figure(figsize=(4.4, 3.4))
     axes = figure.subplots()
-    cells = [Cell("a", float(x), float(y), 1.0, "good", label=letters) for x in range(1, 10) for y in (1, 2)]
+    cells = [MapCell("a", float(x), float(y), 1.0, "good", label=letters) for x in range(1, 10) for y in (1, 2)]
     report._panel(axes, a_map(cells=cells, lines={}), "a")
     report._fit(axes)
     width = axes.get_window_extent().width / 9

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from service.errors import GraspdError, MeshError
+from service.model.errors import GraspdError, MeshError
 from worker.objects.formats import glb, obj, off, ply, stl
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
 

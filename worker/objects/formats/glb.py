@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import MeshError
-from service.transforms import quat_to_matrix
+from service.model.errors import MeshError
+from service.model.transforms import quat_to_matrix
 from worker.objects.formats.soup import Soup, check_face_count
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from service.errors import MeshError
+from service.model.errors import MeshError
 from worker.objects.formats.soup import Soup, check_face_count, fan
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.errors import MeshError
+from service.model.errors import MeshError
 from worker.objects.formats.soup import Soup, check_face_count, fan
 
 

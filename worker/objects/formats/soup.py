@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import LimitError, MeshError
+from service.model.errors import LimitError, MeshError
 
 MAX_FACES: Final = 1_000_000
 #: Coordinates beyond this are no length in any unit.

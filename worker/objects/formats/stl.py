@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from service.errors import MeshError
+from service.model.errors import MeshError
 from worker.objects.formats.soup import Soup, check_face_count
 
 _HEADER = 84

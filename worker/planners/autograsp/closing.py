@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from worker.hands.jacobian import ancestors
 from worker.hands.model import HandModel, JointType, SurfacePoints
 from worker.planners.autograsp import kernels

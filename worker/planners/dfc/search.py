@@ -9,14 +9,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.transforms import IDENTITY_POSE, apply
+from service.model.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.planners.dfc import kernels
 from worker.planners.dfc.schedule import CONTACTS, SELF_GAP_M
 from worker.planners.fast_graspd.pairs import Pair
-from worker.planners.inside import inside_points
-from worker.planners.parts import Steps
+from worker.planners.inner_surface import inside_points
+from worker.planners.threads import Steps
 from worker.simulation.kernels import kinematics, optimizers
 from worker.simulation.simulation import HandState, Simulation, still_schedule
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from service.domain import Fidelity
+from service.model.domain import Fidelity
 from worker.planners.fast_graspd.planner import plan
 from worker.planners.port import Method
 

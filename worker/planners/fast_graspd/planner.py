@@ -10,22 +10,22 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.domain import Fidelity
+from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import scene_starts
-from worker.planners.fast_graspd.merit import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
+from worker.planners.fast_graspd.selection import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.starts import RETREATS, nearest_distances, sample_starts
-from worker.planners.parts import Steps, cut, run_parts
 from worker.planners.port import Cancelled, Progress
+from worker.planners.threads import Steps, cut, run_parts
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule, Simulation
-from worker.surroundings import Placed
+from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
-from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.errors import InputError
+from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, probe_depths, start_generator
 from worker.simulation.simulation import HandState, Simulation, still_schedule
-from worker.surroundings import Placed, Surroundings
+from worker.simulation.surroundings import Placed, Surroundings
 
 Floats = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.domain import Fidelity
+from service.model.domain import Fidelity
 from worker.simulation.simulation import LossOptions, Schedule
 
 Floats = NDArray[np.float64]

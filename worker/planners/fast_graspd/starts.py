@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import InputError
-from service.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.errors import InputError
+from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.simulation import HandState, Simulation, still_schedule

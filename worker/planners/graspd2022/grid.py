@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
-from service.cores import available_cores
+from service.model.cores import available_cores
 from worker.simulation.device import DeviceObject
 from worker.simulation.kernels import surface
 

@@ -20,7 +20,7 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.struct
-class Physics:
+class ForceModel:
     stiffness: wp.float32  # k [N/m]
     viscous: wp.float32  # kf [N s/m]
     friction: wp.float32  # mu
@@ -34,7 +34,7 @@ class Physics:
 
 
 @wp.func
-def contact_force(physics: Physics, depth: wp.float32, n: wp.vec3, v: wp.vec3):
+def contact_force(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
     """Force on the object at a point whose depth in the dilated object is `depth`."""
     c = wp.max(depth, 0.0)
     normal = physics.stiffness * c
@@ -47,7 +47,7 @@ def contact_force(physics: Physics, depth: wp.float32, n: wp.vec3, v: wp.vec3):
 
 
 @wp.func
-def force_slope(physics: Physics, depth: wp.float32, n: wp.vec3, v: wp.vec3):
+def force_slope(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
     """d f / d depth, a share `leak` of it where the point does not touch."""
     slope = -physics.stiffness * n
     tangential = v - wp.dot(v, n) * n
@@ -64,7 +64,7 @@ def force_slope(physics: Physics, depth: wp.float32, n: wp.vec3, v: wp.vec3):
 
 @wp.kernel
 def multipliers(
-    physics: Physics,
+    physics: ForceModel,
     active_in: wp.array(dtype=wp.int32),
     wanted_in: wp.array(dtype=vec6),
     total_inout: wp.array2d(dtype=vec6),
@@ -95,14 +95,14 @@ def multipliers(
 
 
 @wp.func
-def relaxed(physics: Physics, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
+def relaxed(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
     """Gradient with respect to F of mismatch |F - f|^2 plus the task's pull."""
     return 2.0 * physics.mismatch * (force - actual) + wanted
 
 
 @wp.kernel
 def relax(
-    physics: Physics,
+    physics: ForceModel,
     surface: Surface,
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
@@ -179,7 +179,7 @@ def nearest(
 
 @wp.kernel
 def probe(
-    physics: Physics, surface: Surface, point_in: wp.array(dtype=wp.vec3), velocity_in: wp.vec3,
+    physics: ForceModel, surface: Surface, point_in: wp.array(dtype=wp.vec3), velocity_in: wp.vec3,
     distance_out: wp.array(dtype=wp.float32), force_out: wp.array(dtype=wp.vec3), slope_out: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
     """Distance, contact force and its slope at given points, for tests. Launch over them."""

@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.transforms import quat_rotate
+from service.model.transforms import quat_rotate
 from worker.hands.surface import sample_surface
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
 from worker.planners.graspd2022.grid import distance_grid
-from worker.planners.parts import Steps
+from worker.planners.threads import Steps
 from worker.simulation.kernels import kinematics, optimizers, pieces
 from worker.simulation.simulation import MAX_DILATION, HandState, Schedule, Simulation
 
@@ -55,7 +55,7 @@ def schedule(steps: int) -> Schedule:
 
 def physics_of(gyration: float, *, mismatch: float = MISMATCH) -> Any:
     """The constants as the kernels have them; `gyration` [m] weighs torques."""
-    out = kernels.Physics()
+    out = kernels.ForceModel()
     out.stiffness, out.viscous, out.friction, out.leak = STIFFNESS, VISCOUS, FRICTION, LEAK
     out.mismatch, out.gyration, out.tolerance = mismatch, gyration, TOLERANCE_N
     out.damping, out.rate, out.warmup = DAMPING, FORCE_RATE, float(WARMUP)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from worker.hands.model import HandModel, SurfacePoints
-from worker.planners.inside import inside_points
+from worker.planners.inner_surface import inside_points
 
 #: Contacts on each link that closes, and on the palm.
 EACH: Final = 2

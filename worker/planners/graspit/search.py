@@ -8,15 +8,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.errors import InputError
-from service.transforms import quat_from_matrix
+from service.model.errors import InputError
+from service.model.transforms import quat_from_matrix
 from worker.hands.model import HandModel
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspit import kernels
 from worker.planners.graspit.contacts import virtual_contacts
 from worker.planners.graspit.eigengrasps import Eigengrasps, eigengrasps
 from worker.planners.graspit.schedule import FIRST_STEP
-from worker.planners.parts import Steps
+from worker.planners.threads import Steps
 from worker.simulation.device import to_wxyz, to_xyzw
 from worker.simulation.simulation import HandState, body_points, still_schedule
 

@@ -23,8 +23,8 @@ import manifold3d as m3d
 import numpy as np
 from numpy.typing import NDArray
 
-from service.digests import digest_json
-from service.errors import MeshError
+from service.model.digests import digest_json
+from service.model.errors import MeshError
 from worker.hands.primitives import triangle_areas
 from worker.objects.model import ObjectModel
 

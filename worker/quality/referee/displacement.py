@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.cores import available_cores
+from service.model.cores import available_cores
+from worker.engines.mujoco_warnings import ARENA, void
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
-from worker.mujoco_warnings import ARENA, void
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import add_object, add_shape

@@ -14,14 +14,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.cores import available_cores
-from service.errors import InputError, TaskCancelled
+from service.model.cores import available_cores
+from service.model.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import Level, postures_key, verdict_key
-from worker.quality.referee.model import COARSE, Physics, build
+from worker.quality.referee.model import COARSE, MujocoOptions, build
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
 
 Floats = NDArray[np.float64]
@@ -140,7 +140,7 @@ class _Bench:
         self.level, self.hard, self.pieces, self.threads = level, hard, pieces, threads
         self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
         self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        levels = [Physics().hardened(), COARSE.hardened()] if hard else [Physics(), COARSE]
+        levels = [MujocoOptions().hardened(), COARSE.hardened()] if hard else [MujocoOptions(), COARSE]
         full = build(hand, obj, pieces, levels[0])
         coarse = build(hand, obj, pieces, levels[1]) if level == "screen" else None
         for _ in range(threads):

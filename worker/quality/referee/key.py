@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 import mujoco
 import numpy as np
 
-from service.digests import digest_bytes, digest_json
+from service.model.digests import digest_bytes, digest_json
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -76,7 +76,7 @@ def verdict_key(
             "gains": [array.tolist() for array in (hand.stiffness, hand.effort, hand.masses)],
             "object": [obj.digest, np.round(obj.inertia, 12).tolist(), np.round(obj.centre_of_mass, 9).tolist()],
             "pieces": pieces.digest,
-            "physics": asdict(model.Physics().hardened() if hard else model.Physics()),
+            "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
         }
     )
@@ -98,4 +98,4 @@ def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    return asdict(value) if isinstance(value, model.Physics) else value
+    return asdict(value) if isinstance(value, model.MujocoOptions) else value

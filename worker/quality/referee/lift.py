@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import invert, slerp
+from service.model.transforms import invert, slerp
+from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
-from worker.mujoco_warnings import void
 from worker.quality.referee.model import Scene, blend
 from worker.quality.referee.protocol import (
     LOST_ROTATION,
@@ -32,7 +32,7 @@ from worker.quality.referee.protocol import (
     Test,
     Trial,
 )
-from worker.surroundings import Placed
+from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from service.cores import available_cores
-from service.digests import digest_bytes, digest_json
-from service.errors import InputError, TaskCancelled
+from service.model.cores import available_cores
+from service.model.digests import digest_bytes, digest_json
+from service.model.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -25,8 +25,8 @@ from worker.quality.referee import lift as protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
-from worker.quality.referee.model import Physics, build
-from worker.surroundings import Placed
+from worker.quality.referee.model import MujocoOptions, build
+from worker.simulation.surroundings import Placed
 
 LiftLevel = Literal["letter", "lift"]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
@@ -97,7 +97,7 @@ def judge_lifts(
         raise InputError("the lift test needs a scene and, but for the letter, an approach of each grasp")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
-    physics = Physics().hardened() if hard else Physics()
+    physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = build(hand, obj, pieces, physics, placed.supports)
     tests: queue.SimpleQueue[Lift] = queue.SimpleQueue()
     workers = max(1, min(threads or available_cores(), len(grasps)))
@@ -139,5 +139,5 @@ def lift_key(
     pushes = verdict_key(hand, obj, "letter" if level == "letter" else "certificate", hard, pieces=pieces)
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}
-    physics = asdict(Physics().hardened() if hard else Physics())
+    physics = asdict(MujocoOptions().hardened() if hard else MujocoOptions())
     return digest_json([REVISION, pushes, level, physics, digest_bytes(supports), constants])

@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import slerp
+from service.model.transforms import slerp
+from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
 from worker.hands.model import ConvexPiece, HandModel, JointType
-from worker.mujoco_warnings import ARENA
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.surroundings import Obstacle
+from worker.simulation.surroundings import Obstacle
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ _MIN_MASS: Final = 1e-3
 
 
 @dataclass(frozen=True)
-class Physics:
+class MujocoOptions:
     """What may differ between the levels of a certificate."""
 
     timestep: float = 0.004
@@ -50,7 +50,7 @@ class Physics:
     friction: tuple[float, float] = FRICTION
     """Sliding and torsional coefficient of every contact."""
 
-    def hardened(self) -> Physics:
+    def hardened(self) -> MujocoOptions:
         """The same at the friction of the hard protocol."""
         slide, twist = self.friction
         return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
@@ -58,7 +58,7 @@ class Physics:
 
 #: Coarse physics that decide the clear cases of a screen. At 6 ms a contact is as stiff as at 4 ms (two steps are less
 #: than the 12.5 ms that hand and object agree on), at 8 ms it is not.
-COARSE: Final = Physics(timestep=0.006, root="fixed")
+COARSE: Final = MujocoOptions(timestep=0.006, root="fixed")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Scene:
 
     model: Any
     hand: HandModel
-    physics: Physics
+    physics: MujocoOptions
     hand_geoms: NDArray[np.bool_]
     """(G,) geoms of the hand."""
     object_body: int
@@ -101,7 +101,7 @@ class Scene:
 
 
 def build(
-    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: Physics, supports: Sequence[Obstacle] = ()
+    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions, supports: Sequence[Obstacle] = ()
 ) -> Scene:
     """Compile the scene of a hand and an object, with the supports that it stands on or between, if any."""
     spec = mujoco.MjSpec()

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
-from worker.mujoco_warnings import void
 from worker.quality.referee.model import OBJECT_MASS, Scene, blend
 
 Floats = NDArray[np.float64]

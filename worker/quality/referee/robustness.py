@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.transforms import compose, invert, quat_from_axis_angle
+from service.model.transforms import compose, invert, quat_from_axis_angle
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

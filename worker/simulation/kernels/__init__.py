@@ -12,7 +12,7 @@ from typing import Final
 
 import warp as wp
 
-from worker import backend
+from worker.engines import backend
 
 backend.start()
 

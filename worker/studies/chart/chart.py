@@ -8,16 +8,16 @@ from typing import Any, Final
 
 import warp as wp
 
-from service.clock import timestamp
-from service.cores import available_cores
-from service.domain import FIDELITIES
-from service.version import PACKAGE_VERSION
+from service.model.clock import timestamp
+from service.model.cores import available_cores
+from service.model.domain import FIDELITIES
+from service.model.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
 from worker.studies.bench import device_name
-from worker.studies.chart.cells import FRICTION, THRESHOLD_M, Cell, Setting
 from worker.studies.chart.statistics import figures, plain, summed
+from worker.studies.chart.trials import FRICTION, THRESHOLD_M, Setting, Trial
 
 Say = Callable[[str], None]
 
@@ -55,7 +55,7 @@ def chart(
         for hand in hands:
             true = thing.load(TRUE_ERROR_M)
             pieces = decompose(true)
-            cells = [Cell(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
+            cells = [Trial(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
             for cell in cells:
                 cell.warm_up()
             for _ in range(repeats):
@@ -83,7 +83,7 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> dict
     }
 
 
-def _row(cell: Cell, hand: HandModel, thing: Thing) -> dict[str, Any]:
+def _row(cell: Trial, hand: HandModel, thing: Thing) -> dict[str, Any]:
     setting = cell.setting
     return {
         "method": setting.method,

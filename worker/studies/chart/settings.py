@@ -6,10 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from service.domain import FIDELITIES
-from service.errors import InputError
+from service.model.domain import FIDELITIES
+from service.model.errors import InputError
 from worker.planners import method, planner
-from worker.studies.chart.cells import Setting
+from worker.studies.chart.trials import Setting
 
 #: Label of methods that know no fidelities: they run as their source has them.
 LABEL: Final = "as published"

@@ -8,8 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.intervals import wilson
-from worker.studies.chart.cells import Cell
+from worker.quality.intervals import wilson
+from worker.studies.chart.trials import Trial
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ METRICS: Final = {"gsr": True, "epsilon": True, "pd_mm": False}
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
-def figures(cell: Cell) -> dict[str, Any]:
+def figures(cell: Trial) -> dict[str, Any]:
     """The keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
     held = np.concatenate(cell.success).astype(float)
     seconds, batch = np.array(cell.seconds), cell.setting.batch
@@ -64,7 +64,7 @@ def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | 
     return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
 
 
-def _draws(cell: Cell) -> dict[str, Floats]:
+def _draws(cell: Trial) -> dict[str, Floats]:
     """Bootstrap: repeats with replacement, then grasps within each."""
     rng = np.random.default_rng(0)
     repeats = len(cell.seconds)

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 import warp as wp
 
-from service.domain import FIDELITIES, Fidelity
-from service.errors import InputError
+from service.model.domain import FIDELITIES, Fidelity
+from service.model.errors import InputError
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -24,9 +24,9 @@ from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
 from worker.quality.referee.decomposition import decompose
 from worker.simulation.simulation import LossOptions
 from worker.studies.chart import kernels
-from worker.studies.chart.cells import Cell, Setting
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import figures, plain
+from worker.studies.chart.trials import Setting, Trial
 from worker.studies.chart.variants import asking_each
 
 Say = Callable[[str], None]
@@ -115,10 +115,10 @@ def sweep(
     default = Turn("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
-    cells: dict[tuple[str, str], Cell] = {}
+    cells: dict[tuple[str, str], Trial] = {}
     for turn in [default, *turns(quick, knobs)]:
         if turn is default or not turn.default:
-            cells[turn.knob, turn.value] = Cell(
+            cells[turn.knob, turn.value] = Trial(
                 _setting(turn, batch, threads, device), hand, thing.load(turn.fidelity.face_error_m), true, pieces
             )
     for _ in range(repeats):

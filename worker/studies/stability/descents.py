@@ -9,14 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.domain import FIDELITIES, Fidelity
-from service.stability import Cell, StabilityMap, graded, reachable, short
-from service.transforms import quat_rotate
+from service.model.domain import FIDELITIES, Fidelity
+from service.model.stability import MapCell, StabilityMap, graded, reachable, short
+from service.model.transforms import quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.merit import merits
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.selection import merits
 from worker.planners.fast_graspd.starts import RETREATS, sample_starts
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.simulation import HandState, Schedule
@@ -142,7 +142,7 @@ def length_map(
     for length in lengths:
         found = descend(pair, state, fidelity, iterations=length)
         (cell,) = _cells(pair, found, "draft", length, "residual")
-        cells += [cell, Cell("draft", length, "quaternion drift", found.drift, graded(found.drift, 1e-5, 1e-3))]
+        cells += [cell, MapCell("draft", length, "quaternion drift", found.drift, graded(found.drift, 1e-5, 1e-3))]
         say(f"{length} iterations: {cell.outcome}, quaternions off by {found.drift:.1e}")
     return StabilityMap(
         "length", f"Long runs of the fine phase, {hand.name} on {obj.name}", "iterations", "measure",
@@ -172,11 +172,11 @@ def starts_of(pair: Pair, count: int) -> HandState:
     return sample_starts(hand, obj, probe, seed=11, batch=0, indices=range(count), each=1)
 
 
-def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | str) -> list[Cell]:
+def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | str) -> list[MapCell]:
     state = found.state
     finite = bool(np.isfinite(state.pivot).all() and np.isfinite(state.q).all() and np.isfinite(state.rotation).all())
     if not finite:
-        return [Cell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
+        return [MapCell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
     residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(found.depths)))))
     depth = float(np.median(found.depths)) * 1e3
     held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)
@@ -184,7 +184,7 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
     # What makes the cell bad is what stands on it.
     label = f"↓{short(depth)}" if is_deep else ""
     said = f"residual {residual:.2g}, {depth:.2g} mm deep"
-    return [Cell(panel, x, y, residual, deep if is_deep else held, said, label)]
+    return [MapCell(panel, x, y, residual, deep if is_deep else held, said, label)]
 
 
 def _scaled(schedule: Schedule, rates: float, weights: float) -> Schedule:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.stability import Cell, StabilityMap, graded, reachable
+from service.model.stability import MapCell, StabilityMap, graded, reachable
 from worker.simulation import reference
 from worker.simulation.kernels import contact
 from worker.simulation.reference import Contacts, World
@@ -80,7 +80,7 @@ def gradient_map(
             for gap in gaps:
                 angles = [_angle(name, size, gap, count, seed) for seed in range(repeats)]
                 worst = float(np.median(angles))
-                cells.append(Cell(name, size, gap, worst, graded(worst, *ANGLE)))
+                cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
     return StabilityMap(
         "gradient", "Gradient of the float32 kernels against float64 differences", "radius of the object [m]",
         "spread of the gaps over the step", "sine of the angle between the gradients, median of some contact sets",

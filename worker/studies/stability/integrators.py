@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.stability import Cell, StabilityMap, graded, reachable, short
+from service.model.stability import MapCell, StabilityMap, graded, reachable, short
 from worker.simulation import reference
 from worker.simulation.reference import Contacts, World
 from worker.simulation.simulation import LossOptions
@@ -199,14 +199,14 @@ def time_step_map(time_steps: Sequence[float] = TIME_STEPS, speeds: Sequence[flo
     )  # fmt: skip
 
 
-def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -> Cell:
+def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -> MapCell:
     energy, deep = found
     worst = max(graded(energy, *ENERGY), graded(deep, *SINK_M), key=("good", "weak", "broken").index)
     said = f"energy × {energy:.3g}, {deep * 1e3:.2g} mm deep"
     # What makes the cell bad is what stands on it.
     ratio = f"{energy:.2f}" if energy < 2 else short(energy)
     label = f"×{ratio}" if energy >= ENERGY[0] else short(round(deep * 1e3, 2))
-    return Cell(name, dt, speed, energy, worst, said, label)
+    return MapCell(name, dt, speed, energy, worst, said, label)
 
 
 def stiffness_map(
@@ -263,7 +263,7 @@ def contact_count_map(counts: Sequence[int] = COUNTS) -> StabilityMap:
     )  # fmt: skip
 
 
-def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float) -> Cell:
+def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float) -> MapCell:
     rng = np.random.default_rng(count)
     points = np.concatenate([0.005 * rng.normal(size=(count, 2)), np.full((count, 1), RADIUS_M)], axis=1)
     normals = np.tile([0.0, 0, 1], (count, 1))
@@ -272,4 +272,4 @@ def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float)
     world = ball_world(1.0, step)
     end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)
     left = abs(float(end[2]) + depth) / step
-    return Cell(name, count, depth, left, graded(left, 0.25, 1.0))
+    return MapCell(name, count, depth, left, graded(left, 0.25, 1.0))

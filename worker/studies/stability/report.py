@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from service.stability import OUTCOMES, Cell, Stability, StabilityMap, between, counts, tick
+from service.model.stability import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
 
 #: Told apart by lightness alone too, from calm to alarming: (fill, text).
 COLOURS: Final = {
@@ -68,7 +68,7 @@ def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
     return [*lines, ""]
 
 
-def _row(cells: Sequence[Cell]) -> str:
+def _row(cells: Sequence[MapCell]) -> str:
     return " | ".join(str(number) for number in counts(cells).values())
 
 

@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 import trimesh
 
-from service.digests import digest_files
-from service.domain import FIDELITIES, AssetKind, JobRequest
-from service.errors import GraspdError
-from service.stability import Cell, Outcome, StabilityMap, reachable
+from service.model.digests import digest_files
+from service.model.domain import FIDELITIES, AssetKind, JobRequest
+from service.model.errors import GraspdError
+from service.model.stability import MapCell, Outcome, StabilityMap, reachable
 from worker.certified import certified_grasps
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -127,15 +127,15 @@ def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectM
 def _cell(
     hand: HandModel, panel: str, value: float | str, mesh: Any, options: dict[str, Any], fidelity: str, count: int,
     threads: int,
-) -> Cell:  # fmt: skip
+) -> MapCell:  # fmt: skip
     request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", fidelity=fidelity, audits=0)
     try:
         obj = prepared(mesh, options, FIDELITIES[fidelity].face_error_m)
         found = certified_grasps(hand, obj, request, count=count, threads=threads)
     except GraspdError as error:
-        return Cell(panel, value, fidelity, float("nan"), "refused", str(error))
+        return MapCell(panel, value, fidelity, float("nan"), "refused", str(error))
     valid = float(found.columns["quality/valid"].mean())
     depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
     finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
     outcome: Outcome = "broken" if not finite or valid == 0 else "weak" if valid < 0.5 else "good"
-    return Cell(panel, value, fidelity, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")
+    return MapCell(panel, value, fidelity, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")

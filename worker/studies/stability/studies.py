@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from service.stability import StabilityMap
+from service.model.stability import StabilityMap
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.studies.stability import descents, gradients, integrators, shapes

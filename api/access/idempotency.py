@@ -1,0 +1,65 @@
+"""Idempotency-Key (IETF draft): the same key with another body is a mistake of the caller's.
+
+The same request is the same job without any key, because its id follows from its content; so no answer needs to be
+kept, only which content a key stood for. That lies in Redis for a day: losing it loses a check, never a job.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+from redis.exceptions import RedisError
+
+from service.model.digests import digest_bytes, digest_json
+from service.model.domain import JobRequest
+from service.model.errors import InputError, QueueUnavailable
+
+KEPT_S: Final = 24 * 3600
+_FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"
+
+
+class Idempotency:
+    """Which request a key stood for; in Redis, so that all API processes know."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+
+    @contextmanager
+    def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
+        """Bind a key to a request that is recorded within; one that fails leaves the key free.
+
+        Args:
+            owner: name of the API key that the request showed: others may use the same words.
+
+        Raises:
+            InputError: the key is bound to another request.
+            QueueUnavailable: Redis does not answer.
+        """
+        name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
+        content = digest_json(request.model_dump(mode="json")).encode()
+        is_ours = self._bind(name, content)
+        try:
+            yield
+        except BaseException:
+            if is_ours:
+                with suppress(RedisError):
+                    self._connection.eval(_FREE, 1, name, content)
+            raise
+        if not is_ours:
+            # The request that had bound it may have failed meanwhile.
+            with suppress(RedisError):
+                self._connection.set(name, content, ex=KEPT_S, nx=True)
+
+    def _bind(self, name: str, content: bytes) -> bool:
+        """Whether the key was free."""
+        try:
+            if self._connection.set(name, content, ex=KEPT_S, nx=True):
+                return True
+            bound = self._connection.get(name)
+        except RedisError as error:
+            raise QueueUnavailable(f"Redis does not answer: {error}") from None
+        if bound not in (None, content):
+            raise InputError("this Idempotency-Key came with another request before; take a new key")
+        return False

@@ -1,0 +1,258 @@
+"""Bearer keys with scopes. A key is shown once when it is made; what is kept is its SHA-256.
+
+The keys lie in one JSON file (mode 600) that every API process reads, so a key made, rotated or revoked on the command
+line counts at the next request.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+from typing import Final, Self
+
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+
+PREFIX: Final = "gd_"
+SESSION_S: Final = 12 * 3600
+
+
+class Scope(StrEnum):
+    """What a key may do; each includes the one before it.
+
+    `submit` acts on what was submitted with the same key, `admin` on everybody's.
+    """
+
+    READ = "read"
+    SUBMIT = "submit"
+    ADMIN = "admin"
+
+    def includes(self, other: Scope) -> bool:
+        order = list(Scope)
+        return order.index(self) >= order.index(other)
+
+
+class KeyLimits(BaseModel):
+    """What one key may use. None: what the settings say for all keys; 0: no limit."""
+
+    requests_per_minute: int | None = Field(None, ge=0)
+    concurrency: int | None = Field(None, ge=0, description="requests being answered at once")
+    grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
+    jobs_per_day: int | None = Field(None, ge=0, description="new jobs from midnight to midnight UTC")
+
+
+class Key(BaseModel):
+    """A key as it is kept. Its id lasts through rotation, and no later key of the same name has it."""
+
+    id: str = ""
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    scope: Scope
+    sha256: str
+    created: str
+    revoked: str | None = None
+    expires: str | None = None
+    limits: KeyLimits = KeyLimits()
+
+    @model_validator(mode="after")
+    def _has_an_id(self) -> Self:
+        # Keys made before there were ids: the old and the new secret of one that is being rotated share its name.
+        self.id = self.id or _sha256(f"name {self.name}")[:16]
+        return self
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it opens anything now."""
+        return self.revoked is None and (self.expires is None or _now() < self.expires)
+
+
+class _Document(BaseModel):
+    session_secret: str
+    keys: list[Key] = []
+
+
+class KeyFile:
+    """The file of keys."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._stamp: tuple[int, ...] | None = None
+        self._document = _Document(session_secret="")
+
+    def list(self) -> list[Key]:
+        """All keys, the revoked ones too."""
+        return list(self._read().keys)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether no key was ever made, so that anybody on this machine may use the service."""
+        return not self._read().keys
+
+    @property
+    def has_live_key(self) -> bool:
+        return any(key.is_live for key in self._read().keys)
+
+    def add(
+        self, name: str, scope: Scope, *, lifetime: timedelta | None = None, limits: KeyLimits | None = None
+    ) -> str:
+        """Make a key and return it; it cannot be shown again.
+
+        Raises:
+            ConflictError: a live key has this name.
+            InputError: the name is not a plain word.
+        """
+        with self._changing() as document:
+            if any(key.name == name and key.is_live for key in document.keys):
+                raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
+            token = PREFIX + secrets.token_urlsafe(32)
+            try:
+                key = Key(
+                    id=secrets.token_hex(8),
+                    name=name,
+                    scope=scope,
+                    sha256=_sha256(token),
+                    created=_now(),
+                    expires=_now(lifetime) if lifetime else None,
+                    limits=limits or KeyLimits(),
+                )
+            except ValidationError:
+                raise InputError(f"{name!r} is no key name; use letters, digits, dot, dash and underscore") from None
+            document.keys.append(key)
+        return token
+
+    def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
+        """A new secret for a key; the old one still opens for `grace`. Scope and limits stay.
+
+        Raises:
+            NotFoundError: no live key has this name.
+        """
+        token = PREFIX + secrets.token_urlsafe(32)
+        with self._changing() as document:
+            old = _live(document, name)
+            fresh = old[-1].model_copy(
+                update={
+                    "sha256": _sha256(token),
+                    "created": _now(),
+                    "expires": _now(lifetime) if lifetime else None,
+                }
+            )
+            for key in old:
+                if grace:
+                    key.expires = min(_now(grace), key.expires or _now(grace))
+                else:
+                    key.revoked = _now()
+            document.keys.append(fresh)
+        return token
+
+    def limit(self, name: str, limits: KeyLimits) -> KeyLimits:
+        """Change those limits of a key that are given; returns all of them.
+
+        Raises:
+            NotFoundError: no live key has this name.
+        """
+        with self._changing() as document:
+            for key in (found := _live(document, name)):
+                key.limits = key.limits.model_copy(update=limits.model_dump(exclude_unset=True))
+        return found[-1].limits
+
+    def revoke(self, name: str) -> None:
+        """End a key's life; it stays in the list.
+
+        Raises:
+            NotFoundError: no live key has this name.
+        """
+        with self._changing() as document:
+            for key in _live(document, name):
+                key.revoked = _now()
+
+    def find(self, token: str) -> Key | None:
+        """The live key behind a token."""
+        digest = _sha256(token)
+        return self._first(lambda key: hmac.compare_digest(key.sha256, digest))
+
+    def open_session(self, key: Key) -> str:
+        """Signed cookie value for a browser that showed a key."""
+        claim = base64.urlsafe_b64encode(json.dumps([key.sha256, int(time.time()) + SESSION_S]).encode()).decode()
+        return f"{claim}.{self._sign(claim)}"
+
+    def find_session(self, cookie: str) -> Key | None:
+        """The live key behind a session; revoking the key ends its sessions."""
+        claim, _, signature = cookie.partition(".")
+        if not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
+            return None
+        digest, expires = json.loads(base64.urlsafe_b64decode(claim))
+        if time.time() > expires:
+            return None
+        return self._first(lambda key: key.sha256 == digest)
+
+    def _first(self, is_it: Callable[[Key], bool]) -> Key | None:
+        return next((key for key in self._read().keys if is_it(key) and key.is_live), None)
+
+    def _sign(self, claim: str) -> str:
+        return hmac.new(self._read().session_secret.encode(), claim.encode(), "sha256").hexdigest()
+
+    def _read(self) -> _Document:
+        try:
+            status = self.path.stat()
+        except FileNotFoundError:
+            return _Document(session_secret="")
+        # File clocks tick slowly and file numbers are used again: the size tells two quick changes apart.
+        stamp = (status.st_mtime_ns, status.st_ino, status.st_size)
+        if stamp != self._stamp:
+            try:
+                self._document = _Document.model_validate_json(self.path.read_bytes())
+            except (ValidationError, OSError) as error:
+                raise UnavailableError(
+                    f"the key file {self.path} cannot be read; restore it, or remove it to begin anew"
+                ) from error
+            self._stamp = stamp
+        return self._document
+
+    @contextmanager
+    def _changing(self) -> Iterator[_Document]:
+        """A copy of the document that replaces the file at the end; two commands at once take turns."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                document = self._read().model_copy(deep=True)
+                document.session_secret = document.session_secret or secrets.token_hex(32)
+                yield document
+                self._write(document)
+        except OSError as error:
+            raise UnavailableError(f"the key file {self.path} cannot be written: {error.strerror}") from None
+
+    def _write(self, document: _Document) -> None:
+        draft = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            file.write(document.model_dump_json(indent=2))
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(self.path)
+
+
+def _live(document: _Document, name: str) -> list[Key]:
+    found = [key for key in document.keys if key.name == name and key.is_live]
+    if not found:
+        raise NotFoundError(f"there is no live key named {name!r}; `graspd keys list` shows them")
+    return found
+
+
+def _sha256(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def _now(ahead: timedelta = timedelta(0)) -> str:
+    """RFC 3339 in UTC to the microsecond; such texts sort by time."""
+    return (datetime.now(UTC) + ahead).isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -1,0 +1,1 @@
+"""What routes and pages read and do, as documents."""

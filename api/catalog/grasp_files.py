@@ -1,0 +1,102 @@
+"""What a base shard says of one grasp: postures, quality at every threshold, the referee's verdict push by push."""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import lru_cache
+from typing import Any, Final
+
+from api.models import GraspDetail, Posture, Push
+from service.index.views import GraspView, ShardView
+from service.model.errors import InputError, NotFoundError
+from service.store.integrity import read_checked
+from service.store.shards import SCHEMAS, Shard, read_shard
+from service.store.store import Store
+
+#: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.
+_KEPT_SHARDS: Final = 64
+_POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+_SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
+_OUTCOME: Final = "quality/verdict_outcome"
+#: What the numbers of the column mean, as its description in the schema says.
+OUTCOMES: Final = {
+    int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][_OUTCOME].description)
+}
+DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
+
+
+class GraspFiles:
+    """Reads base shards; keeps the ones it read last, which is memory that may be lost."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._read = lru_cache(maxsize=_KEPT_SHARDS)(self._fetch)
+
+    def detail(self, grasp: GraspView, shard: ShardView) -> GraspDetail:
+        """The grasp of the index with what stands in its shard.
+
+        Raises:
+            NotFoundError: the shard holds no grasps.
+            DamagedShard: its file is gone, or not what its checksum says.
+        """
+        file = self._read(shard.key, shard.sha256)
+        row = grasp.row
+        return GraspDetail(
+            **grasp.model_dump(),
+            hand_digest=shard.hand_digest,
+            object_digest=shard.object_digest,
+            joint_names=_texts(file.attributes.get("joint_names")),
+            postures={name: _posture(file, name, row) for name in _POSTURES},
+            thresholds_m=_numbers(file["quality/thresholds_m"]),
+            sweep={name: _numbers(file[f"quality/{name}"][row]) for name in _SWEPT},
+            pushes=_pushes(file, row),
+            verdict_margin=_value(file, "quality/verdict_margin", row),
+            audit=_verdict(file, "quality/audit", row),
+            friction=_number(file.attributes.get("mu")),
+        )
+
+    def _fetch(self, key: str, sha256: str) -> Shard:
+        data = read_checked(self._store, key, sha256)
+        try:
+            return read_shard(data, kind="base", name=key)
+        except InputError as error:
+            raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
+
+
+def _posture(file: Shard, name: str, row: int) -> Posture:
+    pose, joints = file[f"{name}/hand_pose"][row], file[f"{name}/joint_positions"][row]
+    return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
+
+
+def _pushes(file: Shard, row: int) -> list[Push]:
+    outcomes = file.arrays.get(_OUTCOME)
+    if outcomes is None or _verdict(file, "quality/success", row) is None:
+        return []
+    codes = outcomes[row].tolist()
+    return [
+        Push(direction=direction, outcome=OUTCOMES.get(code, "unknown"))
+        for direction, code in zip(DIRECTIONS, codes, strict=False)
+    ]
+
+
+def _verdict(file: Shard, path: str, row: int) -> bool | None:
+    column = file.arrays.get(path)
+    return None if column is None or column[row] < 0 else bool(column[row])
+
+
+def _value(file: Shard, path: str, row: int) -> float | None:
+    column = file.arrays.get(path)
+    return None if column is None else _number(column[row])
+
+
+def _numbers(values: Any) -> list[Any]:
+    return [_number(value) for value in values.tolist()]
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(float(value)) else float(value)
+
+
+def _texts(value: Any) -> list[str]:
+    return [str(name) for name in value] if isinstance(value, list) else []

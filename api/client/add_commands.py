@@ -1,0 +1,109 @@
+"""`graspd hands add` and `graspd objects add`: upload one with what its files do not say, and wait for its check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.client.add_sets import add_set, name_of_set, one_of_set, sweep
+from api.client.hand_files import upload_of
+from api.client.reports import UrlOption, open_client, show_asset
+from api.uploads import name_of_upload
+from service.cli import JsonFlag, reporting_errors
+from service.model.domain import AssetKind
+from service.model.errors import InputError
+from service.store.asset_options import (
+    AllowOpenOption,
+    ApproachOption,
+    DensityOption,
+    DropOption,
+    FixOption,
+    KeepLargestOption,
+    LicenceOption,
+    MassOption,
+    PalmOption,
+    PreShapeOption,
+    RootOption,
+    ScaleSweepOption,
+    SourceOption,
+    UnitsOption,
+    hand_options,
+    object_options,
+    provenance,
+    sizes_of,
+)
+from service.store.object_sets import files_of_set
+
+NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
+WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
+
+
+@reporting_errors
+def add_hand(
+    file: Annotated[
+        Path, typer.Argument(help="A URDF, whose meshes are found beside it; its folder; or a ZIP of that.")
+    ],
+    name: NameOption = None,
+    palm: PalmOption = None,
+    approach: ApproachOption = None,
+    root: RootOption = None,
+    pre_shape: PreShapeOption = None,
+    fix: FixOption = None,
+    drop: DropOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
+    wait: WaitOption = True,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload a hand, wait for its check, and say what was guessed."""
+    options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    options |= provenance(licence, source)
+    with upload_of(file) as upload:
+        _add(AssetKind.HAND, upload, name, options, wait=wait, url=url, json=json)
+
+
+@reporting_errors
+def add_object(
+    file: Annotated[Path, typer.Argument(help="A mesh, or a ZIP with one; or a folder or ZIP of many objects.")],
+    name: NameOption = None,
+    units: UnitsOption = None,
+    scale_to: ScaleSweepOption = None,
+    keep_largest: KeepLargestOption = False,
+    allow_open: AllowOpenOption = False,
+    density: DensityOption = None,
+    mass: MassOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
+    wait: WaitOption = True,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload an object or a whole set of them, wait for the check, and say what was repaired."""
+    sizes = sizes_of(scale_to)
+    one_size = sizes[0] if len(sizes) == 1 else None
+    options = object_options(
+        units=units, scale_to=one_size, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
+    )
+    options |= provenance(licence, source)
+    if len(sizes) > 1:
+        swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
+        add_set(swept, name=name or name_of_set(file), prefix=None, options=options, wait=wait, url=url, json=json)
+    elif files := files_of_set(file):
+        add_set(files, name=name or name_of_set(file), prefix=name, options=options, wait=wait, url=url, json=json)
+    else:
+        _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
+
+
+def _add(
+    kind: AssetKind, file: Path, name: str | None, options: dict[str, Any], *, wait: bool, url: str | None, json: bool
+) -> None:
+    with open_client(url) as client:
+        asset = client.upload(kind, file, name=name or name_of_upload(file.name), options=options)
+        if wait:
+            asset = client.wait_checked(kind, asset.name)
+    show_asset(asset.model_dump(mode="json"), json=json)
+    if asset.verdict == "refuse":
+        raise InputError(f"refused: {asset.message}")

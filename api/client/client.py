@@ -1,0 +1,250 @@
+"""A thin HTTP client: the documents of `api.models` in, problem documents back as the exceptions they came from."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+from urllib.parse import urlsplit
+
+import httpx
+
+from api.hosts import is_loopback
+from api.models import GraspQuery, Health, Job, JobDetail, Shard
+from api.problems import ERRORS
+from service.index.views import AssetView, GraspView, Page
+from service.model.domain import AssetKind, JobRequest, State
+from service.model.errors import GraspdError, InputError, RateError, UnavailableError
+
+_TIMEOUT: Final = httpx.Timeout(30.0, connect=5.0)
+#: The server sends a sign of life every 15 s.
+_STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
+_POLL_S: Final = 0.3
+#: Longest waits before another try when the service says that requests come too fast [s].
+_WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
+
+
+class Client:
+    """Talks to one graspd API. Usable as a context manager.
+
+    Args:
+        url: where the API answers, e.g. http://127.0.0.1:8000.
+        key: Bearer key, if the service asks for one.
+        transport: replaces the network in tests.
+    """
+
+    def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self.url = url.rstrip("/")
+        # A proxy of the environment cannot reach this machine's own addresses.
+        is_local = is_loopback(urlsplit(self.url).hostname or "")
+        self._http = httpx.Client(
+            base_url=self.url, headers=headers, timeout=_TIMEOUT, transport=transport, follow_redirects=True,
+            trust_env=not is_local,
+        )  # fmt: skip
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._http.close()
+
+    def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
+        """Submit a job; the same request gives the same job."""
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        answer = self.send("POST", "/v1/jobs", json=request.model_dump(mode="json"), headers=headers)
+        return JobDetail.model_validate_json(answer.content)
+
+    def job(self, job_id: str) -> JobDetail:
+        return JobDetail.model_validate_json(self.send("GET", f"/v1/jobs/{job_id}").content)
+
+    def jobs(self, *, state: State | None = None, limit: int = 50, cursor: str | None = None) -> Page[Job]:
+        """Jobs, newest first."""
+        params = {"state": state, "limit": limit, "cursor": cursor}
+        return Page[Job].model_validate_json(self.send("GET", "/v1/jobs", params=params).content)
+
+    def cancel(self, job_id: str) -> JobDetail:
+        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/cancel").content)
+
+    def delete(self, path: str) -> None:
+        """Take away what stands under an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
+        self.send("DELETE", path)
+
+    def retry(self, job_id: str) -> JobDetail:
+        return JobDetail.model_validate_json(self.send("POST", f"/v1/jobs/{job_id}/retry").content)
+
+    def grasps(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
+        params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit, "cursor": cursor}
+        return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
+
+    def assets(self, kind: AssetKind) -> Iterator[AssetView]:
+        """All hands or objects."""
+        cursor: str | None = None
+        while True:
+            answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor})
+            page = Page[AssetView].model_validate_json(answer.content)
+            yield from page.items
+            cursor = page.next
+            if cursor is None:
+                return
+
+    def asset(self, kind: AssetKind, name: str) -> AssetView:
+        return AssetView.model_validate_json(self.send("GET", f"/v1/{kind.value}s/{name}").content)
+
+    def upload(
+        self, kind: AssetKind, path: Path, *, name: str | None = None, options: dict[str, Any] | None = None
+    ) -> AssetView:
+        """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened."""
+        fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
+        try:
+            with path.open("rb") as file:
+                answer = self.send(
+                    "POST",
+                    f"/v1/{kind.value}s",
+                    files={"file": (path.name, file)},
+                    data=fields,
+                )
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}") from None
+        return AssetView.model_validate_json(answer.content)
+
+    def wait_checked(self, kind: AssetKind, name: str, *, timeout_s: float = 120.0) -> AssetView:
+        """An uploaded asset once a worker has checked it; UnavailableError if none did in time."""
+        deadline = time.monotonic() + timeout_s
+        while (asset := self.asset(kind, name)).verdict is None:
+            if time.monotonic() > deadline:
+                raise UnavailableError(f"no worker has checked {kind.value} {name!r} yet; is one running?")
+            time.sleep(_POLL_S)
+        return asset
+
+    def fetch(self, path: str) -> Iterator[bytes]:
+        """Chunks of a file of the API."""
+        with _Translated(self.url), self._http.stream("GET", path) as answer:
+            _raise_for(answer)
+            yield from answer.iter_bytes()
+
+    def download(self, shard: Shard, path: Path) -> Path:
+        """Fetch a shard's file; the name appears once it is whole."""
+        draft = path.with_name(f".{path.name}.part")
+        try:
+            with draft.open("wb") as file:
+                for chunk in self.fetch(shard.file):
+                    file.write(chunk)
+            draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
+        return path
+
+    def health(self) -> Health:
+        """State of the parts, also when one of them is down."""
+        with _Translated(self.url):
+            return Health.model_validate_json(self._http.get("/readyz").content)
+
+    def watch(self, job_id: str) -> Iterator[Job]:
+        """A job at each change until it ends; survives a restart of the API."""
+        while True:
+            try:
+                for event, data in self._events(f"/v1/jobs/{job_id}/events"):
+                    if event in ("progress", "end"):
+                        yield Job.model_validate(data)
+                    if event == "end":
+                        return
+            except UnavailableError:
+                if not self._comes_back():
+                    raise
+            time.sleep(_POLL_S)
+
+    def wait(self, job_id: str, on_progress: Callable[[Job], None] | None = None) -> JobDetail:
+        """The job in its final state."""
+        for job in self.watch(job_id):
+            if on_progress is not None:
+                on_progress(job)
+        return self.job(job_id)
+
+    def _comes_back(self, timeout_s: float = 30.0) -> bool:
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            try:
+                self.send("GET", "/healthz")
+            except UnavailableError:
+                time.sleep(_POLL_S)
+            else:
+                return True
+        return False
+
+    def _events(self, path: str) -> Iterator[tuple[str, Any]]:
+        with _Translated(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
+            _raise_for(answer)
+            yield from parse_events(answer.iter_lines())
+
+    def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
+        """The answer to a request; the error behind a problem document is raised."""
+        given = {name: value for name, value in (params or {}).items() if value is not None}
+        for wait in (*_WAITS_S, None):
+            with _Translated(self.url):
+                answer = self._http.request(method, path, params=given or None, **options)
+            if wait is None or not _is_too_fast(answer):
+                break
+            time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
+        _raise_for(answer)
+        return answer
+
+
+def _is_too_fast(answer: httpx.Response) -> bool:
+    """A quota is used up for longer than anybody waits: only the rate of requests is worth another try."""
+    return answer.status_code == 429 and RateError.slug in answer.text
+
+
+def parse_events(lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
+    """(event, decoded data) of a text/event-stream (HTML standard §9.2.6)."""
+    event, data = "message", ""
+    for line in lines:
+        if not line:
+            if data:
+                yield event, json.loads(data)
+            event, data = "message", ""
+        elif line.startswith("event:"):
+            event = line[6:].strip()
+        elif line.startswith("data:"):
+            data += line[5:].strip()
+
+
+class _Translated:
+    """Errors of the network as UnavailableError."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
+            raise UnavailableError(
+                f"no graspd answers at {self.url}; start one with `graspd up`, or set GRASPD_API_URL"
+            ) from None
+        if isinstance(error, httpx.HTTPError | httpx.InvalidURL):
+            raise UnavailableError(f"the connection to {self.url} broke: {error or type(error).__name__}") from None
+
+
+def _raise_for(answer: httpx.Response) -> None:
+    if answer.is_success:
+        return
+    answer.read()
+    try:
+        problem = answer.json()
+        slug, detail = str(problem["type"]).rpartition("/")[2], str(problem["detail"])
+    except (ValueError, KeyError, TypeError):
+        slug, detail = "", f"{answer.url} answered {answer.status_code}, and not as graspd does; check the address"
+    fallback: type[GraspdError] = InputError if answer.is_client_error else UnavailableError
+    raise ERRORS.get(slug, fallback)(detail)

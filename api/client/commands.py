@@ -1,0 +1,271 @@
+"""Commands that talk to the API over HTTP, and the ones that run it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from api.client import key_commands
+from api.client.add_commands import add_hand, add_object
+from api.client.client import Client
+from api.client.datasets import DatasetClient
+from api.client.job_options import pairs
+from api.client.reports import UrlOption, job_request, open_client, say_deleted, show_asset, show_job, watch
+from api.formatting import count, percent, size
+from api.models import Job
+from api.uploads import MAIN_SUFFIXES, name_of_upload
+from service.cli import JsonFlag, emit, reporting_errors
+from service.model.domain import AssetKind, State
+from service.model.errors import InputError
+
+app = typer.Typer(no_args_is_help=True)
+
+JobArgument = Annotated[str, typer.Argument(help="Job id, or the beginning of one.")]
+
+
+@app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
+@reporting_errors
+def submit(
+    hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
+    object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
+    grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    budget: Annotated[float, typer.Option(help="Tries for each valid grasp, at most.")] = 4.0,
+    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
+    audits: Annotated[int, typer.Option(help="Valid grasps judged again by the letter.")] = 8,
+    robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
+    method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
+    option: Annotated[
+        list[str] | None, typer.Option(help="An option of the planner, such as steps=20000; several times.")
+    ] = None,
+    fidelity: Annotated[str, typer.Option(help="draft, standard, fine, or auto with --target.")] = "standard",
+    target: Annotated[
+        str, typer.Option(help="With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest that meets it is taken.")
+    ] = "",
+    seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
+    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 0,
+    views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
+    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    width: Annotated[int, typer.Option(help="Picture width [px].")] = 320,
+    height: Annotated[int, typer.Option(help="Picture height [px].")] = 240,
+    channels: Annotated[list[str] | None, typer.Option(help="distance, normals or occlusion; several times.")] = None,
+    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Submit a job: one hand on one object."""
+    with open_client(url) as client:
+        request = job_request(
+            {
+                "hand": _uploaded(client, AssetKind.HAND, hand),
+                "object": _uploaded(client, AssetKind.OBJECT, object),
+                "grasps": grasps,
+                "want": want,
+                "budget": budget,
+                "referee": referee,
+                "audits": audits,
+                "robustness": robustness,
+                "method": method,
+                "options": pairs(option or []),
+                "fidelity": fidelity,
+                "target": target,
+                "seed": seed,
+                "scenes": scenes,
+                "views": views,
+                "stereo": stereo,
+                "width": width,
+                "height": height,
+                "channels": channels or [],
+                "friction": friction,
+            }
+        )
+        job = client.submit(request)
+        if wait:
+            job = watch(client, job.id)
+        show_job(job, json=json, url=client.url)
+
+
+@app.command(epilog="graspd jobs --state running")
+@reporting_errors
+def jobs(
+    state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
+    limit: Annotated[int, typer.Option(min=1, max=200, help="At most this many.")] = 20,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """List jobs, the newest first."""
+    with open_client(url) as client:
+        page = client.jobs(state=state, limit=limit)
+    if json:
+        emit({"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next})
+        return
+    table = Table("job", "state", "hand", "object", "progress", "valid", "created", box=None, header_style="bold")
+    for job in page.items:
+        done = f"{count(job.valid)} of {count(job.requested)}"
+        table.add_row(job.id[:12], job.state, job.hand, job.object, percent(job.progress), done, job.created)
+    Console().print(table if page.items else "no job yet; `graspd submit --hand allegro --object mug` makes one")
+
+
+@app.command(epilog="graspd status 3f2a --json")
+@reporting_errors
+def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stages, progress and quality of a job."""
+    with open_client(url) as client:
+        show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+
+
+@app.command(epilog="graspd cancel 3f2a")
+@reporting_errors
+def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Stop a job; what is written stays."""
+    with open_client(url) as client:
+        show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+
+
+@app.command(epilog="graspd delete 3f2a")
+@reporting_errors
+def delete(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Take away a job that has ended; its shards follow after a grace time, unless another job needs them."""
+    with open_client(url) as client:
+        full = _full_id(client, job_id)
+        client.delete(f"/v1/jobs/{full}")
+    say_deleted("job", full, json=json)
+
+
+@app.command(epilog="graspd retry 3f2a --wait")
+@reporting_errors
+def retry(
+    job_id: JobArgument,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Run again what failed or was cancelled; what is written is not made twice."""
+    with open_client(url) as client:
+        job = client.retry(_full_id(client, job_id))
+        if wait:
+            job = watch(client, job.id)
+        show_job(job, json=json, url=client.url)
+
+
+@app.command(epilog="graspd logs 3f2a")
+@reporting_errors
+def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Failed attempts of a job, with their reasons."""
+    with open_client(url) as client:
+        job = client.job(_full_id(client, job_id))
+    if json:
+        emit({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
+        return
+    console = Console(highlight=False)
+    if not job.attempts:
+        console.print("no attempt has failed")
+    for attempt in job.attempts:
+        console.print(
+            f"{attempt.ended}  task {attempt.task_id[:8]}  attempt {attempt.number}  {attempt.worker}", markup=False
+        )
+        console.print(f"    {attempt.kind}: {attempt.reason}", markup=False)
+        if attempt.trace:
+            console.print("\n".join("    " + line for line in attempt.trace.splitlines()), style="dim", markup=False)
+
+
+def asset_commands(kind: AssetKind) -> typer.Typer:
+    """`graspd hands ...` or `graspd objects ...`."""
+    group = typer.Typer(no_args_is_help=True, help=f"Check, add, list, show and delete {kind.value}s.")
+
+    @group.command("list")
+    @reporting_errors
+    def list_assets(url: UrlOption = None, json: JsonFlag = False) -> None:
+        """All of them."""
+        with open_client(url) as client:
+            assets = list(client.assets(kind))
+        if json:
+            emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
+            return
+        table = Table("name", "file", "size", "check", "digest", box=None, header_style="bold")
+        for asset in assets:
+            origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
+            table.add_row(asset.name, asset.filename, size(asset.size_bytes), origin, asset.digest[:12])
+        Console().print(table)
+
+    @group.command("show")
+    @reporting_errors
+    def show(
+        name: Annotated[str, typer.Argument(help="Its name.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """One of them, with what the check found."""
+        with open_client(url) as client:
+            asset = client.asset(kind, name)
+        show_asset(asset.model_dump(mode="json"), json=json)
+
+    @group.command("delete", epilog=f"graspd {kind.value}s delete my_{kind.value}")
+    @reporting_errors
+    def delete_asset(
+        name: Annotated[str, typer.Argument(help="Its name or digest.")],
+        url: UrlOption = None,
+        json: JsonFlag = False,
+    ) -> None:
+        """Take one away that no job, dataset or set of objects needs."""
+        with open_client(url) as client:
+            client.delete(f"/v1/{kind.value}s/{name}")
+        say_deleted(kind.value, name, json=json)
+
+    return group
+
+
+hands_app, objects_app = asset_commands(AssetKind.HAND), asset_commands(AssetKind.OBJECT)
+hands_app.command("add", epilog="graspd hands add my_hand.zip --palm base_link --approach 0,0,1")(add_hand)
+objects_app.command("add", epilog="graspd objects add banana.stl --units mm --density 950")(add_object)
+
+
+@objects_app.command("sets", epilog="graspd objects sets")
+@reporting_errors
+def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Sets of objects; `graspd objects add FOLDER` makes one."""
+    with open_client(url) as client:
+        found = DatasetClient(client).object_sets()
+    if json:
+        emit({"sets": [one.model_dump(mode="json") for one in found]})
+        return
+    table = Table("set", "objects", "", box=None, header_style="bold")
+    for one in found:
+        table.add_row(
+            one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + (", ..." * (len(one.objects) > 5))
+        )
+    Console().print(table if found else "no set yet; `graspd objects add FOLDER` makes one")
+
+
+app.add_typer(hands_app, name="hands")
+app.add_typer(objects_app, name="objects")
+app.add_typer(key_commands.app, name="keys")
+
+
+def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
+    """The name of a hand or object; a path that exists is uploaded and checked first."""
+    path = Path(value)
+    is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
+    if not is_file_name:
+        return value
+    if not path.is_file():
+        raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
+    asset = client.upload(kind, path, name=name_of_upload(path.name))
+    if not asset.builtin and (asset := client.wait_checked(kind, asset.name)).verdict == "refuse":
+        raise InputError(f"refused: {asset.message}")
+    return asset.name
+
+
+def _full_id(client: Client, prefix: str) -> str:
+    """The id of the one job that begins so, among the latest."""
+    if len(prefix) >= 32:
+        return prefix
+    found: list[Job] = [job for job in client.jobs(limit=200).items if job.id.startswith(prefix)]
+    if len(found) > 1:
+        raise InputError(f"{len(found)} jobs begin with {prefix!r}; give more letters")
+    return found[0].id if found else prefix

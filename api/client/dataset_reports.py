@@ -1,0 +1,127 @@
+"""How estimates and datasets are told on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from api.client.datasets import DatasetClient
+from api.formatting import count, duration, metric, percent, size
+from service.index.dataset_views import CellView, DatasetView
+from service.model.domain import State
+from service.pipeline.datasets.cost import Estimate
+
+#: A table with more hands does not fit a terminal: then each cell has a line.
+_MOST_COLUMNS: Final = 6
+_SHOWN_RATES: Final = 8
+_STYLES: Final = {
+    State.SUCCEEDED: "green",
+    State.RUNNING: "cyan",
+    State.QUEUED: "dim",
+    State.FAILED: "red",
+    State.CANCELLED: "yellow",
+}
+
+
+def print_estimate(found: Estimate, console: Console) -> None:
+    """Time for some numbers of workers, storage, network, and what the rates are known from."""
+    console.print(
+        f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.tried)} tries, "
+        f"{count(found.valid)} valid, {count(found.tasks)} tasks",
+        markup=False,
+        soft_wrap=True,
+    )
+    table = Table("workers", "time", "from", "to", "network", "on average", box=None, header_style="bold")
+    for plan in found.plans:
+        rate = f"{size(round(plan.network_bytes_per_s))}/s"
+        times = (plan.seconds, plan.seconds_low, plan.seconds_high)
+        table.add_row(str(plan.workers), *map(duration, times), size(plan.network_bytes), rate)
+    console.print(table)
+    kinds = ", ".join(f"{kind} {size(stored)}" for kind, stored in found.storage_by_kind.items())
+    console.print(f"storage {size(found.storage_bytes)} ({kinds})", markup=False)
+    width = max(len(used.hand) for used in found.rates[:_SHOWN_RATES])
+    for used in found.rates[:_SHOWN_RATES]:
+        each = "no valid grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
+        batches = f", {count(used.batches)} batches" if used.batches else ""
+        console.print(
+            f"  {used.hand:<{width}} {each} per valid grasp, yield {percent(used.valid_yield)} "
+            f"({used.origin}{batches}) for {count(used.cells)} cells",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+    if len(found.rates) > _SHOWN_RATES:
+        console.print(f"  and {len(found.rates) - _SHOWN_RATES} more rates; --json shows them", style="dim")
+
+
+def print_dataset(dataset: DatasetView, console: Console) -> None:
+    """A dataset in three lines."""
+    states = ", ".join(f"{count(n)} {state.value}" for state, n in dataset.states.items() if n)
+    left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
+    console.print(
+        f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}", markup=False, highlight=False
+    )
+    console.print(f"cells: {states}", markup=False, highlight=False)
+    tried = f" of {count(dataset.tried)} tried" if dataset.tried else ""
+    console.print(
+        f"grasps: {count(dataset.valid)} valid{tried}, {count(dataset.asked)} asked for; "
+        f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Console) -> None:
+    """Objects as rows and hands as columns, each cell with its state, valid yield and failures."""
+    if len(dataset.hands) > _MOST_COLUMNS:
+        table = Table("hand", "object", "job", "", box=None, header_style="bold")
+        for cell in cells:
+            table.add_row(cell.hand, cell.object, cell.job_id[:12], _words(cell), style=_STYLES[cell.state])
+    else:
+        table = Table("", *dataset.hands, box=None, header_style="bold")
+        at = {(cell.hand, cell.object): cell for cell in cells}
+        for obj in dataset.objects:
+            found = [at.get((hand, obj)) for hand in dataset.hands]
+            table.add_row(obj, *(_styled(cell) if cell else "" for cell in found))
+    console.print(table)
+    for cell in [cell for cell in cells if cell.reason][:5]:
+        console.print(f"{cell.hand} on {cell.object}: {cell.reason}", markup=False, soft_wrap=True)
+
+
+def watch_dataset(client: DatasetClient, name: str, console: Console) -> DatasetView:
+    """The dataset in its final state, with a bar of its tasks meanwhile."""
+    columns = (
+        TextColumn("{task.description}"), BarColumn(bar_width=32), TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[rate]}", style="cyan"), TextColumn("{task.fields[left]}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(name, total=1.0, rate="", left="")
+        said = -1.0
+        for dataset in client.watch(name):
+            rate = f"{metric(dataset.valid / dataset.seconds)} valid/s per worker" if dataset.seconds else ""
+            left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
+            progress.update(bar, completed=dataset.progress, rate=rate, left=left)
+            if not console.is_terminal and dataset.progress - said >= 0.05:
+                said = dataset.progress
+                console.print(f"{name} {percent(dataset.progress)} {rate} {left}", highlight=False)
+    return dataset
+
+
+def _styled(cell: CellView) -> str:
+    return f"[{_STYLES[cell.state]}]{_words(cell)}[/]"
+
+
+def _words(cell: CellView) -> str:
+    words = [cell.state.value]
+    if cell.state is State.RUNNING:
+        words.append(percent(cell.progress))
+    if cell.valid_yield is not None:
+        words.append(f"{count(cell.valid)}/{count(cell.asked)} at {percent(cell.valid_yield)}")
+    if cell.tasks_failed:
+        words.append(f"{cell.tasks_failed} failed")
+    return " ".join(words)

@@ -1,0 +1,112 @@
+"""A dataset's spec as a file: what the options of `graspd datasets create` say, as TOML or JSON, to keep and share."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import Field, model_validator
+
+from api.client.job_options import pairs, validated
+from service.model.domain import JobOptions, Name
+from service.model.errors import InputError
+
+SpecOption = Annotated[
+    Path | None, typer.Option("--spec", help="TOML or JSON file that says it; options go over what it says.")
+]
+
+
+class Spec(JobOptions):
+    """The keys of a spec: those of a job's options, and these."""
+
+    name: Name | None = None
+    hands: tuple[Name, ...] = ()
+    objects: str | tuple[str, ...] = Field((), description="as `--objects`; a folder is looked for beside the spec")
+    total_grasps: int | None = Field(
+        None, ge=1, description="grasps over all hands and objects, shared evenly, in the place of `grasps`"
+    )
+
+    @model_validator(mode="after")
+    def _one_number(self) -> Spec:
+        if self.total_grasps is not None and "grasps" in self.model_fields_set:
+            raise ValueError("total_grasps stands in the place of grasps: say one of them")
+        return self
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a command was told, by a spec and by options."""
+
+    name: str
+    hands: str
+    objects: str
+    options: dict[str, Any]
+    total: int | None = None
+
+    def shared_out(self, matrix: dict[str, Any], objects: int) -> dict[str, Any]:
+        """The matrix with the grasps of each cell, where a number over all cells is wanted: rounded up."""
+        if self.total is None or not objects:
+            return matrix
+        return matrix | {"grasps": math.ceil(self.total / (len(matrix["hands"]) * objects))}
+
+
+def wanted(
+    spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
+) -> Wanted:
+    """Spec and options together; what an option says goes before.
+
+    Args:
+        spec: file, if one was given.
+        name: of the dataset; stays empty where neither names it.
+        hands: comma-separated, as `--hands`.
+        objects: as `--objects`.
+        options: of `with_job_options`.
+
+    Raises:
+        InputError: no hands or no objects, no such file, or it holds a key or a value that is not known.
+    """
+    given = {key: value for key, value in options.items() if value is not False}  # a flag that was not set
+    if "options" in given:
+        given["options"] = pairs(given["options"])
+    said = read_spec(spec) if spec is not None else {}
+    total = None if "grasps" in given else said.pop("total_grasps", None)
+    said.pop("total_grasps", None)
+    found_name = name or said.pop("name", "")
+    found_hands = hands or ",".join(said.get("hands", ()))
+    found_objects = objects or _objects(spec, said.get("objects", ()))
+    for what, found in (("hands", found_hands), ("objects", found_objects)):
+        if not found:
+            raise InputError(f"say which {what}: --{what}, or {what} in the file of --spec")
+    rest = {key: value for key, value in said.items() if key not in ("name", "hands", "objects")}
+    return Wanted(found_name, found_hands, found_objects, {**rest, **given}, total)
+
+
+def read_spec(file: Path) -> dict[str, Any]:
+    """The keys that a spec says; InputError for a file that is none."""
+    try:
+        text = file.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    try:
+        found = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
+    except ValueError as error:
+        raise InputError(f"{file} is no {'JSON' if file.suffix == '.json' else 'TOML'}: {error}") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")
+    try:
+        spec: Spec = validated(Spec, found)
+    except InputError as error:
+        raise InputError(f"{file}: {str(error).removeprefix('--')}") from None
+    return spec.model_dump(mode="json", exclude_unset=True)
+
+
+def _objects(spec: Path | None, said: Any) -> str:
+    if not isinstance(said, str):
+        return ",".join(said)
+    beside = spec.parent / said if spec is not None else Path(said)
+    return str(beside) if "/" in said and beside.exists() else said

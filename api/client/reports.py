@@ -1,0 +1,146 @@
+"""What the commands share: the client of the settings, progress, and how jobs and assets are told."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from api.client.client import Client
+from api.client.watching import JobDisplay
+from api.formatting import count, duration, metric, percent
+from api.models import JobDetail
+from service.cli import emit, load_settings
+from service.model.domain import AssetKind, JobRequest, State
+from service.model.errors import InputError, TaskError
+from service.run.address import recorded_address
+from service.store.asset_summary import summary
+
+UrlOption = Annotated[
+    str | None,
+    typer.Option("--url", help="Where the API answers; default GRASPD_API_URL, or the service of the data folder."),
+]
+
+
+def open_client(url: str | None) -> Client:
+    """A client of the API that the option or the settings name, or else that serves the data folder."""
+    settings = load_settings()
+    key = settings.api_key.get_secret_value() if settings.api_key else None
+    if url is None and "api_url" not in settings.model_fields_set:
+        url = recorded_address(settings.data_dir)
+    return Client(url or settings.api_url, key=key)
+
+
+def say_deleted(what: str, name: str, *, json: bool) -> None:
+    """Tell that a thing is gone."""
+    if json:
+        emit({"deleted": name, "kind": what})
+    else:
+        typer.echo(f"{what} {name} is deleted")
+
+
+def job_request(values: dict[str, Any]) -> JobRequest:
+    """A job request; InputError names the first option that cannot be used."""
+    try:
+        return JobRequest.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = f"--{first['loc'][0]}: " if first["loc"] else ""
+        raise InputError(option + first["msg"].removeprefix("Value error, ")) from None
+
+
+def watch(client: Client, job_id: str) -> JobDetail:
+    """The job in its final state, with progress on standard error meanwhile."""
+    with JobDisplay(Console(stderr=True)) as display:
+        return client.wait(job_id, display.update)
+
+
+def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
+    """Say what became of a job; TaskError if it failed or was cancelled and should not have been."""
+    if json:
+        emit(job_summary(job))
+    else:
+        _print_job(job, url)
+    if must_succeed and job.state in (State.FAILED, State.CANCELLED):
+        why = f": {job.reason}" if job.reason else ""
+        raise TaskError(f"job {job.id[:12]} is {job.state}{why}; `graspd retry {job.id[:12]}` runs it again")
+
+
+def job_summary(job: JobDetail) -> dict[str, Any]:
+    """The keys that scripts rely on (DESIGN.md §5): job, state, grasps, valid, stages, mean, shards; and more."""
+    return {
+        "job": job.id,
+        "state": job.state.value,
+        "hand": job.hand,
+        "object": job.object,
+        "grasps": job.grasps,
+        "valid": job.valid,
+        "tried": job.tried,
+        "audited": job.audited,
+        "audit_held": job.audit_held,
+        "note": job.note,
+        "progress": job.progress,
+        "reason": job.reason,
+        "stages": {stage.stage.value: {"tasks": stage.tasks, "seconds": stage.seconds} for stage in job.stages},
+        "mean": {
+            name: value
+            for name, value in job.mean.model_dump().items()
+            if name in ("epsilon", "contact_area_cm2", "intersection_volume_cm3")
+        },
+        "shards": [shard.id for shard in job.shards],
+    }
+
+
+def show_asset(asset: dict[str, Any], *, json: bool) -> None:
+    """Say what is known of a hand or object."""
+    if json:
+        emit(asset)
+        return
+    console = Console(highlight=False)
+    for name in ("name", "kind", "filename", "size_bytes", "digest", "created", "verdict", "message"):
+        if asset.get(name) is not None:
+            console.print(f"{name:<18} {asset[name]}", markup=False, soft_wrap=True)
+    for line in asset.get("repairs", []):
+        console.print(f"{'repair':<18} {line}", markup=False, soft_wrap=True)
+    facts = asset.get("facts", {})
+    for line in summary(AssetKind(asset["kind"]), facts) or [f"{name:<18} {value}" for name, value in facts.items()]:
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def yield_of(job: JobDetail) -> str:
+    """What was found among how many tries, and what the audit says, in a line."""
+    level = job.request.referee
+    if level == "none":
+        return f"{count(job.grasps)} grasps kept in {count(job.tried)} tries; nobody judged them"
+    audit = f"; {job.audit_held} of {job.audited} audited hold by the letter" if job.audited else ""
+    return f"{count(job.valid)} valid grasps in {count(job.tried)} tries, {level} level{audit}"
+
+
+def means_of(job: JobDetail) -> str:
+    """Means over the valid grasps, in a line."""
+    mean = job.mean
+    return (
+        f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
+        f"intersection {metric(mean.intersection_volume_cm3)} cm³"
+    )
+
+
+def _print_job(job: JobDetail, url: str) -> None:
+    console = Console(highlight=False)
+    console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
+    if job.reason:
+        console.print(f"reason: {job.reason}", markup=False)
+    if job.note:
+        console.print(f"note: {job.note}", markup=False)
+    table = Table("stage", "state", "batches", "progress", "worker time", "left", box=None, header_style="bold")
+    for stage in job.stages:
+        done = f"{stage.succeeded} of {stage.tasks}"
+        table.add_row(
+            stage.stage, stage.state, done, percent(stage.progress), duration(stage.seconds), duration(stage.eta_s)
+        )
+    console.print(table)
+    if job.grasps:
+        console.print(f"{yield_of(job)}; {means_of(job)}", markup=False)

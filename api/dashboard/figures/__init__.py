@@ -1,0 +1,1 @@
+"""What pages draw: charts, matrices and maps, as SVG and tables."""

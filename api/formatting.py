@@ -1,0 +1,79 @@
+"""How numbers, times and sizes read, on pages and on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import Final
+
+NONE: Final = "–"
+
+
+def metric(value: float | None) -> str:
+    """Three significant digits, without a tail of zeros that says nothing."""
+    if value is None or value != value:
+        return NONE
+    if value == 0:
+        return "0"
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    if 0 < value < 1e-3:
+        return "< 0.001"
+    digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1 if abs(value) < 100 else 0
+    return f"{value:.{digits}f}"
+
+
+def count(value: float | None) -> str:
+    """A whole number with thousands apart."""
+    return NONE if value is None else f"{value:,.0f}"
+
+
+def percent(value: float | None) -> str:
+    """Share [0, 1] as per cent; 100 only when it is all."""
+    if value is None:
+        return NONE
+    return f"{int(100 * value + 1e-9)} %" if value > 0.1 else f"{100 * value:.1f} %".replace(".0 %", " %")
+
+
+def duration(seconds: float | None) -> str:
+    """The two largest units of a time span."""
+    if seconds is None:
+        return NONE
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    hours, minutes = divmod(minutes, 60)
+    if hours < 48:
+        return f"{hours} h {minutes} min"
+    return f"{hours // 24} d {hours % 24} h"
+
+
+def size(value: float | None) -> str:
+    """Bytes in decimal units."""
+    if value is None:
+        return NONE
+    for unit in ("B", "kB", "MB", "GB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" or value >= 100 else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} TB"
+
+
+def stamp(value: str) -> str:
+    """What a reader without JavaScript sees of an RFC 3339 time; the script says it relative to now."""
+    return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
+
+
+#: The names that templates call them by.
+FILTERS: Final[Mapping[str, Callable[..., str]]] = {
+    "metric": metric,
+    "count": count,
+    "percent": percent,
+    "duration": duration,
+    "bytes": size,
+    "stamp": stamp,
+}

@@ -1,0 +1,101 @@
+"""Limits on what a stranger may send: bytes of a body, while they arrive, and the time they may take."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Final
+
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from api.problems import ApiError, answer
+from service.model.errors import LimitError
+
+#: A JSON body or a form without a file: job requests are a few hundred bytes.
+MAX_BODY_BYTES: Final = 1 << 20
+#: Longest wait for the next piece of a body [s].
+PIECE_S: Final = 30.0
+#: Multipart framing and the other fields of an upload.
+_FORM_SLACK_BYTES: Final = 64 << 10
+#: Of a Content-Length: Python takes long to read a number of thousands, or refuses it.
+_MOST_DIGITS: Final = 18
+
+
+class BodyLimit:
+    """Refuses a body over the limit by its Content-Length, and stops reading one that turns out longer or too slow.
+
+    Args:
+        upload_paths: paths that take files.
+        upload_bytes: largest file [bytes].
+        piece_s: longest wait for the next piece of a body [s].
+    """
+
+    def __init__(
+        self, app: ASGIApp, *, upload_paths: frozenset[str], upload_bytes: int, piece_s: float = PIECE_S
+    ) -> None:
+        self.app = app
+        self.upload_paths = upload_paths
+        self.upload_bytes = upload_bytes
+        self.piece_s = piece_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        is_upload = scope["method"] == "POST" and scope["path"].rstrip("/") in self.upload_paths
+        limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
+        given = dict(scope["headers"])
+        if b"transfer-encoding" in given and b"content-length" in given:
+            # Two lengths: a proxy may have taken the other one, and what is left would be read as the next request.
+            await _refuse(
+                ApiError(400, "Transfer-Encoding and Content-Length exclude each other"), scope, receive, send
+            )
+            return
+        declared = given.get(b"content-length", b"0")
+        if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
+            await _refuse(_too_large(limit), scope, receive, send)
+            return
+        await self._watch(scope, receive, send, limit)
+
+    async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
+        received = 0
+        is_whole = is_answered = False
+        refusal: Exception | None = None
+
+        async def counted() -> Message:
+            nonlocal received, is_whole, refusal
+            try:
+                # After the body only the end of the connection is awaited, for as long as the answer takes.
+                async with asyncio.timeout(None if is_whole else self.piece_s):
+                    message = await receive()
+            except TimeoutError:
+                refusal = ApiError(408, f"no piece of the body came for {self.piece_s:g} s; send it again")
+                return {"type": "http.disconnect"}
+            is_whole = not message.get("more_body", False)
+            received += len(message.get("body", b""))
+            if received > limit:
+                refusal = _too_large(limit)
+                # The application sees a client that went away and stops; its answer is replaced below.
+                return {"type": "http.disconnect"}
+            return message
+
+        async def guarded(message: Message) -> None:
+            nonlocal is_answered
+            if refusal is not None and not is_answered:
+                return
+            is_answered = True
+            await send(message)
+
+        await self.app(scope, counted, guarded)
+        if refusal is not None and not is_answered:
+            await _refuse(refusal, scope, receive, send)
+
+
+def _too_large(limit: int) -> LimitError:
+    return LimitError(f"the body is larger than {limit} bytes; send a smaller one")
+
+
+async def _refuse(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
+    response = answer(Request(scope), error)
+    response.headers["Connection"] = "close"
+    await response(scope, receive, send)

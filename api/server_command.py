@@ -1,0 +1,28 @@
+"""`graspd api`: the HTTP API and the dashboard, until it is told to stop."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from service import tracing
+from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(epilog="graspd api --port 8000")
+@reporting_errors
+def api(
+    host: Annotated[str | None, typer.Option(help="Address to bind; default GRASPD_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free one.")] = None,
+) -> None:
+    """Run the HTTP API and the dashboard."""
+    from api.server import serve
+
+    settings = load_settings(host=host, port=port)
+    log_to_stderr(settings, "api")
+    keep_private(settings)
+    tracing.set_up("api")
+    serve(settings)

@@ -1,0 +1,290 @@
+"""Queries on datasets, their cells and snapshots, and on named sets of objects."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from typing import Any, Final
+
+from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
+
+from service.index.database import Database
+from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
+from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
+from service.index.queries import cursors
+from service.index.tables import attempts, jobs, shards, tasks
+from service.index.views import Page
+from service.model.dataset_records import SnapshotShard
+from service.model.domain import BATCH_SIZE, JobOptions, Stage, State
+from service.model.errors import NotFoundError
+from service.model.planning import job_state, stages_of
+
+_SHARE: Final[ColumnElement[float]] = case(
+    (tasks.c.state == State.SUCCEEDED.value, 1.0),
+    (tasks.c.progress_total > 0, tasks.c.progress_done / tasks.c.progress_total),
+    else_=0.0,
+)
+_IS_BASE: Final = shards.c.stage == Stage.SYNTHESIZE.value
+
+
+class DatasetQueries(Database):
+    """Reads on datasets."""
+
+    def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+        """Datasets, newest first."""
+        size = cursors.page_size(limit)
+        query = select(datasets).order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
+        if cursor is not None:
+            query = query.where(tuple_(datasets.c.created, datasets.c.name) < cursors.decode(cursor, str, str))
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+            views = [_dataset_view(connection, row) for row in rows[:size]]
+        last = views[-1] if len(rows) > size else None
+        return Page(items=views, next=last and cursors.encode(last.created, last.name))
+
+    def dataset(self, name: str) -> DatasetView:
+        """A dataset; NotFoundError if there is none."""
+        with self.reading() as connection:
+            return _dataset_view(connection, _dataset_row(connection, name))
+
+    def unfinished_datasets(self, names: Collection[str]) -> set[str]:
+        """Of these names, those of a dataset that has not ended."""
+        query = select(datasets).where(datasets.c.name.in_(sorted(names)))
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+            return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
+
+    def dataset_cells(
+        self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
+    ) -> Page[CellView]:
+        """Cells of a dataset by their position."""
+        size = cursors.page_size(limit)
+        with self.reading() as connection:
+            dataset = _dataset_row(connection, name)
+            now = _cell_state(dataset["cancelled"])
+            query = (
+                select(dataset_cells, now.label("state"), jobs.c.id.is_not(None).label("planned"), jobs.c.reason)
+                .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
+                .where(dataset_cells.c.dataset == name)
+                .order_by(dataset_cells.c.position)
+                .limit(size + 1)
+            )
+            if state is not None:
+                query = query.where(now == state.value)
+            if cursor is not None:
+                query = query.where(dataset_cells.c.position > cursors.decode(cursor, int)[0])
+            rows = connection.execute(query).mappings().all()
+            views = _cell_views(connection, rows[:size], JobOptions.model_validate(dataset["options"]))
+        return Page(items=views, next=cursors.encode(views[-1].position) if len(rows) > size else None)
+
+    def dataset_shards(self, name: str) -> list[SnapshotShard]:
+        """All shards of a dataset: cell by cell, batch by batch, stage by stage."""
+        query = (
+            select(*(shards.c[field] for field in SnapshotShard.model_fields))
+            .join(tasks, tasks.c.shard_id == shards.c.id)
+            .join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
+            .where(dataset_cells.c.dataset == name)
+            .order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
+        )
+        with self.reading() as connection:
+            _dataset_row(connection, name)
+            rows = connection.execute(query).mappings().all()
+        return [SnapshotShard(**row) for row in rows]
+
+    def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
+        """Snapshots of a dataset, newest first."""
+        size = cursors.page_size(limit)
+        key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
+        query = select(dataset_snapshots).where(dataset_snapshots.c.dataset == name)
+        query = query.order_by(*(part.desc() for part in key)).limit(size + 1)
+        if cursor is not None:
+            query = query.where(tuple_(*key) < cursors.decode(cursor, str, str))
+        with self.reading() as connection:
+            _dataset_row(connection, name)
+            views = [SnapshotView(**row) for row in connection.execute(query).mappings()]
+        last = views[size - 1] if len(views) > size else None
+        return Page(items=views[:size], next=last and cursors.encode(last.created, last.digest))
+
+    def object_sets(self) -> list[ObjectSetView]:
+        """The newest version of each set of objects, by name."""
+        query = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
+        with self.reading() as connection:
+            newest = {row["name"]: ObjectSetView(**row) for row in connection.execute(query).mappings()}
+        return list(newest.values())
+
+    def object_set(self, name: str) -> ObjectSetView:
+        """The newest version of a set of objects; NotFoundError if there is none of that name."""
+        found = {view.name: view for view in self.object_sets()}
+        if name not in found:
+            known = ", ".join(list(found)[:20]) or "none yet"
+            raise NotFoundError(f"there is no set of objects {name!r}; there are: {known}")
+        return found[name]
+
+
+def _dataset_row(connection: Connection, name: str) -> Any:
+    row = connection.execute(select(datasets).where(datasets.c.name == name)).mappings().first()
+    if row is None:
+        known = select(datasets.c.name).order_by(datasets.c.created.desc()).limit(20)
+        names = ", ".join(connection.scalars(known))
+        raise NotFoundError(f"there is no dataset {name!r}; there are: {names or 'none yet'}")
+    return row
+
+
+def _cell_state(cancelled: bool) -> ColumnElement[str]:
+    """State of a cell: its job's; while it has none, what became of the dataset."""
+    # Written out: PostgreSQL does not see that an expression with a parameter is the one it groups by.
+    unplanned = literal((State.CANCELLED if cancelled else State.QUEUED).value, literal_execute=True)
+    return func.coalesce(jobs.c.state, unplanned)
+
+
+def _dataset_view(connection: Connection, row: Any) -> DatasetView:
+    options = JobOptions.model_validate(row["options"])
+    states = _states(connection, row)
+    state = _state(row, states)
+    work = _work(connection, dataset_cells.c.dataset == row["name"])
+    made = _made(connection, dataset_cells.c.dataset == row["name"])
+    tasks_asked = max(work["tasks"], row["cells"] * _tasks_of_cell(options))
+    left = tasks_asked - work["share"]
+    pace = made["seconds"] / work["done"] if work["done"] else None
+    return DatasetView(
+        **{name: row[name] for name in ("name", "digest", "cells", "created", "owner", "cancelled")},
+        hands=[member["name"] for member in row["hands"]],
+        objects=[member["name"] for member in row["objects"]],
+        options=options,
+        state=state,
+        states=states,
+        asked=row["cells"] * options.grasps,
+        tasks=tasks_asked,
+        tasks_done=work["done"],
+        tasks_failed=work["failed"],
+        progress=min(1.0, work["share"] / tasks_asked),
+        eta_s=left * pace / work["running"] if pace is not None and work["running"] else None,
+        finished=work["finished"] if state.is_final else None,
+        **made,
+    )
+
+
+def _state(row: Any, states: dict[State, int]) -> State:
+    state = job_state(state for state, count in states.items() if count)
+    if state.is_final and not row["cancelled"] and row["applied"] < row["events"]:
+        return State.QUEUED  # a retry that is not yet passed on to the jobs
+    return state
+
+
+def _states(connection: Connection, row: Any) -> dict[State, int]:
+    now = _cell_state(row["cancelled"])
+    query = (
+        select(now, func.count())
+        .select_from(dataset_cells)
+        .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
+        .where(dataset_cells.c.dataset == row["name"])
+        .group_by(now)
+    )
+    found = {State(state): int(count) for state, count in connection.execute(query)}
+    return {state: found.get(state, 0) for state in State}
+
+
+def _tasks_of_cell(options: JobOptions) -> int:
+    return -(-options.grasps // BATCH_SIZE) * len(stages_of(options))
+
+
+def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
+    """Tasks of the cells: how many there are, are done, failed, run; the sum of their shares; when the last ended."""
+    query = (
+        select(
+            func.count().label("tasks"),
+            _count(tasks.c.state == State.SUCCEEDED.value).label("done"),
+            _count(tasks.c.state == State.FAILED.value).label("failed"),
+            _count(tasks.c.state == State.RUNNING.value).label("running"),
+            func.coalesce(func.sum(cast(_SHARE, Float)), 0.0).label("share"),
+            func.max(tasks.c.finished).label("finished"),
+        )
+        .select_from(dataset_cells)
+        .join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
+        .where(where)
+    )
+    return dict(connection.execute(query).mappings().one())
+
+
+def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
+    """What the shards of the cells hold and cost."""
+    query = (
+        select(*_MADE)
+        .select_from(dataset_cells)
+        .join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
+        .join(shards, shards.c.id == tasks.c.shard_id)
+        .where(where)
+    )
+    return dict(connection.execute(query).mappings().one())
+
+
+def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions) -> list[CellView]:
+    ids = [row["job_id"] for row in rows]
+    work = _work_by_job(connection, ids)
+    made = _made_by_job(connection, ids)
+    failed = select(attempts.c.job_id, func.count()).where(attempts.c.job_id.in_(ids)).group_by(attempts.c.job_id)
+    failures = {job: int(count) for job, count in connection.execute(failed)}
+    views = []
+    for row in rows:
+        job = row["job_id"]
+        count = work[job]
+        total = max(count["tasks"], _tasks_of_cell(options))
+        yields = made.get(job, {"grasps": 0, "valid": 0, "tried": 0, "seconds": 0.0})
+        views.append(
+            CellView(
+                **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "reason")},
+                fidelity=row["fidelity"] or options.knobs.name,
+                asked=options.grasps,
+                **yields,
+                valid_yield=yields["valid"] / yields["tried"] if yields["tried"] else None,
+                tasks=total,
+                tasks_done=count[State.SUCCEEDED],
+                tasks_failed=count[State.FAILED],
+                attempts_failed=failures.get(job, 0),
+                progress=min(1.0, count["share"] / total),
+            )
+        )
+    return views
+
+
+def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, float]]:
+    query = (
+        select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(_SHARE, Float)))
+        .where(tasks.c.job_id.in_(ids))
+        .group_by(tasks.c.job_id, tasks.c.state)
+    )
+    found: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(int))
+    for job, state, count, share in connection.execute(query):
+        found[job][State(state)] += count
+        found[job]["tasks"] += count
+        found[job]["share"] += share
+    return found
+
+
+def _made_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
+    wanted = [column for column in _MADE if column.name in ("grasps", "valid", "tried", "seconds")]
+    query = (
+        select(tasks.c.job_id, *wanted)
+        .join(shards, shards.c.id == tasks.c.shard_id)
+        .where(tasks.c.job_id.in_(ids))
+        .group_by(tasks.c.job_id)
+    )
+    return {row["job_id"]: {k: row[k] for k in row if k != "job_id"} for row in connection.execute(query).mappings()}
+
+
+def _count(condition: ColumnElement[bool]) -> ColumnElement[int]:
+    return func.coalesce(func.sum(case((condition, 1), else_=0)), 0)
+
+
+def _base(column: ColumnElement[int]) -> ColumnElement[int]:
+    return func.coalesce(func.sum(case((_IS_BASE, column), else_=0)), 0)
+
+
+_MADE: Final = (
+    func.count().label("shards"),
+    func.coalesce(func.sum(shards.c.size_bytes), 0).label("size_bytes"),
+    func.coalesce(func.sum(shards.c.seconds), 0.0).label("seconds"),
+    _base(shards.c.count).label("grasps"),
+    _base(shards.c.valid).label("valid"),
+    _base(shards.c.tried).label("tried"),
+)

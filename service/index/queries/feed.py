@@ -1,0 +1,158 @@
+"""What the keeper asks the index: which tasks should be queued, and which it believes are."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Column, ColumnElement, exists, or_, select
+
+from service.index.database import Database, chunks
+from service.index.tables import assets, jobs, tasks
+from service.model.domain import AssetKind, Lane, Stage, State
+from service.model.planning import MAX_BACKOFF_S, PlannedTask
+from service.model.records import JobRecord
+from service.model.turns import Turns, WaitingJob, interleave
+
+
+@dataclass(frozen=True)
+class ReadyTask:
+    """A task that may start now, with what a message needs."""
+
+    job: JobRecord
+    task: PlannedTask
+    lane: Lane
+    last_attempt: int
+    retried_upto: int
+
+
+@dataclass(frozen=True)
+class ReadyCheck:
+    """An uploaded hand or object that waits for its check."""
+
+    kind: AssetKind
+    name: str
+    digest: str
+    last_attempt: int
+
+
+class Feed(Database):
+    """Reads of the keeper."""
+
+    def waiting_jobs(self, lane: Lane, *, now: float) -> list[WaitingJob]:
+        """Jobs with tasks that may be queued, oldest first."""
+        due = _due(tasks.c.not_before, now)
+        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
+        query = (
+            select(jobs.c.id, jobs.c.origin)
+            .where(jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.lane == lane.value, waiting)
+            .order_by(jobs.c.created, jobs.c.id)
+        )
+        with self.reading() as connection:
+            return [WaitingJob(job, (origin or {}).get("key", "")) for job, origin in connection.execute(query)]
+
+    def ready_tasks(self, lane: Lane, turns: Turns, *, now: float, limit: int) -> list[ReadyTask]:
+        """At most `limit` tasks to be queued: in turn those of each key, and of each job of a key."""
+        of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
+        for job, share in turns.order(self.waiting_jobs(lane, now=now), limit):
+            of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])
+        chosen = interleave([interleave(of_jobs) for of_jobs in of_key.values()])[:limit]
+        turns.served([job for job, _ in chosen])
+        return [task for _, task in chosen]
+
+    def ready_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
+        """The first tasks of one job that may be queued; at a time, or none of them heeding its back-off."""
+        due = () if now is None else (_due(tasks.c.not_before, now),)
+        query = (
+            select(tasks, jobs.c.request, jobs.c.revisions, jobs.c.origin, jobs.c.hand_digest, jobs.c.object_digest)
+            .join(jobs, jobs.c.id == tasks.c.job_id)
+            .where(tasks.c.job_id == job_id, *_WAITING, *due)
+            .order_by(tasks.c.batch)
+            .limit(limit)
+        )
+        with self.reading() as connection:
+            return [_ready(row) for row in connection.execute(query).mappings()]
+
+    def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
+        """Uploads to be checked, oldest first."""
+        open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
+        query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
+        with self.reading() as connection:
+            return [
+                ReadyCheck(AssetKind(row["kind"]), row["name"], row["digest"], row["last_attempt"])
+                for row in connection.execute(query).mappings()
+            ]
+
+    def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
+        """Unfinished tasks, and checks of assets, that were given to the queue."""
+        unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
+        of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
+        of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
+        with self.reading() as connection:
+            checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
+            return set(connection.scalars(of_tasks)), checks
+
+    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Stage and shard id of tasks."""
+        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
+        with self.reading() as connection:
+            return {
+                task: (stage, shard)
+                for some in chunks(list(task_ids))
+                for task, stage, shard in connection.execute(query.where(tasks.c.id.in_(some)))
+            }
+
+    def cancelled(self, task_ids: Collection[str]) -> set[str]:
+        """Those of the tasks that are cancelled."""
+        query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
+        with self.reading() as connection:
+            return {
+                task
+                for some in chunks(list(task_ids))
+                for task in connection.scalars(query.where(tasks.c.id.in_(some)))
+            }
+
+    def has_jobs(self) -> bool:
+        """Whether the index knows any job."""
+        with self.reading() as connection:
+            return connection.scalar(select(jobs.c.id).limit(1)) is not None
+
+    def failed_tasks(self, job_id: str) -> dict[str, int]:
+        """Failed and cancelled tasks of a job with the number of their last attempt."""
+        final = tasks.c.state.in_((State.FAILED.value, State.CANCELLED.value))
+        query = select(tasks.c.id, tasks.c.last_attempt).where(tasks.c.job_id == job_id, final)
+        with self.reading() as connection:
+            return {row.id: row.last_attempt for row in connection.execute(query)}
+
+    def unfinished_tasks(self, job_id: str) -> list[str]:
+        """Tasks of a job that are in the queue or with a worker."""
+        query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
+        with self.reading() as connection:
+            return list(connection.scalars(query))
+
+
+_WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
+
+
+def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
+    # A wait longer than any back-off means that the clock was set back: then the task is due as well.
+    return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
+
+
+def _ready(row: Any) -> ReadyTask:
+    record = JobRecord(
+        id=row["job_id"],
+        request=row["request"],
+        revisions=row["revisions"],
+        origin=row["origin"],
+        hand_digest=row["hand_digest"],
+        object_digest=row["object_digest"],
+        lane=row["lane"],
+        created=row["created"],
+    )
+    task = PlannedTask(
+        row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
+    )
+    return ReadyTask(record, task, Lane(row["lane"]), row["last_attempt"], row["retried_upto"])

@@ -1,0 +1,186 @@
+"""How the grasps of a filter are found in the order of a metric, in a bounded time at millions of rows.
+
+The choice of an index is made here and not left to the database: SQLite does not know how the values are spread, and
+takes an order's index to the end for a filter that almost nothing passes. There are three ways:
+
+1. A condition leaves few rows: its index gives them, and they are sorted.
+2. Else the rows are looked at in the wanted order, a bounded number of them, until the page is full.
+3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read, once.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, func, select, tuple_
+from sqlalchemy.sql.operators import in_op, is_
+
+from service.index.filters import GraspFilter, GraspSort
+from service.index.tables import grasps, shards, tasks
+from service.model.domain import Stage
+
+#: So many rows are fetched by an index and sorted in less time than all of a million are read.
+SORTED_AT_ONCE: Final = 40_000
+#: Rows looked at in the wanted order: a few first, since most filters fill a page from them.
+LOOKED_AT: Final = (1000, 20_000)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A test of one column. Conditions of one group are served by one index."""
+
+    group: str
+    column: ColumnElement[Any]
+    operator: Callable[[Any, Any], Any]
+    value: Any
+
+    def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
+        """The test; of a group that is not listed in a form that no index serves (None: all are)."""
+        return self.on(self.column if groups is None or self.group in groups else _plain(self.column))
+
+    def on(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
+        """The same test of another column."""
+        test: ColumnElement[bool] = self.operator(column, self.value)
+        return test
+
+
+def conditions(where: GraspFilter | None) -> list[Condition]:
+    """A filter as conditions that all must hold."""
+    where = where or GraspFilter()
+    found = []
+    if where.shard is not None:
+        found.append(Condition("shard", grasps.c.shard_id, operator.eq, where.shard))
+    if where.job is not None:
+        of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
+        found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
+    for name, wanted in (("hand", where.hand), ("object", where.object)):
+        if wanted is not None:
+            found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
+    for name, flag in (("valid", where.valid), ("success", where.success)):
+        if flag is not None:
+            found.append(Condition("flag", grasps.c[name], is_, flag))
+    found += [Condition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
+    found += [Condition(name, grasps.c[name], operator.le, bound) for name, bound in where.at_most.items()]
+    return found
+
+
+def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
+    """A filter in SQL; the database chooses the index."""
+    return [condition.sql(None) for condition in conditions(where)]
+
+
+def search(
+    connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
+) -> list[Any]:
+    """The first `size` rows behind a position; rows without the metric come last.
+
+    Args:
+        start: metric, shard id and row of the last grasp before.
+    """
+    wanted = conditions(where)
+    few = _few(connection, where, wanted)
+    rows: list[Any] = []
+    # Databases differ on where NULL sorts, so rows with the metric and rows without are two queries.
+    if start is None or start[0] is not None:
+        rows = _with_metric(connection, wanted, few, sort, size, start)
+    if len(rows) < size:
+        by = grasps.c[sort.by]
+        query = select(grasps).where(by.is_(None), *(c.sql([few] if few else None) for c in wanted))
+        after = start[1:] if start is not None and start[0] is None else None
+        key = (grasps.c.shard_id, grasps.c.row)
+        rows += connection.execute(_slice(query, key, sort, size - len(rows), after)).mappings()
+    return rows
+
+
+def _with_metric(
+    connection: Connection,
+    wanted: Sequence[Condition],
+    few: str | None,
+    sort: GraspSort,
+    size: int,
+    start: tuple[Any, ...] | None,
+) -> list[Any]:
+    by = grasps.c[sort.by]
+    if few is not None and few != sort.by:
+        return _sorted(connection, [c.sql([few]) for c in wanted], sort, size, start)
+    # An index of the order may serve some conditions besides: those of its own metric, or of hand and object.
+    served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
+    inside = [c.sql(served) for c in wanted if c.group in served]
+    outside = [c for c in wanted if c.group not in served]
+    ordered = select(grasps).where(by.is_not(None), *inside)
+    key = (by, grasps.c.shard_id, grasps.c.row)
+    if not outside:
+        return list(connection.execute(_slice(ordered, key, sort, size, start)).mappings())
+    for number in LOOKED_AT:
+        looked = _slice(ordered, key, sort, number, start).subquery()
+        query = select(looked).where(*(c.on(looked.c[str(c.column.key)]) for c in outside))
+        same_key = tuple(looked.c[str(column.key)] for column in key)
+        rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
+        if len(rows) >= size or _count(connection, looked) < number:
+            return rows
+    # PostgreSQL can join indexes; SQLite would follow one of them row by row, which takes longer than to read all.
+    groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
+    return _sorted(connection, [c.sql(groups) for c in wanted], sort, size, start)
+
+
+def _sorted(
+    connection: Connection,
+    tests: Sequence[ColumnElement[bool]],
+    sort: GraspSort,
+    size: int,
+    start: tuple[Any, ...] | None,
+) -> list[Any]:
+    """Rows that pass, sorted without the order's index."""
+    by = _plain(grasps.c[sort.by])
+    query = select(grasps).where(by.is_not(None), *tests)
+    return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
+
+
+def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Condition]) -> str | None:
+    """The group of conditions that leaves the fewest rows, if these can be sorted at once."""
+    numbers: dict[str, int] = {}
+    for group in dict.fromkeys(condition.group for condition in wanted):
+        if group == "shard":
+            return group
+        if group != "flag":
+            numbers[group] = _number(connection, where or GraspFilter(), group, wanted)
+    few = min(numbers, key=lambda name: numbers[name], default=None)
+    return few if few is not None and numbers[few] <= SORTED_AT_ONCE else None
+
+
+def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Condition]) -> int:
+    """Rows that pass the conditions of a group; of a metric's no more are counted than matter."""
+    query: Select[Any]
+    if group == "job":
+        query = select(func.sum(tasks.c.count)).where(tasks.c.job_id == where.job, tasks.c.position == 0)
+    elif group == "pair":
+        pair = {"hand": where.hand, "object": where.object}
+        tests = [shards.c[name] == value for name, value in pair.items() if value is not None]
+        query = select(func.sum(shards.c.count)).where(shards.c.kind == "base", *tests)
+    else:
+        some = select(grasps.c[group]).where(*(c.sql(None) for c in wanted if c.group == group))
+        return _count(connection, some.limit(SORTED_AT_ONCE + 1).subquery())
+    return int(connection.scalar(query) or 0)
+
+
+def _count(connection: Connection, rows: Subquery) -> int:
+    return int(connection.scalar(select(func.count()).select_from(rows)) or 0)
+
+
+def _slice(
+    query: Select[Any], key: tuple[ColumnElement[Any], ...], sort: GraspSort, size: int, start: tuple[Any, ...] | None
+) -> Select[Any]:
+    if start is not None:
+        position = tuple_(*key)
+        query = query.where(position < start if sort.descending else position > start)
+    return query.order_by(*(part.desc() if sort.descending else part for part in key)).limit(size)
+
+
+def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
+    """The same value in a form that no index is on."""
+    if isinstance(column.type, Float):
+        return column + 0.0
+    return column.concat("") if isinstance(column.type, String) else column

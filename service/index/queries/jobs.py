@@ -1,0 +1,181 @@
+"""Queries on jobs, tasks and attempts."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, select, tuple_
+
+from service.index.database import Database
+from service.index.queries import cursors
+from service.index.tables import attempts, jobs, shards, tasks
+from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
+from service.model.domain import Stage, State
+from service.model.errors import NotFoundError
+from service.model.planning import CHAIN
+
+
+class JobQueries(Database):
+    """Reads on jobs and what they consist of."""
+
+    def jobs(
+        self,
+        *,
+        state: State | None = None,
+        hand: str | None = None,
+        object: str | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[JobView]:
+        """Jobs, newest first."""
+        size = cursors.page_size(limit)
+        query = select(jobs).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
+        for column, wanted in ((jobs.c.state, state), (jobs.c.hand, hand), (jobs.c.object, object)):
+            if wanted is not None:
+                query = query.where(column == wanted)
+        if cursor is not None:
+            query = query.where(tuple_(jobs.c.created, jobs.c.id) < cursors.decode(cursor, str, str))
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+            views = _job_views(connection, rows[:size])
+        last = cursors.encode(views[-1].created, views[-1].id) if len(rows) > size else None
+        return Page(items=views, next=last)
+
+    def job(self, job_id: str) -> JobView:
+        """A job with its progress; NotFoundError if there is none."""
+        with self.reading() as connection:
+            rows = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().all()
+            if not rows:
+                raise NotFoundError(f"there is no job {job_id!r}")
+            return _job_views(connection, rows)[0]
+
+    def unfinished_of(self, ids: Collection[str]) -> set[str]:
+        """Of these job ids, those whose job has not ended."""
+        wanted, found = sorted(ids), set[str]()
+        with self.reading() as connection:
+            for start in range(0, len(wanted), 500):
+                some = jobs.c.id.in_(wanted[start : start + 500])
+                found |= set(connection.scalars(select(jobs.c.id).where(some, jobs.c.finished.is_(None))))
+        return found
+
+    def tasks(
+        self,
+        *,
+        job: str | None = None,
+        stage: Stage | None = None,
+        state: State | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[TaskView]:
+        """Tasks by job, batch and stage."""
+        size = cursors.page_size(limit)
+        key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
+        query = select(tasks).order_by(*key).limit(size + 1)
+        for column, wanted in ((tasks.c.job_id, job), (tasks.c.stage, stage), (tasks.c.state, state)):
+            if wanted is not None:
+                query = query.where(column == wanted)
+        if cursor is not None:
+            query = query.where(tuple_(*key) > cursors.decode(cursor, str, int, int))
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        views = [_task_view(row) for row in rows[:size]]
+        last = rows[size - 1] if len(rows) > size else None
+        return Page(items=views, next=last and cursors.encode(last["job_id"], last["batch"], last["position"]))
+
+    def task(self, task_id: str) -> TaskView:
+        """A task; NotFoundError if there is none."""
+        with self.reading() as connection:
+            row = connection.execute(select(tasks).where(tasks.c.id == task_id)).mappings().first()
+        if row is None:
+            raise NotFoundError(f"there is no task {task_id!r}")
+        return _task_view(row)
+
+    def attempts(self, *, job: str | None = None, task: str | None = None, limit: int = 50) -> list[AttemptView]:
+        """Failed attempts of a job or a task, newest first."""
+        query = select(attempts).order_by(attempts.c.ended.desc(), attempts.c.number.desc())
+        if job is not None:
+            query = query.where(attempts.c.job_id == job)
+        if task is not None:
+            query = query.where(attempts.c.task_id == task)
+        with self.reading() as connection:
+            rows = connection.execute(query.limit(cursors.page_size(limit))).mappings().all()
+        return [AttemptView(**{name: row[name] for name in AttemptView.model_fields}) for row in rows]
+
+
+def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
+    ids = [row["id"] for row in rows]
+    progress = _progress(connection, ids)
+    made = _made(connection, ids)
+    return [
+        JobView(
+            **{name: row[name] for name in JobView.model_fields if name in row},
+            stages=progress[row["id"]],
+            **made.get(row["id"], {}),
+        )
+        for row in rows
+    ]
+
+
+def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
+    share: ColumnElement[float] = case(
+        (tasks.c.state == State.SUCCEEDED.value, 1.0),
+        (tasks.c.progress_total > 0, tasks.c.progress_done / tasks.c.progress_total),
+        else_=0.0,
+    )
+    query = (
+        select(
+            tasks.c.job_id,
+            tasks.c.position,
+            tasks.c.state,
+            func.count().label("tasks"),
+            func.sum(cast(share, Float)).label("done"),
+            func.sum(func.coalesce(tasks.c.seconds, 0.0)).label("seconds"),
+        )
+        .where(tasks.c.job_id.in_(ids))
+        .group_by(tasks.c.job_id, tasks.c.position, tasks.c.state)
+    )
+    stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
+    for row in connection.execute(query).mappings():
+        stage = stages[row["job_id"]].setdefault(row["position"], {"tasks": 0, "done": 0.0, "seconds": 0.0})
+        stage[row["state"]] = row["tasks"]
+        for name in ("tasks", "done", "seconds"):
+            stage[name] += row[name]
+    return {
+        job: [StageProgress(stage=CHAIN[position], **stages[job][position]) for position in sorted(stages[job])]
+        for job in ids
+    }
+
+
+def _made(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
+    columns = {"grasps": "count", "valid": "valid", "tried": "tried", "audited": "audited", "audit_held": "audit_held"}
+    query = (
+        select(tasks.c.job_id, *(func.sum(shards.c[column]).label(name) for name, column in columns.items()))
+        .join(shards, shards.c.id == tasks.c.shard_id)
+        .where(tasks.c.job_id.in_(ids), tasks.c.stage == Stage.SYNTHESIZE.value)
+        .group_by(tasks.c.job_id)
+    )
+    rows = connection.execute(query).mappings()
+    return {row["job_id"]: {name: int(row[name]) for name in columns} for row in rows}
+
+
+def _task_view(row: Any) -> TaskView:
+    return TaskView(
+        id=row["id"],
+        job_id=row["job_id"],
+        stage=row["stage"],
+        batch=row["batch"],
+        count=row["count"],
+        state=row["state"],
+        shard_id=row["shard_id"],
+        attempt=row["last_attempt"] + (not State(row["state"]).is_final or row["last_attempt"] == 0),
+        worker=row["worker"],
+        device=row["device"],
+        done=row["progress_done"],
+        total=row["progress_total"],
+        message=row["progress_message"],
+        reason=row["reason"],
+        seconds=row["seconds"],
+        finished=row["finished"],
+    )

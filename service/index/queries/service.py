@@ -1,0 +1,180 @@
+"""Queries on assets, workers and the service as a whole."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from sqlalchemy import and_, case, func, select, tuple_
+
+from service.index.database import Database
+from service.index.queries import cursors
+from service.index.tables import assets, attempts, jobs, shards, tasks, workers
+from service.index.views import AssetView, FailureGroup, MatrixCell, Page, Stats, Throughput, WorkerView
+from service.model.domain import AssetKind, State
+from service.model.errors import NotFoundError
+
+
+class ServiceQueries(Database):
+    """Reads on everything that is neither job nor grasp."""
+
+    def assets(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
+        """Hands or objects, all versions, newest first."""
+        size = cursors.page_size(limit)
+        query = select(assets).where(assets.c.kind == kind.value)
+        query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
+        if cursor is not None:
+            query = query.where(tuple_(assets.c.created, assets.c.digest) < cursors.decode(cursor, str, str))
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        views = [_asset_view(row) for row in rows[:size]]
+        last = views[-1] if len(rows) > size else None
+        return Page(items=views, next=last and cursors.encode(last.created, last.digest))
+
+    def asset(self, kind: AssetKind, name_or_digest: str) -> AssetView:
+        """A hand or object by its digest, or the newest of its name that was not refused.
+
+        Raises:
+            NotFoundError: there is none; the names that there are follow.
+        """
+        named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
+        by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
+        refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
+        query = select(assets).where(named | by_digest)
+        query = query.order_by(refused_last, assets.c.created.desc(), assets.c.digest.desc()).limit(1)
+        with self.reading() as connection:
+            row = connection.execute(query).mappings().first()
+            if row is None:
+                known = select(assets.c.name).where(assets.c.kind == kind.value).distinct().order_by(assets.c.name)
+                names = ", ".join(connection.scalars(known.limit(20)))
+                raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}; there are: {names or 'none yet'}")
+        return _asset_view(row)
+
+    def workers(self) -> list[WorkerView]:
+        """Workers, the living first."""
+        query = select(workers).order_by(case((workers.c.state == "lost", 1), else_=0), workers.c.name)
+        with self.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        return [WorkerView(**row) for row in rows]
+
+    def stats(self) -> Stats:
+        """The whole service in a few numbers."""
+        alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
+        sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
+        with self.reading() as connection:
+            of_jobs = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
+            of_tasks = connection.execute(select(tasks.c.state, func.count()).group_by(tasks.c.state)).all()
+            of_shards = {
+                kind: tuple(map(int, row))
+                for kind, *row in connection.execute(select(shards.c.kind, *sums).group_by(shards.c.kind))
+            }
+            living = connection.scalar(alive)
+        _, made, valid, tried, _ = of_shards.get("base", (0, 0, 0, 0, 0))
+        return Stats(
+            jobs=_by_state(of_jobs),
+            tasks=_by_state(of_tasks),
+            grasps=made,
+            valid=valid,
+            tried=tried,
+            shards=sum(row[0] for row in of_shards.values()),
+            bytes=sum(row[4] for row in of_shards.values()),
+            workers=int(living or 0),
+        )
+
+    def throughput(self, *, since: str, bucket_s: int = 60) -> list[Throughput]:
+        """What was made since a time, in intervals of `bucket_s`; intervals without a shard are left out."""
+        # The database adds up by the finest unit of time that divides the interval; what is left is little.
+        unit = func.substr(shards.c.created, 1, next(n for s, n in _UNITS if bucket_s % s == 0)).label("unit")
+        sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
+        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since).group_by(unit, shards.c.kind)
+        made: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
+        with self.reading() as connection:
+            for start, kind, number, count, valid, seconds in connection.execute(query):
+                bucket = made[_bucket(start + _REST_OF_TIME[len(start) :], bucket_s)]
+                bucket["tasks"] += int(number)
+                bucket["seconds"] += float(seconds)
+                if kind == "base":
+                    bucket["grasps"] += int(count)
+                    bucket["valid"] += int(valid)
+        return [Throughput.model_validate({"start": start, **made[start]}) for start in sorted(made)]
+
+    def failures(self, *, limit: int = 20) -> list[FailureGroup]:
+        """Failed attempts by stage and error, the most frequent first."""
+        newest = func.max(attempts.c.ended)
+        count = func.count()
+        query = (
+            select(
+                attempts.c.stage,
+                attempts.c.kind,
+                count,
+                func.count(attempts.c.task_id.distinct()),
+                newest.label("seen"),
+            )
+            .group_by(attempts.c.stage, attempts.c.kind)
+            .order_by(count.desc(), newest.desc())
+            .limit(cursors.page_size(limit))
+        )
+        groups = []
+        with self.reading() as connection:
+            for stage, kind, number, of_tasks, seen in connection.execute(query).all():
+                same = and_(attempts.c.stage == stage, attempts.c.kind == kind, attempts.c.ended == seen)
+                example = connection.execute(select(attempts.c.reason, attempts.c.task_id).where(same).limit(1)).one()
+                groups.append(
+                    FailureGroup(
+                        stage=stage,
+                        kind=kind,
+                        attempts=number,
+                        tasks=of_tasks,
+                        example=example.reason,
+                        task_id=example.task_id,
+                        last_seen=seen,
+                    )
+                )
+        return groups
+
+    def matrix(self) -> list[MatrixCell]:
+        """Jobs, task states and yield of each hand x object."""
+        of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
+        made = (
+            select(shards.c.hand, shards.c.object, *_MADE)
+            .where(shards.c.kind == "base")
+            .group_by(shards.c.hand, shards.c.object)
+        )
+        cells: dict[tuple[str, str], dict[str, int]] = {}
+        with self.reading() as connection:
+            pairs = {}
+            for job, *pair in connection.execute(select(jobs.c.id, jobs.c.hand, jobs.c.object)):
+                cell = cells.setdefault((pair[0], pair[1]), dict.fromkeys(_CELL, 0))
+                cell["jobs"] += 1
+                pairs[job] = cell
+            for job, state, number in connection.execute(of_tasks):
+                if state in _CELL and job in pairs:
+                    pairs[job][state] += int(number)
+            for hand, obj, *sums in connection.execute(made):
+                if (hand, obj) in cells:
+                    cells[hand, obj] |= zip(("grasps", "valid", "tried"), map(int, sums), strict=True)
+        return [MatrixCell(hand=hand, object=obj, **cells[hand, obj]) for hand, obj in sorted(cells)]
+
+
+_CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "tried")
+#: Seconds of an interval, and how many characters of a time tell such intervals apart.
+_UNITS: Final = ((3600, 13), (60, 16), (1, 19))
+_REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
+_MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried))
+
+
+def _by_state(rows: Any) -> dict[State, int]:
+    found = {State(state): int(count) for state, count in rows}
+    return {state: found.get(state, 0) for state in State}
+
+
+def _bucket(created: str, bucket_s: int) -> str:
+    seconds = datetime.fromisoformat(created).timestamp()
+    return (
+        datetime.fromtimestamp(seconds - seconds % bucket_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    )
+
+
+def _asset_view(row: Any) -> AssetView:
+    return AssetView(**{name: row[name] for name in AssetView.model_fields})

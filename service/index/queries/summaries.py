@@ -1,0 +1,121 @@
+"""Sums over many grasps: means, ranges and distributions of their metrics, counted by the database."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
+
+from service.index.database import Database
+from service.index.filters import GraspFilter, Metric
+from service.index.queries.grasp_search import conditions, sql_conditions
+from service.index.tables import grasps, shards, tasks
+
+
+@dataclass(frozen=True)
+class MetricSummary:
+    """One metric over the grasps that have it."""
+
+    count: int
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """One metric over the grasps that were looked at: bins of equal width from `low` to `high`, the ends inclusive."""
+
+    count: int
+    mean: float
+    low: float
+    high: float
+    counts: list[int]
+
+
+@dataclass(frozen=True)
+class Distributions:
+    """Several metrics over one sample of the grasps that pass a filter."""
+
+    looked_at: int
+    share: float
+    """1.0 if every grasp was looked at; else the share of shards, drawn at random, whose grasps were."""
+    metrics: dict[Metric, Distribution]
+
+
+class Summaries(Database):
+    """Reads on all grasps that pass a filter."""
+
+    def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
+        """Count, mean and range of each metric; those that no grasp has are left out."""
+        columns = [
+            function(grasps.c[metric]) for metric in metrics for function in (func.count, func.avg, func.min, func.max)
+        ]
+        with self.reading() as connection:
+            row = connection.execute(select(*columns).where(*sql_conditions(where))).one()
+        parts = {metric: row[4 * i : 4 * i + 4] for i, metric in enumerate(metrics)}
+        return {
+            metric: MetricSummary(int(count), float(mean), float(low), float(high))
+            for metric, (count, mean, low, high) in parts.items()
+            if count
+        }
+
+    def histogram(self, where: GraspFilter, metric: Metric, low: float, high: float, bins: int) -> list[int]:
+        """Number of grasps in each of equal bins of [low, high]; the last one holds its upper end."""
+        counts = [0] * bins
+        value = grasps.c[metric]
+        width = (high - low) / bins
+        with self.reading() as connection:
+            place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
+            if connection.dialect.name == "postgresql":
+                # Its cast rounds where SQLite's cuts off, and not every SQLite knows floor().
+                place = func.floor(place)
+            place = cast(place, Integer)
+            query = select(place, func.count()).where(value.between(low, high), *sql_conditions(where)).group_by(place)
+            for at, count in connection.execute(query):
+                counts[min(int(at), bins - 1)] += int(count)
+        return counts
+
+    def distributions(
+        self, where: GraspFilter, metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
+    ) -> Distributions:
+        """Distribution of each metric, from about `at_most` grasps where the filter's job, pair or all have more.
+
+        The id of a shard is a digest, so those below a bound are a fair sample, and they lie side by side in the index.
+        """
+        with self.reading() as connection:
+            total = _size(connection, where)
+            share = min(1.0, at_most / max(1, total))
+            sampled = [] if share == 1.0 else [grasps.c.shard_id < f"{round(share * 16**8):08x}"]
+            tests = [c.sql(["shard", "job"]) for c in conditions(where)]
+            query = select(*(grasps.c[metric] for metric in metrics)).where(*tests, *sampled)
+            rows = [tuple(row) for row in connection.execute(query)]
+        values = np.array(rows, float).reshape(-1, len(metrics))
+        found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
+        return Distributions(len(values), share, {metric: data for metric, data in found.items() if data is not None})
+
+
+def _size(connection: Connection, where: GraspFilter) -> int:
+    """Grasps of the filter's shard, job or pair, or all."""
+    query = select(func.sum(shards.c.count)).where(shards.c.kind == "base")
+    if where.shard is not None:
+        query = query.where(shards.c.id == where.shard)
+    elif where.job is not None:
+        query = select(func.sum(tasks.c.count)).where(tasks.c.job_id == where.job, tasks.c.position == 0)
+    else:
+        pair = {"hand": where.hand, "object": where.object}
+        query = query.where(*(shards.c[name] == value for name, value in pair.items() if value is not None))
+    return int(connection.scalar(query) or 0)
+
+
+def _distribution(values: NDArray[np.float64], bins: int) -> Distribution | None:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return None
+    low, high = float(known.min()), float(known.max())
+    counts, _ = np.histogram(known, bins, (low, high)) if high > low else ([known.size] + [0] * (bins - 1), None)
+    return Distribution(known.size, float(known.mean()), low, high, [int(n) for n in counts])

@@ -1,0 +1,117 @@
+"""Content addresses: the digest of a result follows from its inputs alone, so a task run twice names one object."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, MutableMapping
+from contextlib import AbstractContextManager
+from typing import IO
+
+from service.model.domain import AssetKind, JobRequest, Stage
+from service.model.version import STAGE_REVISIONS
+
+
+def digest_bytes(data: bytes) -> str:
+    """First 32 hexadecimal digits of the SHA-256 of `data`."""
+    return hashlib.sha256(data).hexdigest()[:32]
+
+
+def digest_json(value: object) -> str:
+    """Digest of a JSON value in canonical form: sorted keys, no spaces, shortest round-trip floats."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
+    return digest_bytes(text.encode())
+
+
+class StreamedFiles(MutableMapping[str, bytes]):
+    """Named files that are not in memory, and whose digests are known."""
+
+    @abstractmethod
+    def digest(self, name: str) -> str:
+        """`digest_bytes` of a file."""
+
+    @abstractmethod
+    def size(self, name: str) -> int:
+        """Its bytes."""
+
+    @abstractmethod
+    def open(self, name: str) -> AbstractContextManager[IO[bytes]]:
+        """It, to be read piece by piece."""
+
+
+def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
+    """Digest of a set of named files; independent of their order."""
+    if isinstance(files, StreamedFiles):
+        digests = {name: files.digest(name) for name in files}
+    else:
+        digests = {name: digest_bytes(data) for name, data in files.items()}
+    return digest_json({"kind": kind, "files": digests})
+
+
+def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
+    """Digest of a hand or object whose files are read with options besides those in them; without any, its own."""
+    return digest_json({"files": digest, "options": dict(options)}) if options else digest
+
+
+def shard_id(
+    stage: Stage,
+    *,
+    request: JobRequest,
+    hand_digest: str,
+    object_digest: str,
+    batch: int,
+    count: int,
+    revision: int,
+    inputs: Iterable[str] = (),
+) -> str:
+    """Address of the shard that a stage makes of its inputs.
+
+    Only what moves the result enters: scenes do not change the grasps, views do not change the scenes.
+    """
+    inputs_of: dict[str, object] = {
+        "stage": stage,
+        "revision": revision,
+        "hand": hand_digest,
+        "object": object_digest,
+        "names": [request.hand, request.object],  # written into the shard
+        "batch": batch,
+        "count": count,
+        "seed": request.seed,
+        "inputs": sorted(inputs),
+    }
+    if stage is Stage.SYNTHESIZE:
+        inputs_of |= {
+            "method": request.method,
+            "fidelity": request.knobs.model_dump(mode="json"),
+            "friction": request.friction,
+            **({"options": request.options} if request.options else {}),
+            **_judgement(request, batch),
+        }
+    elif stage is Stage.SCENE:
+        inputs_of |= {"scenes": request.scenes}
+    elif stage is Stage.RENDER:
+        inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
+    return digest_json(inputs_of)
+
+
+def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
+    """What decides which grasps of a batch are kept, and what is known of them."""
+    found: dict[str, object] = {}
+    if request.want == "valid":
+        found |= {"want": request.want, "budget": request.budget}
+    if request.referee != "none":
+        found |= {"referee": request.referee, "audits": request.audits_of(batch), "robustness": request.robustness}
+    return found
+
+
+def job_id(request: JobRequest, hand_digest: str, object_digest: str) -> str:
+    """Address of a job: the same request on the same hand and object is the same job."""
+    return digest_json(
+        {
+            "request": request.model_dump(mode="json"),
+            "hand": hand_digest,
+            "object": object_digest,
+            "revisions": STAGE_REVISIONS,
+        }
+    )

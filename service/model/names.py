@@ -1,0 +1,119 @@
+"""Names of things in the object store: every key graspd writes is made here (table in ARCHITECTURE.md)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from service.model.domain import AssetKind, Stage
+
+ASSETS: Final = "assets"
+JOBS: Final = "jobs"
+TASKS: Final = "tasks"
+SHARDS: Final = "shards"
+DATASETS: Final = "datasets"
+OBJECT_SETS: Final = "object_sets"
+DELETIONS: Final = "deletions"
+RELEASED: Final = "released"
+
+#: Folder under `shards/` and HDF5 kind of what each stage makes.
+SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
+
+
+def asset_files(kind: AssetKind, digest: str) -> str:
+    """ZIP of all files of a hand or object."""
+    return f"{ASSETS}/{kind.value}/{digest}/files.zip"
+
+
+def asset_record(kind: AssetKind, digest: str) -> str:
+    """`Asset` as JSON, put after the files."""
+    return f"{ASSETS}/{kind.value}/{digest}/asset.json"
+
+
+def asset_check(kind: AssetKind, digest: str) -> str:
+    """What ingest found."""
+    return f"{ASSETS}/{kind.value}/{digest}/check.json"
+
+
+def asset_model(kind: AssetKind, digest: str) -> str:
+    """The prepared hand or object as binary glTF, for viewers."""
+    return f"{ASSETS}/{kind.value}/{digest}/model.glb"
+
+
+def object_prepared(digest: str, key: str) -> str:
+    """An object repaired and simplified; `key` is a digest of how."""
+    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
+
+
+def object_pieces(digest: str, key: str) -> str:
+    """Convex pieces of an object as the referee knows it; `key` is a digest of how they were made."""
+    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
+
+
+def job_record(job: str) -> str:
+    """The request with the digests of hand and object."""
+    return f"{JOBS}/{job}/job.json"
+
+
+def job_events(job: str) -> str:
+    """Prefix of what a user did to the job later."""
+    return f"{JOBS}/{job}/events"
+
+
+def job_event(job: str, number: int, what: str) -> str:
+    """One of `job_events`; numbers start at 1."""
+    return f"{job_events(job)}/{number:06}-{what}.json"
+
+
+def attempts(task: str) -> str:
+    """Prefix of a task's failed attempts."""
+    return f"{TASKS}/{task}/attempts"
+
+
+def attempt(task: str, number: int) -> str:
+    """A failed attempt; numbers start at 1."""
+    return f"{attempts(task)}/{number}.json"
+
+
+def shard_file(stage: Stage, shard: str) -> str:
+    """HDF5 bytes of a shard."""
+    return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.h5"
+
+
+def shard_manifest(stage: Stage, shard: str) -> str:
+    """Manifest of a shard: the shard exists for its readers once this does."""
+    return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
+
+
+def dataset_record(dataset: str) -> str:
+    """Hands, objects and options of a dataset with the jobs that follow from them."""
+    return f"{DATASETS}/{dataset}/dataset.json"
+
+
+def dataset_events(dataset: str) -> str:
+    """Prefix of what a user did to the dataset later."""
+    return f"{DATASETS}/{dataset}/events"
+
+
+def dataset_event(dataset: str, number: int, what: str) -> str:
+    """One of `dataset_events`; numbers start at 1."""
+    return f"{dataset_events(dataset)}/{number:06}-{what}.json"
+
+
+def dataset_snapshots(dataset: str) -> str:
+    """Prefix of a dataset's snapshots."""
+    return f"{DATASETS}/{dataset}/snapshots"
+
+
+def dataset_snapshot(dataset: str, digest: str) -> str:
+    """An immutable list of shards."""
+    return f"{dataset_snapshots(dataset)}/{digest}.json"
+
+
+def object_set(name: str, digest: str) -> str:
+    """One version of a named set of objects."""
+    return f"{OBJECT_SETS}/{name}/{digest}.json"
+
+
+def deletion(what: str, name: str) -> str:
+    """What a user took away, until nothing of it is left: a hand or object by its digest, a job, a dataset."""
+    return f"{DELETIONS}/{what}/{name}.json"

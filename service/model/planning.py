@@ -1,0 +1,185 @@
+"""From a job to its tasks, and from what is known of the tasks to their states. Pure functions: no store, no clock.
+
+A job is cut into batches of `BATCH_SIZE` grasps; each batch is a chain synthesize -> scene -> render, as far as asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from service.model.digests import digest_json, shard_id
+from service.model.domain import (
+    BATCH_SIZE,
+    AssetKind,
+    IngestMessage,
+    JobOptions,
+    JobRequest,
+    Lane,
+    Stage,
+    State,
+    TaskMessage,
+)
+from service.model.records import JobRecord
+from service.model.version import TASK_SCHEMA
+
+#: Order of the stages within a batch.
+CHAIN: Final = (Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER)
+#: A job this small is somebody waiting at a screen; anything larger runs in bulk.
+INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
+
+
+#: Longest wait between two attempts of a task [s].
+MAX_BACKOFF_S: Final = 300.0
+
+
+@dataclass(frozen=True)
+class PlannedTask:
+    """A task as it follows from its job. `inputs` and `output` are shard ids."""
+
+    id: str
+    stage: Stage
+    batch: int
+    count: int
+    inputs: tuple[str, ...]
+    output: str
+
+
+@dataclass
+class TaskFacts:
+    """What decides a task's state."""
+
+    stage: Stage
+    done: bool = False
+    """Its shard's manifest is in the store."""
+    last_attempt: int = 0
+    """Number of the last failed attempt."""
+    exhausted: bool = False
+    """That attempt was the last."""
+    retried_upto: int = 0
+    """Attempts up to this number no longer count: a user retried the job."""
+    running: bool = False
+
+
+def lane_of(request: JobRequest) -> Lane:
+    """Lane of a job submitted by itself; the jobs of a dataset always go in bulk."""
+    return Lane.INTERACTIVE if request.grasps <= INTERACTIVE_GRASPS else Lane.BULK
+
+
+def stages_of(request: JobOptions) -> tuple[Stage, ...]:
+    """The stages each batch of the job passes through."""
+    return CHAIN[: 1 + bool(request.scenes) + bool(request.views)]
+
+
+def task_id(job: str, stage: Stage, batch: int) -> str:
+    """Address of a task: the same job has the same tasks."""
+    return digest_json({"job": job, "stage": stage, "batch": batch})
+
+
+def plan(job: JobRecord) -> Iterator[PlannedTask]:
+    """All tasks of a job, batch by batch, each batch in the order of its stages."""
+    request = job.request
+    for batch in range(-(-request.grasps // BATCH_SIZE)):
+        count = min(BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
+        inputs: tuple[str, ...] = ()
+        for stage in stages_of(request):
+            output = shard_id(
+                stage,
+                request=request,
+                hand_digest=job.hand_digest,
+                object_digest=job.object_digest,
+                batch=batch,
+                count=count,
+                revision=job.revisions[stage],
+                inputs=inputs,
+            )
+            yield PlannedTask(task_id(job.id, stage, batch), stage, batch, count, inputs, output)
+            inputs = (output,)
+
+
+def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
+    """What a worker is told."""
+    return TaskMessage(
+        schema_=TASK_SCHEMA,
+        task_id=task.id,
+        job_id=job.id,
+        stage=task.stage,
+        batch=task.batch,
+        count=task.count,
+        revision=job.revisions[task.stage],
+        attempt=attempt,
+        max_attempt=max(attempt, max_attempt),
+        request=job.request,
+        hand_digest=job.hand_digest,
+        object_digest=job.object_digest,
+        inputs=task.inputs,
+        output=task.output,
+        origin=job.origin,
+    )
+
+
+def backoff(first_s: float, failures: int) -> float:
+    """Wait before the next attempt [s]: doubles with each failure, up to `MAX_BACKOFF_S`."""
+    return min(MAX_BACKOFF_S, first_s * 2.0 ** max(0, failures - 1))
+
+
+def ingest_id(kind: AssetKind, digest: str) -> str:
+    """Address of the task that checks an uploaded hand or object."""
+    return digest_json({"ingest": kind, "digest": digest})
+
+
+def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max_attempt: int) -> IngestMessage:
+    """What a worker is told to check."""
+    return IngestMessage(
+        schema_=TASK_SCHEMA,
+        task_id=ingest_id(kind, digest),
+        kind=kind,
+        name=name,
+        digest=digest,
+        attempt=attempt,
+        max_attempt=max(attempt, max_attempt),
+    )
+
+
+def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
+    """States of the tasks of one batch, given in the order of their stages.
+
+    A task behind one that failed or was cancelled can never start, so it is cancelled.
+    """
+    states: list[State] = []
+    blocked = False
+    for facts in chain:
+        state = _own_state(facts, job_cancelled=job_cancelled)
+        if blocked and not state.is_final:
+            state = State.CANCELLED
+        states.append(state)
+        blocked = blocked or state in (State.FAILED, State.CANCELLED)
+    return states
+
+
+def batch_ready(states: Sequence[State]) -> list[bool]:
+    """Which tasks of a batch may start now: unfinished, and everything before them succeeded."""
+    return [
+        not state.is_final and all(before is State.SUCCEEDED for before in states[:i]) for i, state in enumerate(states)
+    ]
+
+
+def job_state(tasks: Iterable[State]) -> State:
+    """State of a job from the set of its tasks' states."""
+    states = set(tasks)
+    if states & {State.QUEUED, State.RUNNING}:
+        return State.QUEUED if states == {State.QUEUED} else State.RUNNING
+    if State.FAILED in states:
+        return State.FAILED
+    return State.CANCELLED if State.CANCELLED in states else State.SUCCEEDED
+
+
+def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
+    if facts.done:
+        return State.SUCCEEDED
+    if facts.exhausted and facts.last_attempt > facts.retried_upto:
+        return State.FAILED
+    if job_cancelled:
+        return State.CANCELLED
+    return State.RUNNING if facts.running else State.QUEUED

@@ -1,0 +1,67 @@
+"""Small JSON records that the store keeps besides shards: jobs, what users did to them, failed attempts."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from service.model.domain import Digest, JobRequest, Lane, Origin, Stage
+from service.model.version import STAGE_REVISIONS
+
+
+class Record(BaseModel):
+    """Base of the records. Unknown fields are ignored: a newer graspd may have written them."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class JobRecord(Record):
+    """`job.json`: a request on the very hand and object it was made for, and the revision of each stage that its tasks
+    are planned for."""
+
+    version: Literal[1, 2] = 2
+    id: Digest
+    request: JobRequest
+    revisions: dict[str, int] = Field(default_factory=lambda: dict(STAGE_REVISIONS))
+    hand_digest: Digest
+    object_digest: Digest
+    lane: Lane
+    created: str
+    origin: Origin | None = None
+    owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_it_was_meant(cls, data: Any) -> Any:
+        # Records of version 1 knew neither a referee nor revisions.
+        if isinstance(data, dict) and data.get("version") == 1:
+            request = {"want": "raw", "referee": "none", **data.get("request", {})}
+            return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
+        return data
+
+
+class JobEvent(Record):
+    """What a user did to a job later. `retried` maps each failed task to its last attempt that no longer counts."""
+
+    number: int = Field(ge=1)
+    what: Literal["cancelled", "retried"]
+    at: str
+    retried: dict[str, int] = Field(default_factory=dict)
+    cause: str = Field("", description="event of the dataset that asked for it: its name, a slash, its number")
+
+
+class AttemptRecord(Record):
+    """A failed attempt of a task. `last`: no further attempt follows unless a user retries the job."""
+
+    task_id: str
+    job_id: str
+    stage: Stage
+    number: int = Field(ge=1)
+    kind: str
+    reason: str
+    trace: str | None = None
+    worker: str
+    started: str | None = None
+    ended: str
+    last: bool

@@ -1,0 +1,153 @@
+"""The scene that grasps are for, as a user says it: a kind, or a file of supports and the target's pose.
+
+The scene frame has z up. A support is a half-space (everything below a plane) or a box.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from service.model.errors import InputError
+
+#: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
+SceneKind = Literal["free", "table", "bin", "shelf", "file"]
+KINDS: Final = ("free", "table", "bin", "shelf")
+MOST_SUPPORTS: Final = 32
+#: A scene is no larger than this [m].
+FARTHEST_M: Final = 10.0
+#: Largest scene file [bytes].
+MAX_FILE_BYTES: Final = 64 * 1024
+
+_Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
+_Extent = Annotated[float, Field(gt=1e-4, le=2 * FARTHEST_M, allow_inf_nan=False)]
+_Number = Annotated[float, Field(ge=-2.0, le=2.0, allow_inf_nan=False)]
+Vector = tuple[_Metres, _Metres, _Metres]
+Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class HalfSpace(_Part):
+    """Everything below a plane."""
+
+    kind: Literal["half_space"] = "half_space"
+    normal: Vector = (0.0, 0.0, 1.0)
+    """Points out of the support; need not have unit length."""
+    offset: _Metres = 0.0
+    """n.x on the plane [m]."""
+
+    @model_validator(mode="after")
+    def _directed(self) -> Self:
+        if math.hypot(*self.normal) < 1e-6:
+            raise ValueError("a half-space needs a normal that is not zero")
+        return self
+
+
+class Box(_Part):
+    """A box about the origin of its pose."""
+
+    kind: Literal["box"] = "box"
+    size: tuple[_Extent, _Extent, _Extent]
+    """Full extents x y z [m]."""
+    pose: Pose = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    """x y z [m], unit quaternion w x y z."""
+
+    @model_validator(mode="after")
+    def _turned(self) -> Self:
+        _check_quaternion(self.pose)
+        return self
+
+
+class SceneSpec(_Part):
+    """What stands around the object."""
+
+    kind: SceneKind = "free"
+    supports: tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...] = Field((), max_length=MOST_SUPPORTS)
+    """Only with kind `file`."""
+    target: Pose | None = None
+    """Frame of the object in the scene; None: it is dropped onto the support under it."""
+    faces: Literal["drawn", "all"] = "drawn"
+    """drawn: resting faces come as often as drops end on them; all: one scene for each stable face."""
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if self.kind == "file" and not self.supports:
+            raise ValueError("a scene file needs supports: at least one half_space or box")
+        if self.kind != "file" and (self.supports or self.target is not None):
+            raise ValueError(f"a {self.kind} scene has its own supports; give them and a target with kind file")
+        if self.kind == "free" and self.faces != "drawn":
+            raise ValueError("a free object lies on no face: choose table, bin or shelf")
+        if self.target is not None:
+            _check_quaternion(self.target)
+            if self.faces == "all":
+                raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
+        return self
+
+
+def parse_scene(text: str, *, faces: str = "drawn") -> SceneSpec:
+    """The scene that a user names: one of `KINDS`, or a JSON or YAML file; `faces` as in `SceneSpec`.
+
+    Raises:
+        InputError: unknown kind, unreadable file, or nonsense in it, in one line.
+    """
+    if faces not in ("drawn", "all"):
+        raise InputError(f"unknown faces {faces!r}; choose drawn or all")
+    path = Path(text)
+    if text not in KINDS and path.suffix.lower() not in (".json", ".yaml", ".yml"):
+        raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file")
+    found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
+    if faces == found.faces:
+        return found
+    try:
+        return SceneSpec(**{**found.model_dump(), "faces": faces})
+    except ValidationError as error:
+        raise InputError(f"scene {text}: {_first(error)}") from None
+
+
+def read_scene(path: Path) -> SceneSpec:
+    """A scene file; see `parse_scene`."""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the scene file {path} cannot be read: {error}") from None
+    found = _loaded(text, path)
+    if not isinstance(found, dict):
+        raise InputError(f"the scene file {path} must hold one object with supports and a target")
+    try:
+        return SceneSpec(**{"kind": "file", **found})
+    except (ValidationError, TypeError) as error:
+        raise InputError(f"the scene file {path} is wrong: {_first(error)}") from None
+
+
+def _loaded(text: str, path: Path) -> object:
+    try:
+        if path.suffix.lower() == ".json":
+            return json.loads(text)
+        import yaml
+
+        return yaml.safe_load(text)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason}") from None
+
+
+def _first(error: ValidationError | TypeError) -> str:
+    if isinstance(error, TypeError):
+        return str(error)
+    one = error.errors()[0]
+    place = ".".join(str(part) for part in one["loc"])
+    return f"{place}: {one['msg']}" if place else str(one["msg"])
+
+
+def _check_quaternion(pose: tuple[float, ...]) -> None:
+    if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
+        raise ValueError("the quaternion w x y z of a pose must have unit length")

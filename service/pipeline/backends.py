@@ -1,0 +1,41 @@
+"""The three parts every process of graspd talks to, opened from the settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from service.settings import Settings
+from service.store.store import Store, open_store
+
+if TYPE_CHECKING:
+    from service.index.index import Index
+    from service.queue.port import TaskQueue
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Store, index and queue. Only the API and the keeper open the index; a worker uses `open_store` and the queue."""
+
+    settings: Settings
+    store: Store
+    index: Index
+    queue: TaskQueue
+
+    @classmethod
+    def open(cls, settings: Settings) -> Self:
+        """Open all three: makes the data folder, migrates the index; does not need Redis to answer yet.
+
+        Raises:
+            StoreUnavailable, IndexUnavailable: where they cannot be opened.
+        """
+        from service.index.index import Index
+        from service.queue.rq_queue import open_queue
+
+        store = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
+        return cls(settings, store, Index(settings.resolved_index_url), open_queue(settings))
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self.index.close()
+        self.queue.close()

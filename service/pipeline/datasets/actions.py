@@ -1,0 +1,205 @@
+"""What a user does to datasets: create, cancel, retry, snapshot. The planner carries it out, job by job."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable
+from typing import Literal
+
+from service.index.dataset_views import DatasetView, ObjectSetView
+from service.model import names
+from service.model.clock import timestamp
+from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
+from service.model.digests import digest_json
+from service.model.domain import AssetKind, JobOptions, State
+from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
+from service.pipeline.fidelity_choice import Resolver
+from service.pipeline.job_actions import usable
+from service.store.datasets import add_dataset_event, dataset_events, load_dataset, load_snapshot
+from service.store.deletions import refuse_pending
+from service.store.records import put_record, read_record
+
+
+def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[DatasetView, bool]:
+    """Record a dataset; the keeper plans its jobs. The same hands, objects and options again are the same dataset.
+
+    Args:
+        owner: id of the API key that submits it; its jobs get the same.
+
+    Returns:
+        the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
+
+    Raises:
+        NotFoundError: unknown hand, object or set.
+        InputError: a hand or object was refused when it was checked; no chart tells which fidelity meets the target.
+        ConflictError: a check is still running, or the name stands for another dataset.
+        LimitError: more than `MAX_CELLS` cells.
+        QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
+    """
+    hands, objects = members(parts, request)
+    parts.queue.ping()
+    key = names.dataset_record(request.name)
+    new = False
+    # One that is there stays what it is: a later chart changes none of its fidelities.
+    if not parts.store.exists(key):
+        found = describe(request.name, hands, objects, request.shared, Resolver(parts.store), owner)
+        new = put_record(parts.store, key, found)
+    record = load_dataset(parts.store, request.name)
+    if not new:
+        # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
+        other = _difference(record, hands, objects, request.shared)
+        if other:
+            raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
+    try:
+        refuse_pending(parts.store, "dataset", record.name)
+        wanted = [(AssetKind.HAND, one.digest) for one in hands] + [(AssetKind.OBJECT, one.digest) for one in objects]
+        with parts.index.writing() as connection:
+            if not parts.store.exists(key):
+                raise ConflictError(f"dataset {record.name!r} was deleted just now; create it again")
+            if missing := parts.index.missing_assets(wanted, within=connection):
+                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+            parts.index.add_dataset(record, within=connection)
+    except InputError:
+        if new:
+            parts.store.delete(key)
+        raise
+    return parts.index.dataset(record.name), new
+
+
+def cancel(parts: Parts, name: str) -> DatasetView:
+    """Stop a dataset: what is not planned never is, and its unfinished jobs are cancelled. Finished shards stay.
+
+    A job that another dataset waits for as well goes on, and so does one that another key submitted.
+
+    Raises:
+        NotFoundError: unknown dataset.
+        ConflictError: it is finished or cancelled already.
+    """
+    dataset = parts.index.dataset(name)
+    if dataset.cancelled or dataset.state.is_final:
+        raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
+    return _add_event(parts, name, "cancelled")
+
+
+def retry(parts: Parts, name: str) -> DatasetView:
+    """Start the failed and cancelled cells of a dataset again, with fresh attempts; what is made is not made twice.
+
+    Raises:
+        NotFoundError: unknown dataset.
+        ConflictError: no cell failed or was cancelled.
+    """
+    dataset = parts.index.dataset(name)
+    if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
+        raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
+    return _add_event(parts, name, "retried")
+
+
+def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
+    """Write down which shards a dataset holds now. The same shards again are the same snapshot.
+
+    Returns:
+        the snapshot, and whether it is new.
+
+    Raises:
+        NotFoundError: unknown dataset.
+        ConflictError: the dataset has no shard yet.
+    """
+    dataset = parts.index.dataset(name)
+    held = tuple(parts.index.dataset_shards(name))
+    if not held:
+        raise ConflictError(f"dataset {name!r} has no shard yet; wait until a cell is done")
+    base = [shard for shard in held if shard.kind == "base"]
+    taken = Snapshot(
+        dataset=name,
+        dataset_digest=dataset.digest,
+        digest=digest_json({"dataset": dataset.digest, "shards": sorted([s.id, s.sha256] for s in held)}),
+        complete=dataset.state is State.SUCCEEDED,
+        grasps=sum(shard.count for shard in base),
+        valid=sum(shard.valid for shard in base),
+        size_bytes=sum(shard.size_bytes for shard in held),
+        created=timestamp(),
+        shards=held,
+    )
+    new = put_record(parts.store, names.dataset_snapshot(name, taken.digest), taken)
+    if not new:
+        taken = load_snapshot(parts.store, name, taken.digest)
+    parts.index.add_snapshot(taken)
+    return taken, new
+
+
+def add_object_set(
+    parts: Parts,
+    name: str,
+    objects: Iterable[str],
+    *,
+    owner: str = "",
+    may_follow: Callable[[str], None] = lambda owner: None,
+) -> ObjectSetView:
+    """Give objects a name together. The same objects again change nothing; others make a new version.
+
+    Args:
+        owner: id of the API key that asks; a new version keeps the owner of the set.
+        may_follow: called with the owner of the set before it gets a new version; raises where that is refused.
+
+    Raises:
+        NotFoundError: unknown object.
+        InputError: an object was refused when it was checked, or there is none.
+        ConflictError: a check is still running.
+    """
+    assets = [parts.index.asset(AssetKind.OBJECT, one) for one in objects]
+    wanted = tuple(asset.name for asset in assets)
+    if not wanted:
+        raise InputError(f"the set {name!r} holds no object; name some")
+    after = ""
+    with contextlib.suppress(NotFoundError):
+        present = parts.index.object_set(name)
+        if set(present.objects) == set(wanted):
+            return present
+        after = present.digest
+        owner = read_record(ObjectSet, parts.store, names.object_set(name, after)).owner
+        may_follow(owner)
+    found = object_set_of(name, wanted, after=after, owner=owner)
+    put_record(parts.store, names.object_set(name, found.digest), found)
+    parts.index.add_object_set(found)
+    return parts.index.object_set(name)
+
+
+def members(parts: Parts, matrix: Matrix) -> tuple[list[Member], list[Member]]:
+    """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
+    objects = dict.fromkeys(matrix.objects)
+    for name in matrix.sets:
+        objects |= dict.fromkeys(parts.index.object_set(name).objects)
+    if len(matrix.hands) * len(objects) > MAX_CELLS:
+        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    return _members(parts, AssetKind.HAND, matrix.hands), _members(parts, AssetKind.OBJECT, objects)
+
+
+def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str]) -> list[Member]:
+    assets = [usable(parts, kind, name) for name in wanted]
+    found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
+    return list(dict.fromkeys(found))
+
+
+def _add_event(parts: Parts, name: str, what: Literal["cancelled", "retried"]) -> DatasetView:
+    add_dataset_event(parts.store, name, what)
+    parts.index.set_dataset_events(name, dataset_events(parts.store, name))
+    return parts.index.dataset(name)
+
+
+def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:
+    """What another dataset of the same name has that this one has not, in a few words; empty if it is the same."""
+    words = []
+    for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
+        if tuple(ours) != theirs:
+            words.append(f"its {what} are {_named(theirs)}")
+    mine, other = options.model_dump(), known.options.model_dump()
+    words += [f"its {name} is {other[name]!r}" for name in mine if mine[name] != other[name]]
+    return "; ".join(words)
+
+
+def _named(members: Iterable[Member]) -> str:
+    found = [member.name for member in members]
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    return ", ".join(found[:5]) + more

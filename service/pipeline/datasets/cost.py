@@ -1,0 +1,253 @@
+"""What a dataset will cost, before it starts: time for 1, 8 and 64 workers, storage, network.
+
+    tries of a cell    = grasps / yield, at most grasps x budget   (raw grasps: grasps)
+    seconds of a cell  = tries x seconds per try + batches x scenes x seconds per scene + pictures x seconds per picture
+    time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
+
+The rates, each with an interval, come from `service.pipeline.datasets.rates`; intervals add, as if all were off
+together. A worker is one process of `graspd worker` on a device like those that were measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from pydantic import Field
+
+from service.index.index import Index
+from service.index.views import View
+from service.model.dataset_records import request_of
+from service.model.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
+from service.model.errors import LimitError
+from service.model.planning import stages_of
+from service.pipeline.datasets.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate
+from service.pipeline.datasets.spec import MAX_CELLS, Matrix
+
+WORKERS: Final = (1, 8, 64)
+#: A task in the queue and the events it sends back, both ways (docs/scaling.md) [bytes].
+_MESSAGE_BYTES: Final = 19_500
+#: An object of unknown size: a scan of 5000 faces as STL [bytes].
+_ASSET_BYTES: Final = 250_000
+_SHOWN_RATES: Final = 20
+
+
+class WorkersPlan(View):
+    """The same dataset on a number of workers."""
+
+    workers: int
+    seconds: float = Field(description="expected time until the dataset is done [s]")
+    seconds_low: float = Field(description="the same if all goes quickly [s]")
+    seconds_high: float = Field(description="the same if all goes slowly [s]")
+    network_bytes: int = Field(description="between workers, store and Redis, if these are other machines")
+    network_bytes_per_s: float = Field(description="the same, on average over that time")
+
+
+class RateUsed(View):
+    """A rate of the estimate, and how many cells it stands for."""
+
+    hand: str
+    cells: int
+    seconds_per_valid: float | None = Field(description="None: no try is expected to give a valid grasp")
+    seconds_per_try: float
+    valid_yield: float
+    origin: str
+    batches: int = Field(description="finished batches it was measured on; 0: a stored default")
+
+
+class Estimate(View):
+    """What a dataset will cost. Seconds are of one worker."""
+
+    cells: int
+    asked: int = Field(description="grasps asked for, over all cells")
+    tried: int = Field(description="grasps to be computed for these")
+    valid: int = Field(description="valid grasps to be expected")
+    tasks: int
+    seconds: float
+    seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
+    seconds_high: float = Field(description="its upper end [s]")
+    machine_factor: float | None = Field(
+        description="this machine's seconds over the stored ones, which scales these; None: nothing was measured here"
+    )
+    seconds_by_stage: dict[Stage, float]
+    seconds_per_valid: float | None
+    storage_bytes: int
+    storage_by_kind: dict[str, int]
+    plans: list[WorkersPlan]
+    rates: list[RateUsed] = Field(description="the first of them, those of most cells first")
+    measured_share: float = Field(description="share of the cells with a rate that was measured here")
+    unknown: list[str] = Field(description="hands and objects that the service does not know yet")
+
+
+@dataclass
+class _Sums:
+    tried: float = 0.0
+    kept: float = 0.0
+    valid: float = 0.0
+    seconds: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+    machine: Machine = field(default_factory=Machine)
+    base_bytes: float = 0.0
+    cells: dict[tuple[str, Rate], int] = field(default_factory=lambda: defaultdict(int))
+
+
+def _explicit(request: JobRequest) -> JobRequest:
+    return request
+
+
+def estimate(index: Index, matrix: Matrix, resolve: Callable[[JobRequest], JobRequest] = _explicit) -> Estimate:
+    """The cost of a matrix. Hands and objects need not be known yet.
+
+    Args:
+        resolve: puts a fidelity in the place of `auto`; not needed where there is none.
+
+    Raises:
+        NotFoundError: unknown set.
+        InputError: no chart tells which fidelity meets the target.
+        LimitError: more than `MAX_CELLS` cells.
+    """
+    objects = list(matrix.objects)
+    for name in matrix.sets:
+        objects += [one for one in index.object_set(name).objects if one not in objects]
+    cells = len(matrix.hands) * len(objects)
+    if cells > MAX_CELLS:
+        raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
+    options = matrix.shared
+    devices = {worker.device for worker in index.workers() if worker.state != "lost"}
+    costs = index.batch_costs(Stage.SYNTHESIZE)
+    rates: dict[str, Rates] = {}
+    sums = _Sums()
+    for hand in matrix.hands:
+        for obj in objects:
+            chosen = resolve(request_of(options, hand, obj))
+            if chosen.knobs.name not in rates:
+                rates[chosen.knobs.name] = Rates(costs, chosen, devices)
+            sums.machine = rates[chosen.knobs.name].machine
+            _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
+    return _estimate(index, matrix.hands, objects, options, sums)
+
+
+def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
+    tried = _tries(rate, options)
+    valid = tried * rate.valid_yield
+    kept = min(valid, options.grasps) if options.want == "valid" else options.grasps
+    sums.tried += tried
+    sums.valid += min(valid, options.grasps)
+    sums.kept += kept
+    seconds = tried * rate.seconds_per_try
+    sums.seconds += seconds
+    sums.low += seconds * rate.spread[0]
+    sums.high += seconds * rate.spread[1]
+    sums.base_bytes += kept * rate.bytes_per_grasp
+    sums.cells[hand, rate] += 1
+
+
+def _tries(rate: Rate, options: JobOptions) -> float:
+    if options.want == "raw":
+        return float(options.grasps)
+    most = options.grasps * options.budget
+    return min(most, options.grasps / rate.valid_yield) if rate.valid_yield > 0 else most
+
+
+def _estimate(index: Index, hands: Sequence[str], objects: Sequence[str], options: JobOptions, sums: _Sums) -> Estimate:
+    cells = len(hands) * len(objects)
+    batches = cells * -(-options.grasps // BATCH_SIZE)
+    stages = stages_of(options)
+    scene, picture = _later_rates(index, options, sums.machine)
+    pixels = batches * _pictures(options) * options.width * options.height / 1e6
+    seconds = {Stage.SYNTHESIZE: sums.seconds}
+    ends = {Stage.SYNTHESIZE: (sums.low, sums.high)}
+    storage = {"base": sums.base_bytes}
+    if Stage.SCENE in stages:
+        seconds[Stage.SCENE] = batches * options.scenes * scene.seconds
+        ends[Stage.SCENE] = _ends(seconds[Stage.SCENE], scene)
+        storage["scene"] = sums.kept * options.scenes * scene.size_bytes
+    if Stage.RENDER in stages:
+        seconds[Stage.RENDER] = pixels * picture.seconds
+        ends[Stage.RENDER] = _ends(seconds[Stage.RENDER], picture)
+        storage["views"] = pixels * picture.size_bytes
+    total = sum(seconds.values())
+    low, high = (sum(found) for found in zip(*ends.values(), strict=True))
+    read = sum(storage[kind] for kind in list(storage)[:-1])
+    network = sum(storage.values()) + read + batches * len(stages) * _MESSAGE_BYTES
+    assets, unknown = _assets(index, hands, objects)
+    return Estimate(
+        cells=cells,
+        asked=cells * options.grasps,
+        tried=round(sums.tried),
+        valid=round(sums.valid),
+        tasks=batches * len(stages),
+        seconds=total,
+        seconds_low=low,
+        seconds_high=high,
+        machine_factor=sums.machine.factor if sums.machine.batches else None,
+        seconds_by_stage=seconds,
+        seconds_per_valid=total / sums.valid if sums.valid else None,
+        storage_bytes=round(sum(storage.values())),
+        storage_by_kind={kind: round(size) for kind, size in storage.items()},
+        plans=[_plan(workers, (total, low, high), batches, cells, network, assets) for workers in WORKERS],
+        rates=_used(sums),
+        measured_share=sum(n for (_, rate), n in sums.cells.items() if rate.batches) / cells,
+        unknown=unknown,
+    )
+
+
+def _ends(seconds: float, rate: StageRate) -> tuple[float, float]:
+    return seconds * rate.spread[0], seconds * rate.spread[1]
+
+
+def _plan(
+    workers: int, totals: tuple[float, float, float], batches: int, cells: int, network: float, assets: float
+) -> WorkersPlan:
+    """A batch is one worker's from its first stage to its last, so a round takes as long as a batch."""
+    share = max(1 / workers, math.ceil(batches / workers) / batches)
+    seconds, low, high = (total * share for total in totals)
+    # Each worker that meets a cell reads its hand and object, and keeps them while it stays there.
+    moved = network + assets * min(workers, max(1, batches // cells))
+    return WorkersPlan(
+        workers=workers,
+        seconds=seconds,
+        seconds_low=low,
+        seconds_high=high,
+        network_bytes=round(moved),
+        network_bytes_per_s=moved / seconds if seconds else 0.0,
+    )
+
+
+def _later_rates(index: Index, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
+    scene = scene_rate(index.batch_costs(Stage.SCENE) if options.scenes else [], machine)
+    return scene, picture_rate(index.batch_costs(Stage.RENDER) if options.views else [], options, machine)
+
+
+def _pictures(options: JobOptions) -> int:
+    return options.scenes * options.views * (2 if options.stereo else 1)
+
+
+def _assets(index: Index, hands: Sequence[str], objects: Sequence[str]) -> tuple[float, list[str]]:
+    """Bytes of hand and object over all cells; names that are not known."""
+    of_hands = index.asset_sizes(AssetKind.HAND, hands)
+    of_objects = index.asset_sizes(AssetKind.OBJECT, objects)
+    unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]
+    hand_bytes = sum(of_hands.get(name, _ASSET_BYTES) for name in hands) * len(objects)
+    object_bytes = sum(of_objects.get(name, _ASSET_BYTES) for name in objects) * len(hands)
+    return float(hand_bytes + object_bytes), unknown
+
+
+def _used(sums: _Sums) -> list[RateUsed]:
+    ordered = sorted(sums.cells.items(), key=lambda entry: -entry[1])
+    return [
+        RateUsed(
+            hand=hand,
+            cells=cells,
+            seconds_per_valid=rate.seconds_per_try / rate.valid_yield if rate.valid_yield else None,
+            seconds_per_try=rate.seconds_per_try,
+            valid_yield=rate.valid_yield,
+            origin=rate.origin,
+            batches=rate.batches,
+        )
+        for (hand, rate), cells in ordered[:_SHOWN_RATES]
+    ]

@@ -1,0 +1,84 @@
+"""A snapshot as files in a folder, each checked against its checksum. What is there already is not fetched again."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final
+
+from service.model.dataset_records import Snapshot, SnapshotShard
+from service.model.errors import InputError
+from service.store.integrity import check_digest
+
+#: Bytes of a shard, in chunks: from the API or from the store.
+Fetch = Callable[[SnapshotShard], Iterable[bytes]]
+#: Told after each file: files done, files in all, bytes fetched so far.
+Progress = Callable[[int, int, int], None]
+_CHUNK: Final = 1 << 20
+
+
+def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Progress | None = None) -> int:
+    """The HDF5 files as they are: `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and `snapshot.json` beside them.
+
+    `snapshot.json` is written last: a folder that holds it is whole.
+
+    Returns:
+        number of files that had to be fetched.
+
+    Raises:
+        DamagedShard: a file came with another checksum than the snapshot says.
+        StoreUnavailable: a file could not be fetched.
+    """
+    _make(folder)
+    fetched = size = 0
+    for number, shard in enumerate(snapshot.shards, start=1):
+        path = folder / path_of(shard)
+        if not _is_there(path, shard):
+            _make(path.parent)
+            _fetch(shard, path, fetch)
+            fetched, size = fetched + 1, size + shard.size_bytes
+        if progress is not None:
+            progress(number, len(snapshot.shards), size)
+    sums = "".join(f"{shard.sha256}  {path_of(shard)}\n" for shard in snapshot.shards)
+    (folder / "SHA256SUMS").write_text(sums)
+    (folder / "snapshot.json").write_text(snapshot.model_dump_json(indent=1) + "\n")
+    return fetched
+
+
+#: Formats of `graspd datasets export`: another one is another entry here.
+FORMATS: Final[dict[str, Callable[[Snapshot, Path, Fetch, Progress | None], int]]] = {"shards": export_shards}
+
+
+def path_of(shard: SnapshotShard) -> str:
+    """Place of a shard in the folder."""
+    return f"{shard.hand}/{shard.object}/{shard.kind}-{shard.batch:05}.h5"
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"the folder {folder} cannot be made: {error.strerror}") from None
+
+
+def _is_there(path: Path, shard: SnapshotShard) -> bool:
+    if not path.is_file() or path.stat().st_size != shard.size_bytes:
+        return False
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() == shard.sha256
+
+
+def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
+    """The name appears once the file is whole and its checksum is right."""
+    draft = path.with_name(f".{path.name}.part")
+    digest = hashlib.sha256()
+    try:
+        with draft.open("wb") as file:
+            for chunk in fetch(shard):
+                digest.update(chunk)
+                file.write(chunk)
+        check_digest(f"shard {shard.id}", digest.hexdigest(), shard.sha256)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)

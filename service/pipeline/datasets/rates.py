@@ -1,0 +1,240 @@
+"""Seconds and bytes of a batch: measured on this service's finished batches where there are any, else stored.
+
+The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; each at the same
+method, fidelity and referee and on the same kind of device. What is stored stands in `STORED` and `STORED_METHODS`,
+with its origin; as soon as anything was measured here, one factor, this machine's seconds over the stored ones, scales
+all of it, so that two fidelities are never compared by two machines' clocks.
+
+Every rate has an interval: of a measured one, what its batches scatter; of a stored one, how far it was seen to be off.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Hashable, Iterable
+from dataclasses import dataclass, replace
+from statistics import median, quantiles
+from typing import Final
+
+from service.index.queries.costs import BatchCost
+from service.model.domain import BATCH_SIZE, JobOptions
+
+
+@dataclass(frozen=True)
+class Rate:
+    """What grasps of one recipe cost, and where that is known from."""
+
+    seconds_per_try: float
+    valid_yield: float
+    """Valid grasps per grasp tried."""
+    bytes_per_grasp: float
+    origin: str
+    batches: int
+    """Finished batches it was measured on; 0: stored."""
+    spread: tuple[float, float]
+    """The interval of the seconds, as factors of them."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How this machine compares with the one of the stored numbers."""
+
+    factor: float = 1.0
+    """Its seconds over the stored ones: the median of its batches, of whatever fidelity and method."""
+    spread: tuple[float, float] = (1.0, 1.0)
+    """Of single batches, as factors of that."""
+    batches: int = 0
+    """Finished batches that say so; 0: nothing is known of it."""
+
+    @property
+    def stored_spread(self) -> tuple[float, float]:
+        """The interval of a stored number on this machine, as factors of it."""
+        low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
+        return low * self.spread[0], high * self.spread[1]
+
+    def scaled(self, origin: str) -> str:
+        """The origin of a stored number with what was done to it."""
+        if not self.batches:
+            return origin
+        return f"{origin}, x {self.factor:.2g} as {self.batches} batches took here"
+
+
+@dataclass(frozen=True)
+class StageRate:
+    """What a scene (per batch and scene) or a picture (per million pixels) costs."""
+
+    seconds: float
+    size_bytes: float
+    origin: str
+    batches: int
+    spread: tuple[float, float] = (1.0, 1.0)
+    """The interval of the seconds, as factors of them."""
+
+
+#: Interval of a measured rate at least: what another run of the same batches differs by.
+MEASURED_SPREAD: Final = (0.8, 1.25)
+#: Interval of a stored rate on a machine whose factor is known: fidelities and methods differ from machine to machine.
+SCALED_SPREAD: Final = (0.5, 2.0)
+#: Interval of a stored rate on an unknown machine: ten times as long was seen on a small one that others used too.
+STORED_SPREAD: Final = (1 / 3, 10.0)
+#: Where the stored numbers come from: the CPU times and sizes of docs/scaling.md, for a worker with two cores that is
+#: busy nine tenths of its time.
+ORIGIN: Final = "stored default: 2 CPU cores, docs/scaling.md"
+#: Seconds per grasp tried, with postures, quality and verdict; valid yield of standard (docs/results/matrix.md: 1,785
+#: of 2,542 tries), which stands for the others too.
+STORED: Final[dict[str, tuple[float, float]]] = {
+    "draft": (0.13, 0.7),
+    "standard": (0.16, 0.7),
+    "fine": (0.24, 0.7),
+}
+#: The same of other methods at their source's budget: the planner's time and success in docs/results/chart.md, and what
+#: postures, quality and verdict cost besides.
+STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
+    "graspit": (1.5, 0.2),
+    "graspd2022": (0.75, 0.4),
+    "dfc": (0.3, 0.44),
+    "autograsp": (0.13, 0.36),
+}
+_BYTES_PER_GRASP: Final = 1338.0
+STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
+STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
+
+
+class Rates:
+    """The measurements of one moment."""
+
+    def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
+        """Batches of `synthesize` that were made as the options ask.
+
+        Args:
+            devices: devices of the present workers; none: whatever was measured on counts.
+        """
+        self._options = options
+        self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
+        recipe = recipe_of(options)
+        here = [batch for batch in batches if batch.tried and (not devices or batch.device in devices)]
+        self.machine = machine_of(here)
+        for batch in here:
+            if recipe_of(batch.request) == recipe:
+                for key in ((batch.hand, batch.object), batch.hand, ()):
+                    self._groups[key].append(batch)
+        self._known: dict[Hashable, Rate] = {}
+
+    def of(self, hand: str, obj: str) -> Rate:
+        """The rate of a cell."""
+        levels: tuple[tuple[Hashable, str], ...] = (
+            ((hand, obj), f"{hand} on {obj}"),
+            (hand, f"{hand} on other objects"),
+            ((), "other hands and objects"),
+        )
+        for key, words in levels:
+            if key in self._groups:
+                return self._measured(key, words)
+        return self._stored()
+
+    def _measured(self, key: Hashable, words: str) -> Rate:
+        if key not in self._known:
+            batches = _whole(self._groups[key])
+            tried = sum(batch.tried for batch in batches)
+            devices = ", ".join(sorted({batch.device for batch in batches}))
+            self._known[key] = Rate(
+                seconds_per_try=sum(batch.seconds for batch in batches) / tried,
+                valid_yield=sum(batch.kept for batch in batches) / tried,
+                bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
+                origin=f"measured here: {words}, {devices}",
+                batches=len(batches),
+                spread=_spread([batch.seconds / batch.tried for batch in batches], MEASURED_SPREAD),
+            )
+        return self._known[key]
+
+    def _stored(self) -> Rate:
+        seconds, share, origin = _stored_of(self._options)
+        machine = self.machine
+        return Rate(seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled(origin), 0, machine.stored_spread)
+
+
+def _stored_of(options: JobOptions) -> tuple[float, float, str]:
+    """Stored seconds per try, yield and origin."""
+    method, name = options.method, options.knobs.name
+    if method in STORED_METHODS:
+        return *STORED_METHODS[method], f"{ORIGIN}, {method}"
+    origin = ORIGIN if name in STORED else f"{ORIGIN}, of standard for want of {name}"
+    if method != "fast_graspd":
+        origin = f"{ORIGIN}, of fast_graspd for want of {method}"
+    return *STORED.get(name, STORED["standard"]), origin
+
+
+def machine_of(batches: Iterable[BatchCost]) -> Machine:
+    """How the machine that made these batches of `synthesize` compares with the stored numbers.
+
+    Only batches that have a stored number of their own count: as offered, without options.
+    """
+    comparable = [batch for batch in batches if batch.tried and _is_stored(batch.request)]
+    ratios = [
+        batch.seconds / batch.tried / _stored_of(batch.request)[0] for batch in _whole(comparable) if batch.seconds > 0
+    ]
+    if not ratios:
+        return Machine()
+    return Machine(median(ratios), _spread(ratios, (1.0, 1.0)), len(ratios))
+
+
+def _is_stored(request: JobOptions) -> bool:
+    if request.options:
+        return False
+    return request.method in STORED_METHODS or (request.method == "fast_graspd" and request.knobs.name in STORED)
+
+
+def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
+    """Middle eight tenths of the values over their median, and no narrower than `least`."""
+    if len(values) < 2 or (middle := median(values)) <= 0:
+        return least
+    tenths = quantiles(values, n=10, method="inclusive")
+    return min(least[0], tenths[0] / middle), max(least[1], tenths[-1] / middle)
+
+
+def _whole(batches: list[BatchCost]) -> list[BatchCost]:
+    """Those of at least half a full batch, if there are any: a small one spends its time on loading."""
+    return [batch for batch in batches if 2 * batch.tried >= BATCH_SIZE] or batches
+
+
+def recipe_of(options: JobOptions) -> Hashable:
+    """What decides how long a grasp takes, besides hand, object and device."""
+    return (
+        options.method,
+        tuple(sorted((name, str(value)) for name, value in options.options.items())),
+        options.knobs.model_dump_json(exclude={"name"}),
+        options.want,
+        options.referee,
+        options.robustness,
+    )
+
+
+def _on(machine: Machine, stored: StageRate) -> StageRate:
+    """A stored rate as this machine takes it."""
+    seconds = stored.seconds * machine.factor
+    return replace(stored, seconds=seconds, origin=machine.scaled(stored.origin), spread=machine.stored_spread)
+
+
+def scene_rate(batches: Iterable[BatchCost], machine: Machine) -> StageRate:
+    """Seconds per batch and scene, bytes per grasp and scene."""
+    found = [batch for batch in batches if batch.request.scenes]
+    rows = sum(batch.count for batch in found)
+    if not rows:
+        return _on(machine, STORED_SCENE)
+    scenes = sum(batch.request.scenes for batch in found)
+    seconds = sum(batch.seconds for batch in found) / scenes
+    spread = _spread([batch.seconds / batch.request.scenes for batch in found], MEASURED_SPREAD)
+    return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found), spread)
+
+
+def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
+    """Seconds and bytes per million pixels, of pictures with the same channels where there are any."""
+    found = [batch for batch in batches if batch.count]
+    found = [batch for batch in found if batch.request.channels == options.channels] or found
+    pixels = sum(batch.count * batch.request.width * batch.request.height for batch in found) / 1e6
+    if not pixels:
+        return _on(machine, STORED_PICTURE)
+    seconds = sum(batch.seconds for batch in found) / pixels
+    each = [batch.seconds / (batch.count * batch.request.width * batch.request.height) for batch in found]
+    sizes = sum(batch.size_bytes for batch in found) / pixels
+    return StageRate(seconds, sizes, "measured here", len(found), _spread(each, MEASURED_SPREAD))

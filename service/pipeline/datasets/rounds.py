@@ -1,0 +1,95 @@
+"""Carries out what users want of datasets, a little in each round of the keeper: plans jobs, cancels and retries them.
+
+Killed at any moment, its successor goes on: which cells have a job is in the index, and a job's event names the event
+of the dataset that caused it, so none is passed on twice.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Final
+
+from service.index.changes.datasets import DatasetWork
+from service.model.dataset_records import job_of
+from service.model.domain import State
+from service.model.errors import ConflictError
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.store.records import job_events
+
+log = logging.getLogger(__name__)
+#: Time for datasets in one round of the keeper [s]: the queue and lost workers must not wait for long.
+BUDGET_S: Final = 0.5
+_CELLS_AT_ONCE: Final = 20
+
+
+class DatasetRounds:
+    """Works through the datasets that have something to do, the oldest first."""
+
+    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts = parts
+        self._clock = clock
+        self._positions: dict[tuple[str, int], int] = {}
+
+    def advance(self, budget_s: float = BUDGET_S) -> bool:
+        """Work for so long at most. Returns whether something is left to do.
+
+        Raises:
+            UnavailableError: a part is away; call again later.
+        """
+        deadline = self._clock() + budget_s
+        for work in self._parts.index.datasets_in_work():
+            if not self._pass_on(work, deadline) or not self._plan(work, deadline):
+                return True
+        return False
+
+    def _plan(self, work: DatasetWork, deadline: float) -> bool:
+        """Make jobs of the cells that have none; whether all are made."""
+        after = -1
+        while not work.cancelled:
+            cells = self._parts.index.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
+            for cell in cells:
+                if self._clock() > deadline:
+                    return False
+                job_actions.enter(
+                    self._parts, job_of(cell, work.options, work.revisions, work.owner), keeps_assets=True
+                )
+                after = cell.position
+            if not cells:
+                break
+        self._parts.index.set_dataset_progress(work.name, planned=True)
+        return True
+
+    def _pass_on(self, work: DatasetWork, deadline: float) -> bool:
+        """Cancel or retry the jobs, as the last event says; whether that is done."""
+        if work.applied >= work.events:
+            return True
+        key = (work.name, work.events)
+        states = (State.QUEUED, State.RUNNING) if work.cancelled else (State.FAILED, State.CANCELLED)
+        while True:
+            found = self._parts.index.cells_in_states(
+                work.name, states, after=self._positions.get(key, -1), limit=_CELLS_AT_ONCE, unshared=work.cancelled
+            )
+            for position, job in found:
+                if self._clock() > deadline:
+                    return False
+                self._pass_to(job, work)
+                self._positions[key] = position
+            if not found:
+                break
+        self._positions.pop(key, None)
+        self._parts.index.set_dataset_progress(work.name, applied=work.events)
+        return True
+
+    def _pass_to(self, job: str, work: DatasetWork) -> None:
+        cause = f"{work.name}/{work.events}"
+        if any(event.cause == cause for event in job_events(self._parts.store, job)):
+            return
+        act = job_actions.cancel if work.cancelled else job_actions.retry
+        try:
+            act(self._parts, job, cause=cause)
+        except ConflictError as error:
+            # It ended, or somebody started it, since the index was asked.
+            log.info("job %s of dataset %s is left as it is: %s", job, work.name, error)

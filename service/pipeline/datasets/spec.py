@@ -1,0 +1,99 @@
+"""What a user asks for: hands x objects, the options of each cell; and the record that follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, Final, Self
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from service.model.clock import timestamp
+from service.model.dataset_records import DatasetRecord, Member, request_of
+from service.model.digests import digest_json, job_id
+from service.model.domain import AUTO, JobOptions, JobRequest, Name
+from service.model.version import STAGE_REVISIONS
+
+#: Larger matrices are split by their user: the record of this many cells has 4 MB.
+MAX_CELLS: Final = 100_000
+
+
+def _once(given: tuple[str, ...]) -> tuple[str, ...]:
+    """The same name twice is the same cell."""
+    return tuple(dict.fromkeys(given))
+
+
+Names = Annotated[tuple[Name, ...], AfterValidator(_once)]
+
+
+class Matrix(JobOptions):
+    """Hands x objects, and what is wanted of each cell: `grasps` is a number for each cell."""
+
+    hands: Names = Field(min_length=1, max_length=1000, description="names of hands")
+    objects: Names = Field((), max_length=MAX_CELLS, description="names of objects")
+    sets: Names = Field((), max_length=100, description="names of sets of objects; these follow `objects`")
+
+    @model_validator(mode="after")
+    def _has_objects(self) -> Self:
+        if not self.objects and not self.sets:
+            raise ValueError("a dataset needs objects: name some, or a set of them")
+        return self
+
+    @property
+    def shared(self) -> JobOptions:
+        """What all cells share."""
+        return JobOptions(**{name: getattr(self, name) for name in JobOptions.model_fields})
+
+
+class DatasetRequest(Matrix):
+    """A matrix with a name."""
+
+    name: Name = Field(description="name of the dataset; `estimate` is taken by an address of the API")
+
+    @field_validator("name")
+    @classmethod
+    def _is_free(cls, value: str) -> str:
+        if value == "estimate":
+            raise ValueError("the API answers estimates at this name; take another one")
+        return value
+
+
+def describe(
+    name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions,
+    resolve: Callable[[JobRequest], JobRequest], owner: str = "",
+) -> DatasetRecord:  # fmt: skip
+    """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
+    name.
+
+    Args:
+        resolve: puts a fidelity in the place of `auto`.
+        owner: id of the API key that submits it; no part of the digest.
+
+    Raises:
+        InputError: no fidelity meets the target on one of the cells.
+    """
+    cells = [(hand, obj, resolve(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
+    # A fidelity that is chosen has a name.
+    fidelities = tuple(str(request.fidelity) for _, _, request in cells) if options.fidelity == AUTO else ()
+    content = {
+        "hands": [[hand.name, hand.digest] for hand in hands],
+        "objects": [[obj.name, obj.digest] for obj in objects],
+        "options": options.model_dump(mode="json", exclude=_unused(options)),
+        **({"fidelities": fidelities} if fidelities else {}),
+    }
+    return DatasetRecord(
+        name=name,
+        digest=digest_json(content),
+        hands=tuple(hands),
+        objects=tuple(objects),
+        options=options,
+        revisions=dict(STAGE_REVISIONS),
+        jobs=tuple(job_id(request, hand.digest, obj.digest) for hand, obj, request in cells),
+        fidelities=fidelities,
+        created=timestamp(),
+        owner=owner,
+    )
+
+
+def _unused(options: JobOptions) -> set[str]:
+    """Options that came later: where they are not used, digests stay what they were."""
+    return {name for name in ("options", "target") if not getattr(options, name)}

@@ -1,0 +1,219 @@
+"""What a user does to jobs: submit, cancel, retry. The planning behind it is in `planning`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from service.index.queries.feed import ReadyTask
+from service.index.views import AssetView, JobView
+from service.logs import bound
+from service.model import names
+from service.model.clock import timestamp
+from service.model.digests import job_id
+from service.model.domain import AssetKind, JobRequest, Lane, Origin, State
+from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from service.model.planning import lane_of, message_of
+from service.model.records import JobRecord
+from service.pipeline import fidelity_choice
+from service.pipeline.backends import Parts
+from service.queue.port import Event, EventKind
+from service.store.deletions import refuse_pending
+from service.store.records import add_job_event, job_events, put_record, read_record
+
+log = logging.getLogger(__name__)
+
+
+def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tuple[JobView, bool]:
+    """Record a job and queue its first tasks. The same request on the same hand and object is the same job.
+
+    Args:
+        lane: bulk for the jobs of a dataset; by default a small job is interactive.
+
+    Returns:
+        the job, and whether it is new. A failed or cancelled job is returned as it is: `retry` starts it again.
+
+    Raises:
+        what `prepare` raises; nothing was recorded then.
+    """
+    return enter(parts, prepare(parts, request, lane=lane))
+
+
+def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owner: str = "") -> JobRecord:
+    """The job that a request stands for, of a hand and an object that may be used.
+
+    Args:
+        owner: id of the API key that submits it.
+
+    Raises:
+        NotFoundError: unknown hand or object.
+        InputError: the hand or object was refused when it was checked; no chart tells which fidelity meets the target.
+        ConflictError: the check of the hand or object is still running.
+        QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
+    """
+    hand = usable(parts, AssetKind.HAND, request.hand)
+    obj = usable(parts, AssetKind.OBJECT, request.object)
+    parts.queue.ping()
+    request = fidelity_choice.explicit(parts.store, request.model_copy(update={"hand": hand.name, "object": obj.name}))
+    return JobRecord(
+        id=job_id(request, hand.digest, obj.digest),
+        request=request,
+        hand_digest=hand.digest,
+        object_digest=obj.digest,
+        lane=lane or lane_of(request),
+        created=timestamp(),
+        origin=_present_origin(),
+        owner=owner,
+    )
+
+
+def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
+    """Keep a planned job and queue its first tasks.
+
+    Args:
+        keeps_assets: a dataset keeps the hand and the object from being deleted meanwhile.
+
+    Returns:
+        the job, and whether it is new.
+
+    Raises:
+        NotFoundError: the hand or the object was deleted meanwhile.
+        ConflictError: the same job was deleted, and its objects are still being removed.
+    """
+    key = names.job_record(record.id)
+    new = put_record(parts.store, key, record)
+    try:
+        refuse_pending(parts.store, "job", record.id)
+        if not new:
+            record = read_record(JobRecord, parts.store, key)
+        wanted = ((AssetKind.HAND, record.hand_digest), (AssetKind.OBJECT, record.object_digest))
+        with parts.index.writing() as connection:
+            if not new and not parts.store.exists(key):
+                raise ConflictError(f"job {record.id} was deleted just now; submit it again")
+            if not keeps_assets and (missing := parts.index.missing_assets(wanted, within=connection)):
+                raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+            parts.index.add_job(record, within=connection)
+    except InputError:
+        if new:
+            parts.store.delete(key)
+        raise
+    _start(parts, record.id)
+    return parts.index.job(record.id), new
+
+
+def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
+    """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
+
+    Args:
+        cause: event of a dataset that asks for it, kept with the job's event.
+
+    Raises:
+        NotFoundError: unknown job.
+        ConflictError: the job is already finished.
+    """
+    job = parts.index.job(job_id)
+    if job.state.is_final:
+        raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
+    in_queue = parts.index.unfinished_tasks(job_id)
+    add_job_event(parts.store, job_id, "cancelled", cause=cause)
+    _index_events(parts, job_id)
+    try:
+        parts.queue.discard(in_queue)
+    except UnavailableError as error:
+        log.warning("job %s is cancelled; its tasks in the queue follow when it answers: %s", job_id, error)
+    return _told(parts, job_id)
+
+
+def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
+    """Queue the failed and cancelled tasks of a job again, with fresh attempts.
+
+    Args:
+        cause: event of a dataset that asks for it, kept with the job's event.
+
+    Raises:
+        NotFoundError: unknown job.
+        ConflictError: the job neither failed nor was cancelled.
+    """
+    job = parts.index.job(job_id)
+    if job.state not in (State.FAILED, State.CANCELLED):
+        raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
+    add_job_event(parts.store, job_id, "retried", parts.index.failed_tasks(job_id), cause=cause)
+    _index_events(parts, job_id)
+    _start(parts, job_id)
+    return _told(parts, job_id)
+
+
+def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, again: bool = False) -> int:
+    """Put tasks into the queue and mark them in the index.
+
+    The mark comes first: a task marked but not queued is found missing and queued by the keeper; one queued but not
+    marked might run twice.
+    """
+    added = 0
+    if ready:
+        parts.index.set_queued([task.task.id for task in ready])
+    for lane in Lane:
+        messages = [
+            message_of(
+                task.job,
+                task.task,
+                attempt=task.last_attempt + 1,
+                max_attempt=task.retried_upto + parts.settings.task_attempts,
+            )
+            for task in ready
+            if task.lane is lane
+        ]
+        added += parts.queue.enqueue(messages, lane, again=again) if messages else 0
+    return added
+
+
+def _start(parts: Parts, job_id: str) -> None:
+    """Queue as much of a job as the queue's window holds; the keeper feeds the rest, and all of it if Redis is away."""
+    try:
+        room = parts.settings.queue_window - sum(parts.queue.depths().values())
+        if room > 0:
+            queue_tasks(parts, parts.index.ready_of_job(job_id, limit=room))
+        _told(parts, job_id)
+    except UnavailableError as error:
+        log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
+
+
+def _index_events(parts: Parts, job_id: str) -> None:
+    """What users did to a job, read while nobody else writes: of two at once the later one must know of both events."""
+    with parts.index.writing() as connection:
+        parts.index.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
+
+
+def _told(parts: Parts, job_id: str) -> JobView:
+    job = parts.index.job(job_id)
+    try:
+        parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))
+    except UnavailableError as error:
+        log.warning("nobody was told that job %s is %s: %s", job_id, job.state, error)
+    return job
+
+
+def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
+    """A hand or object by name or digest that jobs may use.
+
+    Raises:
+        NotFoundError: there is none.
+        InputError: it was refused when it was checked.
+        ConflictError: its check is still running.
+    """
+    asset = parts.index.asset(kind, name)
+    if asset.verdict == "refuse":
+        raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
+    if asset.verdict is None:
+        raise ConflictError(f"{kind.value} {name!r} is still being checked; submit again in a moment")
+    return asset
+
+
+def _present_origin() -> Origin | None:
+    """The request that is being answered now, if any."""
+    origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
+    return origin if origin != Origin() else None
+
+
+def _ended(state: State) -> str:
+    return {"succeeded": "succeeded", "failed": "failed", "cancelled": "been cancelled"}[state.value]

@@ -1,0 +1,231 @@
+"""The keeper: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from service.index.rebuild import complete_if_new, rebuild
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import Lane
+from service.model.errors import DamagedError, StoreUnavailable, UnavailableError
+from service.model.planning import ingest_id, ingest_message
+from service.model.turns import Turns
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.indexer import Indexer
+from service.pipeline.job_actions import queue_tasks
+from service.pipeline.reaper import Reaper
+from service.pipeline.scrubber import Scrubber
+from service.pipeline.sweeper import Sweeper
+from service.queue.port import Event, EventKind
+from service.store.library import publish_builtins, stored_assets
+
+log = logging.getLogger(__name__)
+PART: Final = "keeper"
+_EVENTS_A_ROUND: Final = 1000
+#: Events that wait for the store; while there are more, no further ones are taken from the stream.
+_LONGEST_BACKLOG: Final = 10_000
+_FORGET_WORKERS_AFTER_S: Final = 3600.0
+_WORKERS_EVERY_S: Final = 2.0
+_LONGEST_PAUSE_S: Final = 5.0
+_SWEEP_EVERY_S: Final = 5.0
+#: What a read of the store that is under way has to end, once the keeper stops [s].
+_LAST_READ_S: Final = 3.0
+
+
+class Keeper:
+    """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
+
+    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts = parts
+        self._indexer = Indexer(parts)
+        self._reaper = Reaper(parts, self._indexer, clock=clock)
+        self._planner = DatasetRounds(parts, clock=clock)
+        self._sweeper = Sweeper(parts, clock=clock)
+        self._has_plans = False
+        self._turns = Turns()
+        self._backlog: list[tuple[str, Event]] = []
+        self._news = False
+        """Whether anything but progress came in since the queue was looked after."""
+        self._started = False
+        self._clock = clock
+        self._look_again = self._plan_again = self._tell_again = self._sweep_again = -math.inf
+
+    def run(self, stop: threading.Event) -> None:
+        """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
+        with self._scrubbing(stop):
+            self._run(stop)
+
+    @contextmanager
+    def _scrubbing(self, stop: threading.Event) -> Iterator[None]:
+        """Reads through the store beside the rounds, where the settings want it."""
+        if not self._parts.settings.scrub_mb_per_s:
+            yield
+            return
+        thread = threading.Thread(target=Scrubber(self._parts, stop).run, name="scrub", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(_LAST_READ_S)
+
+    def _run(self, stop: threading.Event) -> None:
+        pause = 0.0
+        while not stop.is_set():
+            try:
+                self.round(wait_s=self._parts.settings.keeper_interval_s)
+                pause = 0.0
+            except UnavailableError as error:
+                pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
+                log.warning("%s; the keeper tries again in %.2g s", error, pause)
+                stop.wait(pause)
+            except Exception:
+                pause = min(_LONGEST_PAUSE_S, max(1.0, 2 * pause))
+                log.exception("a round broke off; the keeper goes on in %.2g s", pause)
+                stop.wait(pause)
+
+    def round(self, *, wait_s: float = 0.0) -> None:
+        """Index what came in, then look after queue, leases and workers.
+
+        Raises:
+            UnavailableError: a part is away; the round can be run again.
+        """
+        if not self._started:
+            self._start()
+        elif self._parts.index.completeness() is None:
+            self._make_whole()
+        away: list[UnavailableError] = []
+        with _noted(away):
+            self._index_events(0.0 if self._has_plans else wait_s)
+        now = self._clock()
+        if self._news or now >= self._look_again:
+            with _noted(away):
+                self._look_after_queue()
+                self._news = False
+                self._look_again = now + self._parts.settings.keeper_interval_s
+        if self._has_plans or now >= self._plan_again:
+            with _noted(away):
+                self._has_plans = self._planner.advance()
+                self._plan_again = now + self._parts.settings.keeper_interval_s
+        if now >= self._sweep_again:
+            with _noted(away):
+                is_left = self._sweeper.advance() or self._sweeper.collect()
+                self._sweep_again = now if is_left else now + _SWEEP_EVERY_S
+        if now >= self._tell_again:
+            with _noted(away):
+                self._parts.queue.tidy()
+            with _noted(away):
+                self._indexer.flush()
+                self._look_after_workers()
+                self._tell_again = now + _WORKERS_EVERY_S
+        if away:
+            raise away[0]
+
+    def _look_after_workers(self) -> None:
+        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+        # One that ended as it should says so, but its registration is gone a moment before that is read.
+        self._parts.index.set_workers(
+            self._parts.queue.workers(),
+            lost_before=timestamp(self._parts.settings.lease_s),
+            forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
+        )
+
+    def _start(self) -> None:
+        publish_builtins(self._parts.store)
+        complete_if_new(self._parts.index, self._parts.store)
+        made = self._parts.index.completeness()
+        # What was left out may have been mended since.
+        if made is None or made.left_out:
+            self._make_whole()
+        else:
+            self._index_assets()
+        self._started = True
+
+    def _make_whole(self) -> None:
+        log.warning("the index may lack what the store has: it is made from the store")
+        rebuild(self._parts.index, self._parts.store)
+
+    def _index_assets(self) -> None:
+        for kind, digest in stored_assets(self._parts.store):
+            try:
+                self._indexer.checked(kind, digest)
+            except DamagedError as error:
+                log.warning("%s", error)
+
+    def _index_events(self, wait_s: float) -> None:
+        """Take up what came in; what the store is needed for waits while that is away."""
+        if len(self._backlog) < _LONGEST_BACKLOG:
+            wait_s = wait_s if not self._backlog else 0.0
+            self._backlog += self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
+        if not self._backlog:
+            return
+        waiting = set(self._indexer.apply([event for _, event in self._backlog]))
+        done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
+        self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
+        self._parts.queue.acknowledge([event_id for event_id, _ in done])
+        self._news |= any(event.kind is not EventKind.PROGRESS for _, event in done)
+        if waiting:
+            raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
+
+    def _announce(self) -> None:
+        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+
+    def _look_after_queue(self) -> None:
+        # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
+        # first, and nobody's silence is judged.
+        self._announce()
+        # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
+        waiting = self._parts.queue.waiting()
+        leases = self._parts.queue.leases()
+        lost = self._reaper.reap(leases)
+        present = waiting | {lease.task_id for lease in leases if lease not in lost}
+        if stray := self._parts.index.cancelled(present):
+            self._parts.queue.discard(stray)
+        self._reaper.find_missing(present)
+        self._feed(present)
+
+    def _feed(self, present: set[str]) -> None:
+        depths = self._parts.queue.depths()
+        now = time.time()
+        for lane in Lane:
+            room = self._parts.settings.queue_window - sum(n for (of, _), n in depths.items() if of is lane)
+            ready = self._parts.index.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
+            # After a rebuild the index does not know what is in the queue already.
+            self._parts.index.set_queued([task.task.id for task in ready if task.task.id in present])
+            queue_tasks(self._parts, [task for task in ready if task.task.id not in present], again=True)
+        self._feed_checks(present, now)
+
+    def _feed_checks(self, present: set[str], now: float) -> None:
+        for check in self._parts.index.ready_checks(now=now, limit=self._parts.settings.queue_window):
+            self._parts.index.set_asset_waiting([check.digest], queued=True)
+            if self._parts.store.exists(names.asset_check(check.kind, check.digest)):
+                with _noted([]):
+                    self._indexer.checked(check.kind, check.digest)
+            elif ingest_id(check.kind, check.digest) not in present:
+                message = ingest_message(
+                    check.kind,
+                    check.name,
+                    check.digest,
+                    attempt=check.last_attempt + 1,
+                    max_attempt=self._parts.settings.task_attempts,
+                )
+                self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=True)
+
+
+@contextmanager
+def _noted(away: list[UnavailableError]) -> Iterator[None]:
+    """A part that is away, or one damaged record, must not keep the keeper from what does not need it."""
+    try:
+        yield
+    except UnavailableError as error:
+        away.append(error)
+    except DamagedError as error:
+        log.warning("%s", error)

@@ -1,0 +1,173 @@
+"""Finds tasks whose worker is lost, and tasks that the queue lost."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Collection
+from typing import Final
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import AssetKind, IngestMessage, Stage, TaskMessage
+from service.model.errors import DamagedError, UnavailableError
+from service.model.planning import ingest_id
+from service.model.records import AttemptRecord
+from service.pipeline.backends import Parts
+from service.pipeline.indexer import Indexer
+from service.queue.port import Lease
+from service.store.manifests import shard_exists
+from service.store.records import put_record, read_record, task_attempts
+
+log = logging.getLogger(__name__)
+#: A task on its way between queue, worker and stream is in none of them for a moment [s].
+LOST_AFTER_S: Final = 3.0
+
+
+class Reaper:
+    """Watches leases by whether they change, on this process's own monotonic clock: set clocks do not matter."""
+
+    def __init__(self, parts: Parts, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts = parts
+        self._indexer = indexer
+        self._clock = clock
+        self._beats: dict[str, tuple[str, float]] = {}
+        self._looked = clock()
+        self._missing: dict[str, float] = {}
+
+    def reap(self, leases: Collection[Lease]) -> list[Lease]:
+        """Take the tasks from workers that gave no sign of life for a lease; returns those leases."""
+        now = self._clock()
+        lease_s = self._parts.settings.lease_s
+        # Time in which nobody looked, because Redis was away or this process was stopped, is no worker's silence.
+        looked, self._looked = min(now - self._looked, lease_s / 3), now
+        beats: dict[str, tuple[str, float]] = {}
+        lost = []
+        for lease in leases:
+            beat, silence = self._beats.get(lease.key, (None, 0.0))
+            silence = silence + looked if beat == lease.beat else 0.0
+            if silence > lease_s:
+                self._lose(lease)
+                lost.append(lease)
+            else:
+                beats[lease.key] = (lease.beat, silence)
+        self._beats = beats
+        return lost
+
+    def find_missing(self, present: Collection[str]) -> list[str]:
+        """Ids of tasks that the index believes in the queue, but that are neither there nor with a worker."""
+        tasks, checks = self._parts.index.believed_queued()
+        believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
+        now = self._clock()
+        self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
+        missing = [task for task, since in self._missing.items() if now - since >= LOST_AFTER_S]
+        of_checks = {ingest_id(kind, digest): (kind, digest) for kind, digest in checks}
+        self._recover([task for task in missing if task not in of_checks])
+        for task in missing:
+            if task in of_checks:
+                self._recover_check(*of_checks[task])
+        return missing
+
+    def _recover(self, missing: list[str]) -> None:
+        """Make good a lost event from the store; what the store knows nothing of is queued again."""
+        again = []
+        for task, (stage, shard) in self._parts.index.outputs(missing).items():
+            if shard_exists(self._parts.store, Stage(stage), shard):
+                self._find(task, Stage(stage), shard)
+                continue
+            known = self._parts.index.task(task).attempt
+            try:
+                recorded = [a for a in task_attempts(self._parts.store, task) if a.number >= known]
+            except DamagedError as error:
+                self._fail(task, Stage(stage), error)
+                continue
+            for attempt in recorded:
+                self._indexer.failed(attempt)
+            if not recorded:
+                again.append(task)
+        if again:
+            log.warning("%d tasks were lost from the queue and are queued again", len(again))
+            self._indexer.tell(self._parts.index.set_waiting(again))
+
+    def _find(self, task_id: str, stage: Stage, shard: str) -> None:
+        """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again."""
+        try:
+            self._indexer.finished(stage, shard)
+        except DamagedError as error:
+            self._fail(task_id, stage, error)
+
+    def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
+        """End a task that a damaged record stands in the way of."""
+        task = self._parts.index.task(task_id)
+        attempt = AttemptRecord(
+            task_id=task_id,
+            job_id=task.job_id,
+            stage=stage,
+            number=task.attempt,
+            kind=type(error).__name__,
+            reason=str(error),
+            worker="keeper",
+            ended=timestamp(),
+            last=True,
+        )
+        put_record(self._parts.store, names.attempt(task_id, attempt.number), attempt)
+        self._indexer.failed(attempt)
+
+    def _recover_check(self, kind: AssetKind, digest: str) -> None:
+        if self._parts.store.exists(names.asset_check(kind, digest)):
+            try:
+                self._indexer.checked(kind, digest)
+            except DamagedError as error:
+                log.warning("%s", error)
+        else:
+            self._parts.index.set_asset_waiting([digest], queued=False)
+
+    def _lose(self, lease: Lease) -> None:
+        message = lease.message
+        log.warning("worker %s was lost with task %s (attempt %d)", lease.worker, lease.task_id, lease.attempt)
+        try:
+            if isinstance(message, TaskMessage):
+                self._lose_task(lease, message)
+            elif isinstance(message, IngestMessage):
+                self._lose_check(lease, message)
+        except UnavailableError:
+            raise
+        except Exception:  # anybody who writes to Redis can forge a lease: it must not hold up the others
+            log.exception("the lease of task %s is left out", lease.task_id)
+        # Only now: if the store was away, the next round finds the lease again.
+        self._parts.queue.release(lease)
+
+    def _lose_task(self, lease: Lease, message: TaskMessage) -> None:
+        if shard_exists(self._parts.store, message.stage, message.output):
+            self._find(message.task_id, message.stage, message.output)
+            return
+        attempt = AttemptRecord(
+            task_id=message.task_id,
+            job_id=message.job_id,
+            stage=message.stage,
+            number=message.attempt,
+            kind="WorkerLost",
+            reason=f"worker {lease.worker} was lost: no sign of life for {self._parts.settings.lease_s:g} s",
+            worker=lease.worker,
+            ended=timestamp(),
+            last=message.attempt >= message.max_attempt,
+        )
+        key = names.attempt(message.task_id, message.attempt)
+        if not put_record(self._parts.store, key, attempt):
+            try:
+                attempt = read_record(AttemptRecord, self._parts.store, key)
+            except DamagedError as error:
+                self._fail(message.task_id, message.stage, error)
+                return
+        # A first loss is the machine's fault more often than the task's, so there is no wait.
+        self._indexer.failed(attempt, at_once=attempt.number == 1)
+
+    def _lose_check(self, lease: Lease, message: IngestMessage) -> None:
+        if message.attempt >= message.max_attempt:
+            reason = f"checking this {message.kind.value} ended its worker {message.attempt} times; it is not taken"
+            found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
+            self._parts.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+            self._indexer.checked(message.kind, message.digest)
+        else:
+            self._parts.index.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

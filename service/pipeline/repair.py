@@ -1,0 +1,97 @@
+"""Makes again what is damaged in a store and follows from what is not: a shard is a function of its inputs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+from service.index.notes import Damage
+from service.model import names
+from service.model.domain import Lane, Stage
+from service.model.errors import DamagedError, NotFoundError
+from service.model.planning import PlannedTask, message_of, plan
+from service.model.records import JobRecord
+from service.model.version import STAGE_REVISIONS
+from service.pipeline.backends import Parts
+from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
+from service.store.records import read_record, task_attempts
+
+
+def repair(parts: Parts, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
+    """Move what is damaged aside, below `damaged/`, and queue what can be made again.
+
+    A worker puts a shard that was made again only where it has the checksum that its manifest says.
+
+    Returns:
+        what was queued or moved away, and what was left as it is; `what` of the latter says why.
+
+    Raises:
+        UnavailableError: a part is away; call it again.
+    """
+    harmed = {one.shard for one in found if one.shard}
+    repaired, left = [], []
+    for one in found:
+        why = _mend(parts, one, harmed)
+        if why:
+            left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
+        else:
+            repaired.append(one)
+    return repaired, left
+
+
+def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
+    """Repair one thing; why it cannot be, or nothing."""
+    if one.what == FOREIGN:
+        parts.store.set_aside(one.key)
+        return ""
+    if not one.shard:
+        return "put a copy in its place"
+    stage = STAGES[one.key.split("/")[1]]
+    if is_on_its_way(parts.store, one):
+        return "its manifest may be on its way; run it again in a minute"
+    planned = _planned(parts, stage, one.shard)
+    if isinstance(planned, str):
+        if one.what == NO_MANIFEST:
+            parts.store.set_aside(one.key)
+            return ""
+        return planned
+    job, task = planned
+    if harmed & set(task.inputs):
+        return "its input is made again first; run it again when that is done"
+    if one.what != MISSING:
+        _clear(parts, one, stage)
+    number = len(task_attempts(parts.store, task.id)) + 1
+    message = message_of(job, task, attempt=number, max_attempt=number)
+    parts.queue.enqueue([message], Lane.BULK, again=True)
+    return ""
+
+
+def _clear(parts: Parts, one: Damage, stage: Stage) -> None:
+    """Make room for what is made again; a file that only lacks a manifest stays if the index knows its checksum."""
+    file, manifest = names.shard_file(stage, one.shard), names.shard_manifest(stage, one.shard)
+    if one.what == BAD_MANIFEST:
+        parts.store.set_aside(manifest)
+    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _known_to_index(parts, one.shard, file):
+        parts.store.set_aside(file)
+
+
+def _known_to_index(parts: Parts, shard: str, file: str) -> bool:
+    try:
+        return parts.index.shard(shard).sha256 == hashlib.sha256(parts.store.get(file)).hexdigest()
+    except NotFoundError:
+        return False
+
+
+def _planned(parts: Parts, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
+    """The task that makes a shard; or why there is none."""
+    job = parts.index.job_of_shard(shard)
+    if job is None:
+        return "no job makes it, so it cannot be made again; put a copy in its place"
+    try:
+        record = read_record(JobRecord, parts.store, names.job_record(job))
+    except (NotFoundError, DamagedError) as error:
+        return f"the job that makes it cannot be read: {error}"
+    if (made := record.revisions.get(stage)) != STAGE_REVISIONS[stage]:
+        return f"it is of revision {made} of {stage}, and this graspd makes revision {STAGE_REVISIONS[stage]}"
+    task = next((task for task in plan(record) if task.output == shard), None)
+    return (record, task) if task is not None else "its job does not make it"

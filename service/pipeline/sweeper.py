@@ -1,0 +1,138 @@
+"""Removes the objects of what users deleted, a little in each round of the keeper, and after a grace time the shards
+that no job needs any more."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import AssetKind, Stage
+from service.model.errors import ConflictError, DamagedError, NotFoundError
+from service.model.planning import plan
+from service.pipeline.backends import Parts
+from service.pipeline.deletion import delete_job
+from service.store.datasets import load_dataset
+from service.store.deletions import Deletion, Released, released_key
+from service.store.records import put_record, read_record
+
+log = logging.getLogger(__name__)
+#: Time for deletions in one round of the keeper [s].
+BUDGET_S: Final = 0.5
+_AT_ONCE: Final = 200
+
+
+class Sweeper:
+    """Carries out deletions; killed at any moment, its successor does the rest."""
+
+    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts = parts
+        self._clock = clock
+
+    def advance(self, budget_s: float = BUDGET_S) -> bool:
+        """Work for so long at most. Returns whether something is left to do.
+
+        Raises:
+            UnavailableError: a part is away; call again later.
+        """
+        deadline = self._clock() + budget_s
+        for entry in list(self._parts.store.list(names.DELETIONS)):
+            if self._clock() > deadline:
+                return True
+            try:
+                deletion = read_record(Deletion, self._parts.store, entry.key)
+            except DamagedError as error:
+                log.warning("%s", error)
+                continue
+            if not self._carry_out(deletion, deadline):
+                return True
+            self._parts.store.delete(entry.key)
+            log.info("the objects of %s %s are removed", deletion.what, deletion.id)
+        return False
+
+    def collect(self, budget_s: float = BUDGET_S) -> bool:
+        """Remove shards that have not been needed for the grace time. Returns whether something is left to do."""
+        known = self._parts.index.completeness()
+        if known is not None and known.left_out:
+            return False  # a job whose record cannot be read may need one of them
+        deadline = self._clock() + budget_s
+        before = timestamp(self._parts.settings.shard_grace_s)
+        for entry in sorted(self._parts.store.list(names.RELEASED), key=lambda one: one.key):
+            try:
+                released = read_record(Released, self._parts.store, entry.key)
+            except DamagedError as error:
+                log.warning("%s", error)
+                continue
+            if released.at > before:
+                break  # those behind it are younger
+            for stage, shard in self._unneeded(released):
+                if self._clock() > deadline:
+                    return True
+                self._remove_shard(stage, shard)
+            self._parts.store.delete(entry.key)
+        return False
+
+    def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
+        """Rows once more, in case the process ended between record and rows; then the objects. Whether all is done."""
+        if deletion.what == "job":
+            self._parts.index.remove_job(deletion.id)
+            self._remove_job(deletion)
+        elif deletion.what == "dataset":
+            self._parts.index.remove_dataset(deletion.id)
+            if not self._remove_jobs_of(deletion.id, deadline):
+                return False
+            self._remove_below(f"{names.DATASETS}/{deletion.id}", last=names.dataset_record(deletion.id))
+        else:
+            kind = AssetKind(deletion.what)
+            self._parts.index.remove_asset(kind, deletion.id)
+            record = names.asset_record(kind, deletion.id)
+            self._remove_below(record.rpartition("/")[0], last=record)
+        return True
+
+    def _remove_job(self, deletion: Deletion) -> None:
+        if deletion.job is not None:
+            put_record(self._parts.store, released_key(deletion), Released(at=deletion.at, job=deletion.job))
+        for task, number in deletion.attempts:
+            self._parts.store.delete(names.attempt(task, number))
+        record = names.job_record(deletion.id)
+        self._remove_below(record.rpartition("/")[0], last=record)
+
+    def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
+        """Delete the jobs that the planner made for a dataset and that no other one holds; whether all are gone."""
+        try:
+            jobs = load_dataset(self._parts.store, dataset).jobs
+        except (NotFoundError, DamagedError):
+            return True
+        for start in range(0, len(jobs), _AT_ONCE):
+            for job in self._parts.index.planned_only(jobs[start : start + _AT_ONCE]):
+                if self._clock() > deadline:
+                    return False
+                try:
+                    delete_job(self._parts, job)
+                except (ConflictError, NotFoundError) as error:
+                    log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)
+        return True
+
+    def _remove_below(self, folder: str, *, last: str) -> None:
+        for key in [entry.key for entry in self._parts.store.list(folder)]:
+            if key != last:
+                self._parts.store.delete(key)
+        self._parts.store.delete(last)
+
+    def _unneeded(self, released: Released) -> Iterator[tuple[Stage, str]]:
+        planned = [(task.stage, task.output) for task in plan(released.job)]
+        for start in range(0, len(planned), _AT_ONCE):
+            some = planned[start : start + _AT_ONCE]
+            unneeded = self._parts.index.unneeded_shards([shard for _, shard in some])
+            yield from ((stage, shard) for stage, shard in some if shard in unneeded)
+
+    def _remove_shard(self, stage: Stage, shard: str) -> None:
+        """The manifest first: without it the shard does not exist. A job that is entered meanwhile waits for the lock,
+        and makes the shard anew."""
+        with self._parts.index.writing() as connection:
+            if self._parts.index.remove_shard(shard, within=connection):
+                self._parts.store.delete(names.shard_manifest(stage, shard))
+                self._parts.store.delete(names.shard_file(stage, shard))

@@ -1,0 +1,80 @@
+"""What the queue says at the moment of a scrape: two round trips, whatever waits in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from service.model.clock import age_of
+from service.model.domain import Lane, Stage
+
+Place = tuple[Lane, Stage]
+
+
+@dataclass(frozen=True)
+class WorkerPulse:
+    """A living worker."""
+
+    device: str
+    state: str
+    lease_age_s: float
+    """Time since its last beat, by Redis's clock."""
+
+
+@dataclass(frozen=True)
+class QueueNow:
+    """Waiting and running tasks, and the workers. Places without a task may be left out."""
+
+    depth: Mapping[Place, int] = field(default_factory=dict)
+    oldest_s: Mapping[Place, float] = field(default_factory=dict)
+    running: Mapping[Place, int] = field(default_factory=dict)
+    workers: Mapping[str, WorkerPulse] = field(default_factory=dict)
+
+
+def read_queue(
+    connection: Any, *, workers_key: str, worker_key: bytes, lease_s: float, read_beat: Callable[[bytes | None], Any]
+) -> QueueNow:
+    """Two round trips: lengths and heads of the lists, then the age of the heads and the beats of the workers.
+
+    Args:
+        connection: Redis.
+        workers_key: set of the workers' names.
+        worker_key: what stands before a name in the key that a living worker renews.
+        lease_s: how long that key lives after a beat [s].
+        read_beat: what a worker says of itself (`WorkerBeat`), None if that cannot be read.
+    """
+    places = list(product(Lane, Stage))
+    with connection.pipeline(transaction=False) as pipe:
+        for lane, stage in places:
+            name = f"{lane.value}-{stage.value}"
+            pipe.llen(f"rq:queue:{name}")
+            pipe.lindex(f"rq:queue:{name}", 0)
+            pipe.zcard(f"rq:wip:{name}")
+        pipe.smembers(workers_key)
+        *found, names = pipe.execute()
+    lengths, heads, running = found[0::3], found[1::3], found[2::3]
+    first = {place: head for place, head in zip(places, heads, strict=True) if head is not None}
+    known = sorted(names)
+    with connection.pipeline(transaction=False) as pipe:
+        for head in first.values():
+            pipe.hget(b"rq:job:" + head, "enqueued_at")
+        for name in known:
+            pipe.get(worker_key + name)
+            pipe.pttl(worker_key + name)
+        # Under a name that anybody may have put there lies anything: that hides no other.
+        rest = [None if isinstance(answer, Exception) else answer for answer in pipe.execute(raise_on_error=False)]
+    since, beats = rest[: len(first)], rest[len(first) :]
+    ages = {place: age_of((when or b"").decode(errors="replace")) for place, when in zip(first, since, strict=True)}
+    pulses = {}
+    for i, name in enumerate(known):
+        if (beat := read_beat(beats[2 * i])) is not None:
+            age = max(0.0, lease_s - (beats[2 * i + 1] or 0) / 1000)
+            pulses[name.decode(errors="replace")] = WorkerPulse(beat.device, beat.state, age)
+    return QueueNow(
+        depth=dict(zip(places, lengths, strict=True)),
+        oldest_s={place: age for place, age in ages.items() if age is not None},
+        running=dict(zip(places, running, strict=True)),
+        workers=pulses,
+    )

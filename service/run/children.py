@@ -1,0 +1,125 @@
+"""One child process of `graspd up`: started, watched, started again with a growing pause, stopped."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+log = logging.getLogger(__name__)
+_FIRST_PAUSE_S: Final = 0.2
+_LONGEST_PAUSE_S: Final = 10.0
+#: A child that lived this long was well: the next restart is quick again [s].
+_WELL_AFTER_S: Final = 20.0
+
+
+@dataclass
+class Child:
+    """A process by its name and command. All calls come from one thread: the kernel ties a child to that thread."""
+
+    name: str
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    folder: Path
+    """Data folder: pid files go to `run/`, output to `logs/`."""
+    process: subprocess.Popen[bytes] | None = None
+    starts: int = 0
+    _started: float = 0.0
+    _pause: float = _FIRST_PAUSE_S
+    _not_before: float = field(default=0.0)
+
+    @property
+    def log_file(self) -> Path:
+        return self.folder / "logs" / f"{self.name}.log"
+
+    @property
+    def pid_file(self) -> Path:
+        return self.folder / "run" / f"{self.name}.pid"
+
+    def start(self) -> None:
+        """Start the process in a session of its own: Ctrl-C in the terminal is for the parent alone."""
+        for file in (self.log_file, self.pid_file):
+            file.parent.mkdir(parents=True, exist_ok=True)
+        with self.log_file.open("ab") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "service.run.launch", str(os.getpid()), *self.command],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **self.environment},
+                start_new_session=True,
+            )
+        self.pid_file.write_text(f"{self.process.pid}\n")
+        self.starts += 1
+        self._started = time.monotonic()
+
+    def watch(self) -> None:
+        """Start the process again if it ended; each time in a row after a longer pause."""
+        now = time.monotonic()
+        if self.process is not None:
+            code = self.process.poll()
+            if code is None:
+                return
+            if code == 0 or now - self._started > _WELL_AFTER_S:
+                self._pause = _FIRST_PAUSE_S
+            # A worker that has done enough ends by itself, with code 0.
+            level = logging.WARNING if code else logging.INFO
+            log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
+            self.process = None
+            self._not_before = now + self._pause
+            self._pause = min(_LONGEST_PAUSE_S, 2 * self._pause)
+        elif now >= self._not_before:
+            self.start()
+
+    def ask_to_stop(self) -> None:
+        """SIGTERM, if it runs."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+
+    def join(self, deadline: float) -> None:
+        """Wait until `time.monotonic` reaches the deadline, then kill."""
+        if self.process is not None:
+            try:
+                self.process.wait(timeout=max(0.05, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                log.warning("%s does not stop; it is killed", self.name)
+                self.process.kill()
+                self.process.wait()
+            self.process = None
+        self.pid_file.unlink(missing_ok=True)
+
+
+def end_leftovers(folder: Path) -> list[int]:
+    """Kill what the pid files of an earlier `graspd up` name, if it is still ours; returns the pids."""
+    ended = []
+    for file in (folder / "run").glob("*.pid"):
+        try:
+            pid = int(file.read_text())
+            if _is_ours(pid, folder):
+                os.kill(pid, signal.SIGKILL)
+                ended.append(pid)
+        except (ValueError, OSError):
+            pass
+        file.unlink(missing_ok=True)
+    return ended
+
+
+def _is_ours(pid: int, folder: Path) -> bool:
+    """A pid may belong to somebody else by now: the data folder must be in the process's environment or command."""
+    try:
+        found = [Path(f"/proc/{pid}/{part}").read_bytes() for part in ("environ", "cmdline")]
+    except FileNotFoundError:
+        listing = subprocess.run(["ps", "-E", "-o", "command=", "-p", str(pid)], capture_output=True, check=False)
+        found = [listing.stdout]
+    return any(os.fsencode(folder) in part for part in found)
+
+
+def _ended(code: int) -> str:
+    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

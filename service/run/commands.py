@@ -1,0 +1,173 @@
+"""Commands that run the service itself: up, keeper, index."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stderr, reporting_errors
+from service.model import names
+from service.model.errors import IndexDamaged, UnavailableError
+from service.settings import Settings
+
+app = typer.Typer(no_args_is_help=True)
+index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store.")
+app.add_typer(index_app, name="index")
+
+_READY_S = 60.0
+DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")]
+
+
+@app.command(epilog="graspd up --workers 2 --port 8000")
+@reporting_errors
+def up(
+    workers: Annotated[int, typer.Option(min=0, help="Worker processes on this machine.")] = 1,
+    host: Annotated[str | None, typer.Option(help="Address the API binds; GRASPD_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port of the API, 0: any; GRASPD_PORT.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device of the workers: cpu, cuda:0, auto; GRASPD_DEVICE.")] = None,
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """The whole service on this machine, until Ctrl-C."""
+    _check_rooms(workers)
+    from service.run.supervisor import Supervisor
+
+    settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
+    log_to_stderr(settings, "up")
+    keep_private(settings)
+    stop = stop_on_signals()
+    console = Console(stderr=True)
+    supervisor = Supervisor(settings, workers=workers)
+    supervisor.start()
+    try:
+        supervisor.wait_ready(_READY_S)
+        where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
+        console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
+        if json:
+            emit({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
+        stop.wait()
+        console.print("stopping ...")
+    finally:
+        supervisor.stop()
+
+
+@app.command(epilog="graspd keeper")
+@reporting_errors
+def keeper(
+    check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Reaper, delayed retries and indexer. One runs in a service; `graspd up` starts it."""
+    settings = load_settings(data_dir=data_dir)
+    log_to_stderr(settings, "keeper")
+    keep_private(settings)
+    if check:
+        check_keeper(settings)
+        return
+    from service.pipeline.backends import Parts
+    from service.pipeline.keeper import Keeper
+
+    stop = stop_on_signals()
+    parts = Parts.open(settings)
+    try:
+        Keeper(parts).run(stop)
+    finally:
+        parts.close()
+
+
+@index_app.command(epilog="graspd index rebuild --check")
+@reporting_errors
+def rebuild(
+    check: Annotated[bool, typer.Option("--check", help="Change nothing; print what would change.")] = False,
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """Make the rows of the index anew from the store. With --check exit code 1: they differ, or a shard is damaged."""
+    from service.index.index import Index
+    from service.index.rebuild import differences
+    from service.index.rebuild import rebuild as make
+    from service.pipeline.scrub import scan
+    from service.store.store import open_store
+
+    settings = load_settings(data_dir=data_dir)
+    store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
+    try:
+        found = differences(index, store)
+        if check:
+            found += [f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS) if wrong is not None]
+        counts: dict[str, int] = {} if check else make(index, store)
+    except IndexDamaged:
+        if check:
+            raise
+        found, counts = ["the file of the index was damaged; a new one took its place"], make(index, store)
+    if json:
+        emit({"differences": found, "changed": bool(found) and not check, **counts})
+    else:
+        for line in found:
+            typer.echo(line)
+        typer.echo("the index is what the store says" if not found else f"{len(found)} differences", err=True)
+    index.close()
+    if check and found:
+        raise typer.Exit(1)
+
+
+@index_app.command(epilog="graspd index downgrade 0003")
+@reporting_errors
+def downgrade(
+    revision: Annotated[str, typer.Argument(help="Revision of the older graspd: the newest of its migrations.")],
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take the index back to an earlier schema, before an older graspd is installed. Stop the service first."""
+    from service.index.database import downgrade as take_back
+
+    take_back(load_settings(data_dir=data_dir).resolved_index_url, revision)
+    if json:
+        emit({"revision": revision})
+    else:
+        typer.echo(f"the index has revision {revision}; the next start of this graspd would bring it forward again")
+
+
+@index_app.command(epilog="graspd index path")
+@reporting_errors
+def path(data_dir: DataDir = None) -> None:
+    """Print where the index is; a password in the URL is left out."""
+    from sqlalchemy import make_url
+
+    typer.echo(make_url(load_settings(data_dir=data_dir).resolved_index_url).render_as_string(hide_password=True))
+
+
+def _check_rooms(workers: int) -> None:
+    """UnavailableError if a room that the children are of is not installed."""
+    needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
+    if any(find_spec(library) is None for library in needed):
+        raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
+
+
+def check_keeper(settings: Settings) -> None:
+    """UnavailableError if no keeper gave a sign of life lately."""
+    from service.pipeline.keeper import PART
+    from service.queue.rq_queue import open_queue
+
+    queue = open_queue(settings, patience=0)
+    try:
+        if not queue.announced(PART):
+            raise UnavailableError("no keeper gave a sign of life lately; start `graspd keeper`")
+    finally:
+        queue.close()
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that SIGINT and SIGTERM set."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Not set in the handler itself: it may interrupt the very `wait` whose lock `set` needs.
+        signal.signal(number, lambda *_: threading.Thread(target=stop.set, daemon=True).start())
+    return stop

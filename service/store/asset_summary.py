@@ -1,0 +1,90 @@
+"""What a check found, in lines for people: sizes, what was guessed. Messages tell the repairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import typer
+
+from service.model.domain import AssetKind
+
+#: Rounding moves a surface so far; it is no news [m].
+_NOTHING_M = 1e-7
+_OVERRIDES = {
+    "palm": "--palm LINK --approach x,y,z",
+    "preshape": "--pre-shape JOINT=VALUE,...",
+}
+
+
+def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
+    """Print a check's report; a refusal goes to stderr in one line."""
+    if report["verdict"] == "refuse":
+        typer.echo(f"graspd: refused: {report['message']}", err=True)
+        return
+    typer.echo(f"{report['verdict']}: {report['message']}")
+    for line in summary(kind, report["facts"]):
+        typer.echo(f"  {line}")
+
+
+def verdict_line(asset: Mapping[str, Any]) -> str:
+    """An asset of a list in one line."""
+    return f"{asset['verdict'] or 'waiting':<8} {asset['message'] or asset['name']}"
+
+
+def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
+    """Lines of a label and what it holds; a fact that is not there is left out."""
+    pairs = _hand(facts) if kind is AssetKind.HAND else _object(facts)
+    return [f"{label:<18} {text}" for label, text in pairs]
+
+
+def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    guessed = facts.get("guessed", [])
+    lines: list[tuple[str, str]] = []
+    if "palm_centre" in facts:
+        lines.append(("palm", f"{facts.get('root', '')} at {_vector(facts['palm_centre'], 1e3)} mm"))
+        lines.append(("approach", _vector(facts["palm_approach"])))
+    if "fingertips" in facts:
+        lines.append(("fingertips", ", ".join(facts["fingertips"])))
+    if "dofs" in facts:
+        lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
+        lines += [("", _dof(name, facts)) for name in facts["dofs"]]
+    mend = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES]
+    if guessed:
+        lines.append(("guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(mend) if mend else ''}"))
+    return lines
+
+
+def _dof(name: str, facts: Mapping[str, Any]) -> str:
+    limits = f"{_angle(facts['lower'][name])} .. {_angle(facts['upper'][name])}"
+    closing = {1: "closes +", -1: "closes -", 0: "spreads"}[facts["closing"][name]]
+    return f"{name:<32} {limits:<18} {closing:<9} pre-shape {_angle(facts['preshape'][name])}"
+
+
+def _object(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    lines: list[tuple[str, str]] = []
+    if "extents_m" in facts:
+        lines.append(("size", f"{_vector(facts['extents_m'], 1e3)} mm, read as {facts.get('units', 'm')}"))
+    if "prepared_faces" in facts:
+        lines.append(
+            (
+                "mesh",
+                f"{facts['faces']} faces, simplified to {facts['prepared_faces']}; "
+                f"largest surface deviation {1e3 * facts['deviation_m']:.2f} mm",
+            )
+        )
+    if (moved := facts.get("repair_deviation_m")) is not None and moved > _NOTHING_M:
+        lines.append(("repaired", f"surface moved by at most {1e3 * moved:.2g} mm"))
+    if "volume_m3" in facts:
+        mass = facts.get("mass_kg")
+        lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg" if mass else "")))
+    return lines
+
+
+def _vector(values: Sequence[float], scale: float = 1.0) -> str:
+    return "(" + ", ".join(f"{scale * value:.4g}" for value in values) + ")"
+
+
+def _angle(value: float) -> str:
+    return "0" if math.isclose(value, 0, abs_tol=5e-4) else f"{value:.2f}"

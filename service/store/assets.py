@@ -1,0 +1,259 @@
+"""Hands and objects as the service keeps them: immutable archives in the store, and the built-in ones on disk.
+
+An archive is a ZIP made reproducibly: names sorted, fixed time stamps, no compression of attributes that vary.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import shutil
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path, PurePosixPath
+from typing import IO, Final, Self
+
+from service.model.digests import StreamedFiles, digest_bytes, digest_files
+from service.model.domain import Asset, AssetKind
+from service.model.errors import InputError, LimitError, NotFoundError
+from service.store.descriptions import MAX_BYTES, parse_description
+
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+#: The built-in assets carry the release's date, so that publishing them twice writes the same manifest.
+_BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
+MAX_FILES: Final = 2000
+#: Of one name, and of all together: they stand in every list of hands or objects.
+MAX_NAME: Final = 255
+MAX_NAMES: Final = 128 << 10
+#: A small archive may unpack to much more: robot meshes compress about four to one, so this refuses only bombs.
+UNPACK_FACTOR: Final = 8
+_PIECE_BYTES: Final = 1 << 16
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """ZIP of named files; equal files give equal bytes."""
+    buffer = io.BytesIO()
+    pack_into(files, buffer)
+    return buffer.getvalue()
+
+
+def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
+    """Write that ZIP into a file, piece by piece where the files are not in memory."""
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(check_path(name), _EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            if isinstance(files, StreamedFiles):
+                with files.open(name) as source, archive.open(entry, "w") as packed:
+                    shutil.copyfileobj(source, packed, _PIECE_BYTES)
+            else:
+                archive.writestr(entry, files[name])
+
+
+def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
+    """Files of a ZIP in memory; nothing is ever written where a name in the archive says.
+
+    Raises:
+        InputError: not a ZIP, encrypted, or a name that leaves the archive.
+        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
+    """
+    archive = _open_zip(io.BytesIO(data))
+    files: dict[str, bytes] = {}
+    total = 0
+    for name, entry in _entries(archive).items():
+        content = _read_entry(archive, entry, limit_bytes - total + 1)
+        total += len(content)
+        if total > limit_bytes:
+            raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
+        files[name] = content
+    return files
+
+
+class ZipFiles(StreamedFiles):
+    """Files of a ZIP that lies in a file, unpacked piece by piece when they are asked for; others may be added.
+
+    It was unpacked once before, to count and to digest what is really in it.
+
+    Raises:
+        InputError: not a ZIP, encrypted, damaged, or a name that leaves the archive.
+        LimitError: more than `limit_bytes` unpacked, or more than `MAX_FILES` files.
+    """
+
+    def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
+        self._archive = _open_zip(file)
+        self._found = _entries(self._archive)
+        self._added: dict[str, bytes] = {}
+        self._known: dict[str, tuple[int, str]] = {}
+        left = limit_bytes
+        for name, entry in self._found.items():
+            size, digest = _measure_entry(self._archive, entry, left + 1)
+            left -= size
+            if left < 0:
+                raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
+            self._known[name] = (size, digest)
+
+    def without_common_folder(self) -> Self:
+        """A folder zipped whole has its own name before every file: take it off."""
+        tops = {name.partition("/")[0] for name in self._found}
+        if len(tops) == 1 and all("/" in name for name in self._found):
+            self._found = {name.partition("/")[2]: entry for name, entry in self._found.items()}
+            self._known = {name.partition("/")[2]: facts for name, facts in self._known.items()}
+        return self
+
+    def digest(self, name: str) -> str:
+        return digest_bytes(self._added[name]) if name in self._added else self._known[name][1]
+
+    def size(self, name: str) -> int:
+        return len(self._added[name]) if name in self._added else self._known[name][0]
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[IO[bytes]]:
+        if name in self._added:
+            yield io.BytesIO(self._added[name])
+            return
+        with _damage_said(self._found[name]), self._archive.open(self._found[name]) as stream:
+            yield stream
+
+    def __getitem__(self, name: str) -> bytes:
+        with self.open(name) as stream:
+            return stream.read()
+
+    def __setitem__(self, name: str, data: bytes) -> None:
+        self._added[name] = data
+
+    def __delitem__(self, name: str) -> None:
+        del self._added[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._found, **self._added})
+
+    def __len__(self) -> int:
+        return len(self._found.keys() | self._added.keys())
+
+
+def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(file)
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        raise InputError("the archive is not a readable ZIP file; zip the folder again") from None
+
+
+def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The files of an archive by their plain names, once all of them can be taken."""
+    entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+    if len(entries) > MAX_FILES:
+        raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
+    found = {}
+    for entry in entries:
+        name = check_path(entry.filename)
+        if (entry.external_attr >> 16) & 0o170000 == 0o120000:
+            raise InputError(f"the archive entry {name!r} is a symbolic link; pack the file itself")
+        if entry.flag_bits & 1:
+            raise InputError(f"the archive entry {name!r} is encrypted; pack it without a password")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            # Others may ask for gigabytes of memory before the first byte.
+            raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
+        found[name] = entry
+    if sum(map(len, found)) > MAX_NAMES:
+        raise LimitError(f"the names of the files in the archive take more than {MAX_NAMES} characters")
+    return found
+
+
+def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> bytes:
+    """At most `limit` bytes of an entry, whatever its header says."""
+    with _damage_said(entry), archive.open(entry) as stream:
+        return stream.read(limit)
+
+
+def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
+    """Bytes of an entry, counted up to `limit`, and their digest; holds a piece of it at a time."""
+    count, digest = 0, hashlib.sha256()
+    with _damage_said(entry), archive.open(entry) as stream:
+        while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):
+            count += len(piece)
+            digest.update(piece)
+    return count, digest.hexdigest()[:32]
+
+
+@contextmanager
+def _damage_said(entry: zipfile.ZipInfo) -> Iterator[None]:
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError):
+        raise InputError(f"the archive entry {entry.filename!r} is damaged; zip the folder again") from None
+
+
+def check_path(name: str) -> str:
+    """The name itself, if it stays inside its folder; InputError otherwise."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    if len(name) > MAX_NAME:
+        raise InputError(f"the file name {name[:40]!r}... is longer than {MAX_NAME} characters; take a shorter one")
+    if not name or path.is_absolute() or ".." in path.parts or ":" in name or "\0" in name:
+        raise InputError(f"the file name {name!r} leaves its folder; use plain relative names")
+    return str(path)
+
+
+def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
+    """Files of a built-in hand (`asset.json`, URDF) or object (`asset.json`, mesh).
+
+    Raises:
+        NotFoundError: no such built-in.
+    """
+    folder = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s" / name
+    if not (folder / "asset.json").is_file():
+        known = ", ".join(builtin_names(kind))
+        raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {known}")
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def builtin_model(kind: AssetKind, name: str) -> bytes:
+    """Binary glTF of a built-in hand or object, as `python -m worker.stages.models` wrote it."""
+    return (Path(str(resources.files("service"))) / "builtin" / "models" / f"{kind.value}-{name}.glb").read_bytes()
+
+
+def builtin_names(kind: AssetKind) -> tuple[str, ...]:
+    """Names of the built-in hands or objects."""
+    root = Path(str(resources.files("service"))) / "builtin" / f"{kind.value}s"
+    return tuple(sorted(path.parent.name for path in root.glob("*/asset.json")))
+
+
+def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
+    """The asset record of a set of files with an `asset.json` that names the main file under `file`.
+
+    `asset.json` of a hand may also hold palm, approach, preshape, couplings, ...; of an object units and density.
+    """
+    described = parse_description(asset_json(files), f"{kind.value} {name!r}")
+    main = described.file
+    if main not in files:
+        raise InputError(f"{kind.value} {name!r}: the main file {main!r} is not among its files")
+    return Asset(
+        kind=kind,
+        name=name,
+        digest=digest_files(kind, files),
+        filename=main,
+        files=tuple(sorted(files)),
+        size_bytes=sum(files.size(name) if isinstance(files, StreamedFiles) else len(files[name]) for name in files),
+        created=created,
+        builtin=builtin,
+        facts=described.facts,
+    )
+
+
+def asset_json(files: Mapping[str, bytes]) -> bytes:
+    """`asset.json` among the files; InputError if it is not there, or too large to be read at all."""
+    if "asset.json" not in files:
+        raise InputError("asset.json, a JSON object that names the main file, is not among the files")
+    if isinstance(files, StreamedFiles) and files.size("asset.json") > MAX_BYTES:
+        raise InputError(f"asset.json has more than {MAX_BYTES} bytes; leave out what is not needed")
+    return files["asset.json"]
+
+
+def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:
+    """A built-in hand or object with its files."""
+    files = builtin_files(kind, name)
+    return describe(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files

@@ -1,0 +1,53 @@
+"""Records of what users deleted: a record is the fact, the rest follows."""
+
+from __future__ import annotations
+
+import re
+from typing import Final, Literal
+
+from pydantic import Field
+
+from service.model import names
+from service.model.errors import ConflictError
+from service.model.records import JobRecord, Record
+from service.store.store import Store
+
+_DIGITS: Final = re.compile(r"\D")
+What = Literal["hand", "object", "job", "dataset"]
+
+
+class Deletion(Record):
+    """One thing that is gone, and what its removal needs to know once its own record is gone too."""
+
+    version: Literal[1] = 1
+    what: What
+    id: str
+    at: str
+    owner: str = Field("", description="id of the API key that deleted it")
+    job: JobRecord | None = None
+    attempts: tuple[tuple[str, int], ...] = ()
+
+
+class Released(Record):
+    """A job that was deleted: its shards go when nobody has needed them for the grace time."""
+
+    version: Literal[1] = 1
+    at: str
+    job: JobRecord
+
+
+def pending(store: Store) -> set[tuple[str, str]]:
+    """Kind and id of all that is gone but still has objects in the store."""
+    keys = [entry.key.split("/") for entry in store.list(names.DELETIONS)]
+    return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
+
+
+def refuse_pending(store: Store, what: str, name: str) -> None:
+    """ConflictError while a thing of this id is being removed: what is new would be removed with it."""
+    if store.exists(names.deletion(what, name)):
+        raise ConflictError(f"the {what} {name} of before is still being removed; try again in a moment")
+
+
+def released_key(deletion: Deletion) -> str:
+    """Where a deleted job's shards are remembered; the same deletion, carried out again, has the same."""
+    return f"{names.RELEASED}/{_DIGITS.sub('', deletion.at)}-{deletion.id}.json"

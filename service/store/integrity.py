@@ -1,0 +1,146 @@
+"""Whether bytes are what their checksum says: of objects in a store, and of shards in a folder on this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import threading
+import time
+from collections import OrderedDict
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+from service.model.errors import DamagedShard, NotFoundError
+from service.store.store import Stamp, Store
+
+#: Lists of checksums that exports and cards write, looked for in the folder of a shard and in the two above it.
+CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
+_DIGEST: Final = re.compile(r"[0-9a-f]{64}")
+_LEVELS: Final = 3
+_MEND: Final = "`graspd store verify --repair` makes it again where that is possible"
+#: Bits may rot without a new time of change, so that what was found intact is not believed for ever [s].
+_BELIEVED_S: Final = 3600.0
+_REMEMBERED: Final = 100_000
+
+
+def read_checked(store: Store, key: str, sha256: str) -> bytes:
+    """All bytes of an object that was put with this checksum.
+
+    Raises:
+        DamagedShard: it is gone, or has another checksum.
+        StoreUnavailable: the store does not answer.
+    """
+    try:
+        data = store.get(key)
+    except NotFoundError:
+        raise gone(key) from None
+    check_digest(key, hashlib.sha256(data).hexdigest(), sha256)
+    return data
+
+
+def check_digest(name: str, found: str, expected: str) -> None:
+    """DamagedShard, with the shard's name, where the checksums differ."""
+    if found != expected:
+        raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {_MEND}")
+
+
+def gone(key: str) -> DamagedShard:
+    """The error of a shard with a manifest and no file."""
+    return DamagedShard(f"{key} is gone from the store, and its manifest is there; {_MEND}")
+
+
+class Checked:
+    """Remembers which objects were found intact while their size, tag and time of change stay. Safe between threads."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._known: OrderedDict[tuple[str, str], tuple[Stamp, float]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def check(self, key: str, sha256: str) -> None:
+        """Read an object through, unless that was done lately.
+
+        Raises:
+            DamagedShard: it is gone, or has another checksum.
+            StoreUnavailable: the store does not answer.
+        """
+        try:
+            stamp = self._store.stamp(key)
+            with self._lock:
+                known, until = self._known.get((key, sha256), (None, 0.0))
+            if known == stamp and time.monotonic() < until:
+                return
+            digest = hashlib.sha256()
+            for chunk in self._store.stream(key):
+                digest.update(chunk)
+        except NotFoundError:
+            raise gone(key) from None
+        check_digest(key, digest.hexdigest(), sha256)
+        with self._lock:
+            self._known[key, sha256] = (stamp, time.monotonic() + _BELIEVED_S)
+            if len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
+
+
+def check_file(path: Path) -> None:
+    """Check a shard in a folder against the manifest or the list of checksums that lies there, if one does.
+
+    What was found intact is not read again by this process while its size and time of change stay.
+
+    Raises:
+        DamagedShard: it is not what the checksum says.
+    """
+    if _known.get(path) != _file_stamp(path):
+        check_content(path, _expected(path))
+
+
+def check_content(path: Path, sha256: str | None) -> None:
+    """The same with a checksum that the caller knows; None: nothing says what the file should be."""
+    stamp = _file_stamp(path)
+    if _known.get(path) == stamp:
+        return
+    if sha256 is not None:
+        with path.open("rb") as file:
+            check_digest(str(path), hashlib.file_digest(file, "sha256").hexdigest(), sha256)
+    if len(_known) >= _REMEMBERED:
+        _known.clear()
+    _known[path] = stamp
+
+
+_known: dict[Path, tuple[int, int, int]] = {}
+
+
+def _file_stamp(path: Path) -> tuple[int, int, int]:
+    facts = path.stat()
+    return facts.st_size, facts.st_mtime_ns, facts.st_ino
+
+
+def _expected(path: Path) -> str | None:
+    path = path.absolute()
+    if (digest := _of_manifest(path)) is not None:
+        return digest
+    for folder in list(path.parents)[:_LEVELS]:
+        for name in CHECKSUM_LISTS:
+            sums = folder / name
+            if sums.is_file() and (digest := _listed(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(folder)))):
+                return digest
+    return None
+
+
+def _of_manifest(path: Path) -> str | None:
+    """What the manifest beside a file says, as in the store's own folder."""
+    try:
+        said = json.loads(path.with_suffix(".json").read_bytes())
+        digest = said["sha256"] if str(said["key"]).endswith(f"/{path.name}") else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return digest if isinstance(digest, str) and _DIGEST.fullmatch(digest) else None
+
+
+@lru_cache(maxsize=8)
+def _listed(sums: Path, _changed: int) -> dict[str, str]:
+    """Digests by name of a list as `sha256sum` writes it."""
+    lines = (line.split(maxsplit=1) for line in sums.read_text(errors="replace").splitlines())
+    return {parts[1].removeprefix("*"): parts[0] for parts in lines if len(parts) == 2 and _DIGEST.fullmatch(parts[0])}

@@ -1,0 +1,147 @@
+"""Hands and objects in the store: publish, load, and the names they go by."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+from collections.abc import Mapping
+from typing import Final
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.digests import digest_files
+from service.model.domain import Asset, AssetKind
+from service.model.errors import ConflictError, DamagedError, InputError
+from service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
+from service.store.records import read_record
+from service.store.store import Store
+
+log = logging.getLogger(__name__)
+#: An archive the service packed itself is bounded by the upload limit; this only stops a store that was tampered with.
+UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
+
+
+def publish_asset(
+    store: Store,
+    kind: AssetKind,
+    name: str,
+    files: Mapping[str, bytes],
+    *,
+    builtin: bool = False,
+    created: str = "",
+    owner: str = "",
+) -> Asset:
+    """Put a hand or object into the store: the archive first, its record last. Doing it twice changes nothing.
+
+    Args:
+        files: `asset.json` (names the main file) and all files it needs.
+        owner: id of the API key that uploads it.
+
+    Raises:
+        InputError: `asset.json` is missing or wrong.
+        ConflictError: the same content is known under another name.
+    """
+    return record_asset(store, store_files(store, kind, name, files, builtin=builtin, created=created, owner=owner))
+
+
+def store_files(
+    store: Store,
+    kind: AssetKind,
+    name: str,
+    files: Mapping[str, bytes],
+    *,
+    builtin: bool = False,
+    created: str = "",
+    owner: str = "",
+) -> Asset:
+    """The first half of `publish_asset`: the archive is there, and nothing counts it yet.
+
+    Raises:
+        InputError: `asset.json` is missing or wrong.
+    """
+    asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
+    asset = asset.model_copy(update={"owner": owner})
+    with tempfile.TemporaryFile() as archive:
+        pack_into(files, archive)
+        store.put_file(names.asset_files(kind, asset.digest), archive)
+    return asset
+
+
+def record_asset(store: Store, asset: Asset) -> Asset:
+    """The second half of `publish_asset`: the record, from which on the asset counts.
+
+    Raises:
+        ConflictError: the same content is known under another name, or is being removed.
+    """
+    record = names.asset_record(asset.kind, asset.digest)
+    new = store.put(record, asset.model_dump_json().encode())
+    if store.exists(names.deletion(asset.kind.value, asset.digest)):
+        if new:
+            store.delete(record)
+        raise ConflictError(f"the same {asset.kind.value} of before is still being removed; try again in a moment")
+    if new:
+        return asset
+    known = load_asset(store, asset.kind, asset.digest)
+    if known.name != asset.name:
+        raise ConflictError(f"this {asset.kind.value} is already known as {known.name!r}; use that name")
+    return known
+
+
+def publish_builtins(store: Store) -> list[Asset]:
+    """Put the hands and objects that come with graspd into the store."""
+    published = []
+    for kind in AssetKind:
+        for name in builtin_names(kind):
+            asset, files = builtin_asset(kind, name)
+            try:
+                published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
+            except DamagedError as error:
+                log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
+            store.put(names.asset_model(kind, asset.digest), builtin_model(kind, name))
+    return published
+
+
+def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
+    """Kind and digest of every hand and object in the store, but for those that were deleted."""
+    records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
+    gone = {entry.key for entry in store.list(names.DELETIONS)}
+    # Other files of an asset may lie deeper, such as an object's convex pieces.
+    found = [key for key in records if len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json"]
+    return [(AssetKind(key[1]), key[2]) for key in found if names.deletion(key[1], key[2]) not in gone]
+
+
+def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
+    """The record of a hand or object; NotFoundError if there is none, DamagedError if it is not what its name says."""
+    return read_record(Asset, store, names.asset_record(kind, digest))
+
+
+def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
+    """All files of a hand or object, checked against its digest.
+
+    Raises:
+        NotFoundError: no such asset.
+        InputError: the archive in the store is not what its name says.
+    """
+    files = unpack(store.get(names.asset_files(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
+    if digest_files(kind, files) != digest:
+        raise InputError(f"the archive of {kind.value} {digest} in the store is damaged; upload it again")
+    return files
+
+
+def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
+    """What ingest found (`verdict`, `message`, `repairs`, `facts`); None while it has not run.
+
+    Raises:
+        DamagedError: the record is not what its name says.
+    """
+    key = names.asset_check(kind, digest)
+    if not store.exists(key):
+        return None
+    try:
+        found: dict[str, object] = json.loads(store.get(key))
+        if found["verdict"] in ("accept", "repair", "refuse"):
+            return found
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise DamagedError(f"the record {key} in the store is damaged; remove it, and the {kind.value} is checked again")

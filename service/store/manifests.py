@@ -1,0 +1,238 @@
+"""The manifest of a shard: put last, create-only, and all the index needs to know of it."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import Digest, JobRequest, Stage, TaskMessage
+from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
+from service.store import standing
+from service.store.integrity import read_checked
+from service.store.records import put_record, read_record
+from service.store.shards import SCHEMAS, Shard, ShardKind, read_shard
+from service.store.store import Store
+
+#: Contact threshold at which the sweep's metrics enter the index [m]: the widest that the literature reports.
+INDEX_THRESHOLD_M: Final = 0.005
+
+_SWEPT: Final = {
+    "epsilon": "quality/epsilon",
+    "wrench_volume": "quality/wrench_volume",
+    "contact_area_cm2": "quality/contact_area_cm2",
+}
+_PLAIN: Final = {
+    "intersection_volume_cm3": "quality/intersection_volume_cm3",
+    "penetration_depth_mm": "quality/penetration_depth_mm",
+    "self_penetration_depth_mm": "quality/self_penetration_depth_mm",
+    "stability_loss": "quality/stability_loss",
+}
+#: The same for columns that a shard may lack.
+_OPTIONAL: Final = {"robustness": "quality/robustness"}
+
+
+class GraspSummary(BaseModel):
+    """The quality of one grasp, in the units of the shard's columns; None where the shard says nan."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    epsilon: float | None = None
+    wrench_volume: float | None = None
+    contact_area_cm2: float | None = None
+    intersection_volume_cm3: float | None = None
+    penetration_depth_mm: float | None = None
+    self_penetration_depth_mm: float | None = None
+    stability_loss: float | None = None
+    contact_links: int | None = None
+    valid: bool
+    success: bool | None = None
+    verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
+    robustness: float | None = None
+
+
+class ShardManifest(BaseModel):
+    """What a shard is made of and what is in it."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    version: Literal[1] = 1
+    shard_id: Digest
+    stage: Stage
+    kind: ShardKind
+    key: str
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    size_bytes: int = Field(gt=0)
+    counts: dict[str, int] = Field(description="lengths of the shard's axes: N grasps, S scenes, K pairs, V views, ...")
+    hand: str
+    object: str
+    hand_digest: Digest
+    object_digest: Digest
+    request: JobRequest
+    seed: int
+    batch: int
+    inputs: tuple[str, ...]
+    code_version: str
+    stage_revision: int
+    shard_schema: str
+    created: str
+    device: str
+    seconds: float
+    worker: str
+    valid: int = Field(0, description="rows that passed their stage's gate")
+    tried: int = Field(0, ge=0, description="grasps planned for this base shard, kept or not")
+    audited: int = Field(0, ge=0, description="certified grasps that were tested again by the letter")
+    audit_held: int = Field(0, ge=0, description="of these, grasps that held")
+    index_threshold_m: float | None = None
+    grasps: tuple[GraspSummary, ...] = ()
+    info: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tried_what_it_holds(cls, data: Any) -> Any:
+        # Before a shard could hold valid grasps alone, it held every grasp that was tried.
+        if isinstance(data, dict) and "tried" not in data and data.get("kind") == "base":
+            return {**data, "tried": data.get("counts", {}).get("N", 0)}
+        return data
+
+    @model_validator(mode="after")
+    def _one_summary_a_grasp(self) -> ShardManifest:
+        if self.stage is Stage.SYNTHESIZE and len(self.grasps) != self.counts.get("N"):
+            raise ValueError("a base shard's manifest sums up each of its grasps")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Rows that matter to a reader: grasps, transferred grasps or pictures."""
+        return self.counts.get({"base": "N", "scene": "K", "views": "V"}[self.kind], 0)
+
+
+def manifest_of(
+    message: TaskMessage,
+    data: bytes,
+    arrays: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, Any],
+    counts: Mapping[str, int],
+    *,
+    device: str,
+    seconds: float,
+    worker: str,
+    info: Mapping[str, Any] | None = None,
+) -> ShardManifest:
+    """The manifest of a shard that a task made; `arrays`, `attributes` and `counts` are the shard's columns, root
+    attributes and axis lengths."""
+    kind = names.SHARD_KINDS[message.stage]
+    return ShardManifest(
+        shard_id=message.output,
+        stage=message.stage,
+        kind=kind,
+        key=names.shard_file(message.stage, message.output),
+        sha256=hashlib.sha256(data).hexdigest(),
+        size_bytes=len(data),
+        counts=dict(counts),
+        hand=message.request.hand,
+        object=message.request.object,
+        hand_digest=message.hand_digest,
+        object_digest=message.object_digest,
+        request=message.request,
+        seed=message.request.seed,
+        batch=message.batch,
+        inputs=message.inputs,
+        code_version=PACKAGE_VERSION,
+        stage_revision=STAGE_REVISIONS[message.stage],
+        shard_schema=f"graspd/{kind}@1",
+        created=str(attributes.get("created") or timestamp()),
+        device=device,
+        seconds=round(seconds, 4),
+        worker=worker,
+        info=dict(info or {}),
+        **_contents(kind, arrays, attributes),
+    )
+
+
+def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The manifest's fields that follow from the shard's own columns and attributes."""
+    valid = standing.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
+    fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
+    if kind == "base":
+        audit = arrays.get("quality/audit", np.empty(0, np.int8))
+        fields["index_threshold_m"], fields["grasps"] = summarise(arrays, attributes)
+        fields["tried"] = int(attributes.get("tried", len(arrays["quality/valid"])))
+        fields["audited"], fields["audit_held"] = int(np.count_nonzero(audit >= 0)), int(np.count_nonzero(audit == 1))
+    return fields
+
+
+def summarise(
+    arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any] | None = None
+) -> tuple[float, tuple[GraspSummary, ...]]:
+    """The contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
+    thresholds = np.asarray(arrays["quality/thresholds_m"], float)
+    at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
+    count = len(arrays["quality/valid"])
+    columns: dict[str, list[Any]] = {name: _numbers(arrays[path][:, at]) for name, path in _SWEPT.items()}
+    columns |= {name: _numbers(arrays[path]) for name, path in _PLAIN.items()}
+    columns |= {name: _numbers(arrays[path]) for name, path in _OPTIONAL.items() if path in arrays}
+    columns["contact_links"] = [int(v) for v in arrays["quality/contact_links"]]
+    columns["valid"] = standing.valid(arrays).tolist()
+    columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
+    level = (attributes or {}).get("verdict_level")
+    columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
+    rows = zip(*columns.values(), strict=True)
+    return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)
+
+
+def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
+    """Put a shard, its manifest last. False if the shard was there already: that is success too.
+
+    Where two workers raced, or one died between the two puts, the file is another run's: the manifest then describes
+    the bytes that are in the store, not those at hand.
+    """
+    if not store.put(manifest.key, data):
+        manifest = _describing(manifest, store.get(manifest.key))
+    return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
+
+
+def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
+    """The manifest of a shard; NotFoundError while there is no such shard."""
+    return read_record(ShardManifest, store, names.shard_manifest(stage, shard))
+
+
+def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
+    """A finished shard, checked against its manifest.
+
+    Raises:
+        NotFoundError: there is no such shard.
+        DamagedShard: its file is gone, or not what the manifest says.
+    """
+    manifest = load_manifest(store, stage, shard)
+    return read_shard(read_checked(store, manifest.key, manifest.sha256), kind=manifest.kind, name=manifest.key)
+
+
+def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
+    return store.exists(names.shard_manifest(stage, shard))
+
+
+def _describing(manifest: ShardManifest, data: bytes) -> ShardManifest:
+    pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
+    shard = read_shard(data, without=pictures, name=manifest.key)
+    update = {
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "size_bytes": len(data),
+        **_contents(manifest.kind, shard.arrays, shard.attributes),
+    }
+    return manifest.model_copy(update=update)
+
+
+def _numbers(values: NDArray[Any]) -> list[float | None]:
+    return [float(v) if math.isfinite(v) else None for v in values]
+
+
+def _verdict(value: int) -> bool | None:
+    return None if value < 0 else bool(value)

@@ -1,0 +1,269 @@
+"""The object store: create-only puts of immutable objects, on a local folder, S3, Google Cloud, Azure, or memory.
+
+Only what every back end offers is used: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import random
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import IO, Any, Final
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.exceptions import AlreadyExistsError, BaseError
+from obstore.store import LocalStore, MemoryStore, from_url
+
+from service.model.errors import InputError, NotFoundError, StoreUnavailable
+
+_KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
+_PROBE: Final = "health/probe"
+_STREAM_BYTES: Final = 1 << 20
+#: A request that fails is tried again this often by the client; the task's own back-off takes over after that.
+_REMOTE: Final[dict[str, Any]] = {
+    "client_options": {"timeout": timedelta(seconds=120), "connect_timeout": timedelta(seconds=5)},
+    "retry_config": {"max_retries": 3, "retry_timeout": timedelta(seconds=30)},
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An object in a listing."""
+
+    key: str
+    size: int
+
+
+#: Size, time of the last change and, where the store has one, tag of an object: it stays while the object does.
+Stamp = tuple[int, str, str]
+
+
+class Store:
+    """Objects by key. Every method raises StoreUnavailable where the store does not answer."""
+
+    def __init__(self, backend: Any, url: str, *, signer: Any = None) -> None:
+        """`signer` is the same store as clients reach it; None where they do not."""
+        self._backend = backend
+        self._signer = signer
+        self.url = url
+        self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
+
+    def put(self, key: str, data: bytes) -> bool:
+        """Write an object if there is none of this name; all of it is there, or nothing.
+
+        Returns:
+            True if it was written, False if the name was taken (for content-addressed names: the same bytes).
+        """
+        return self.put_file(key, io.BytesIO(data))
+
+    def put_file(self, key: str, file: IO[bytes]) -> bool:
+        """The same from an open file, which a local store copies piece by piece."""
+        check_key(key)
+        file.seek(0)
+        with _mapped(key, self.url):
+            if self._root is not None:
+                return _put_local(self._root, key, file)
+            try:
+                obstore.put(self._backend, key, file.read(), mode="create")
+            except AlreadyExistsError:
+                return False
+            return True
+
+    def delete(self, key: str) -> None:
+        """Remove an object; nothing happens if there is none. Only the keeper does this, to what a user took away."""
+        try:
+            with _mapped(key, self.url):
+                obstore.delete(self._backend, check_key(key))
+        except NotFoundError:
+            return
+
+    def get(self, key: str) -> bytes:
+        """All bytes of an object; NotFoundError if there is none."""
+        with _mapped(key, self.url):
+            return bytes(obstore.get(self._backend, check_key(key)).bytes())
+
+    def get_range(self, key: str, start: int, length: int) -> bytes:
+        """`length` bytes from offset `start`; NotFoundError if there is no such object."""
+        with _mapped(key, self.url):
+            return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
+
+    def stream(self, key: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
+        """Chunks of an object from `start` on; never holds more than one chunk."""
+        end = self.size(key) if length is None else start + length
+        while start < end:
+            chunk = self.get_range(key, start, min(_STREAM_BYTES, end - start))
+            start += len(chunk)
+            yield chunk
+
+    def size(self, key: str) -> int:
+        """Bytes of an object; NotFoundError if there is none."""
+        with _mapped(key, self.url):
+            return int(obstore.head(self._backend, check_key(key))["size"])
+
+    def set_aside(self, key: str) -> None:
+        """Move a damaged object below `damaged/`, so that its name is free; one that is gone is no error."""
+        try:
+            with _mapped(key, self.url):
+                obstore.rename(self._backend, check_key(key), f"damaged/{key}", overwrite=True)
+        except NotFoundError:
+            return
+
+    def stamp(self, key: str) -> Stamp:
+        """What tells whether an object was exchanged or written over; NotFoundError if there is none."""
+        with _mapped(key, self.url):
+            meta = obstore.head(self._backend, check_key(key))
+            return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
+
+    def exists(self, key: str) -> bool:
+        try:
+            self.size(key)
+        except NotFoundError:
+            return False
+        return True
+
+    def list(self, prefix: str, *, offset: str | None = None) -> Iterator[Entry]:
+        """Objects below a folder, in no stated order; with `offset` only those whose key sorts after it."""
+        with _mapped(prefix, self.url):
+            for batch in obstore.list(self._backend, check_key(prefix), offset=offset):
+                yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
+
+    def sign(self, key: str, *, seconds: int = 3600) -> str | None:
+        """URL from which anybody may read the object for a while; None where the store cannot make one."""
+        check_key(key)
+        try:
+            return (
+                None
+                if self._signer is None
+                else str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
+            )
+        except (BaseError, ValueError, TypeError, NotImplementedError, OSError):
+            # Credentials that may read but not sign: the API hands the file out itself.
+            return None
+
+    def probe(self) -> float:
+        """Seconds a small write takes; StoreUnavailable if the store cannot be written."""
+        start = time.perf_counter()
+        with _mapped(_PROBE, self.url):
+            obstore.put(self._backend, _PROBE, b"1", mode="overwrite")
+        return time.perf_counter() - start
+
+
+def open_store(url: str, *, public_endpoint: str | None = None) -> Store:
+    """The store behind a URL: `file:///folder` (made if absent), `memory://`, `s3://`, `gs://`, `az://`.
+
+    Credentials and endpoints of the remote ones come from the usual variables (AWS_ACCESS_KEY_ID, ...).
+
+    Args:
+        public_endpoint: S3 endpoint as clients reach it. Without it, one given by AWS_ENDPOINT_URL is taken for an
+            address of the service's own network: then no download is signed, and files go through the API.
+
+    Raises:
+        InputError: the URL names no known store.
+        StoreUnavailable: the folder cannot be made or written.
+    """
+    parts = urlsplit(url)
+    if parts.scheme == "memory":
+        return Store(MemoryStore(), url)
+    if parts.scheme == "file":
+        if parts.netloc or not parts.path.startswith("/"):
+            raise InputError(f"the store URL {url!r} must hold an absolute path: file:///absolute/folder")
+        return _open_local(Path(unquote(parts.path)), url)
+    if parts.scheme not in ("s3", "gs", "az"):
+        raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")
+    with _mapped(url, url):
+        endpoint = _endpoint() if parts.scheme == "s3" else None
+        backend: Any = from_url(url, **_remote_options(endpoint))
+        signer: Any
+        if public_endpoint and parts.scheme == "s3":
+            signer = from_url(url, **_remote_options(public_endpoint), endpoint=public_endpoint)
+        else:
+            signer = None if endpoint else backend
+        return Store(backend, url, signer=signer)
+
+
+def check_key(key: str) -> str:
+    """The key itself if it is a plain relative name; InputError otherwise."""
+    if not _KEY.fullmatch(key) or ".." in key:
+        raise InputError(f"{key!r} is no name of an object in the store")
+    return key
+
+
+def _endpoint() -> str | None:
+    """An S3 endpoint other than Amazon's own."""
+    return os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
+
+
+def _remote_options(endpoint: str | None) -> dict[str, Any]:
+    options: dict[str, Any] = {key: dict(value) for key, value in _REMOTE.items()}
+    if endpoint is not None and endpoint.startswith("http://"):
+        options["client_options"]["allow_http"] = True
+    return options
+
+
+def _open_local(folder: Path, url: str) -> Store:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return Store(LocalStore(folder), url)
+    except (OSError, BaseError) as error:
+        raise StoreUnavailable(f"the store folder {folder} cannot be written: {_line(error)}") from None
+
+
+def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
+    """Write, flush to the disk, then link under the final name: a power cut leaves all of the object or nothing."""
+    path = root / key
+    if path.exists():
+        return False
+    made = [folder for folder in path.parents if root in folder.parents and not folder.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # obstore's listing skips names that end in `#` and digits: they are its own unfinished writes too.
+    staged = path.with_name(f"{path.name}#{random.SystemRandom().randrange(10**12)}")
+    try:
+        with staged.open("wb") as file:
+            shutil.copyfileobj(data, file, _STREAM_BYTES)
+            file.flush()
+            os.fsync(file.fileno())
+        os.link(staged, path)
+    except FileExistsError:
+        return False
+    finally:
+        staged.unlink(missing_ok=True)
+    for folder in {path.parent, *(folder.parent for folder in made)}:
+        _sync_folder(folder)
+    return True
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _mapped(key: str, url: str) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise NotFoundError(f"there is no object {key!r} in the store") from None
+    except (BaseError, OSError) as error:
+        raise StoreUnavailable(f"the store {url} does not answer or cannot be written: {_line(error)}") from None
+
+
+def _line(error: Exception) -> str:
+    """First line of an error: obstore appends a dump of its internals."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,249 @@
+"""Keys, scopes, sessions, and what a foreign web page may not do."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+
+import pytest
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, KeyLimits, Scope
+from api.app import create_app
+from api.client.key_commands import duration
+from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from tests.memory_queue import MemoryQueue
+
+JOB = {"hand": "allegro", "object": "mug"}
+
+
+@pytest.fixture
+def keys(settings: Settings) -> KeyFile:
+    return KeyFile(settings.data_dir / "keys.json")
+
+
+@pytest.fixture
+def closed(settings: Settings, parts: Parts, keys: KeyFile) -> Iterator[tuple[TestClient, dict[Scope, str]]]:
+    tokens = {scope: keys.add(scope.value, scope) for scope in Scope}
+    with TestClient(create_app(settings, parts), base_url="https://graspd.example") as client:
+        yield client, tokens
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+def test_without_a_key_a_closed_service_answers_401(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    answer = closed[0].get("/v1/jobs")
+    assert answer.status_code == 401
+    assert answer.headers["www-authenticate"].startswith("Bearer")
+
+
+def test_a_wrong_key_is_401(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    assert closed[0].get("/v1/jobs", headers=bearer("gd_wrong")).status_code == 401
+
+
+def test_a_reader_may_read_and_not_submit(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    client, tokens = closed
+    assert client.get("/v1/jobs", headers=bearer(tokens[Scope.READ])).status_code == 200
+    assert client.post("/v1/jobs", json=JOB, headers=bearer(tokens[Scope.READ])).status_code == 403
+
+
+@pytest.mark.parametrize("scope", [Scope.SUBMIT, Scope.ADMIN])
+def test_a_wider_scope_includes_the_narrower(closed: tuple[TestClient, dict[Scope, str]], scope: Scope) -> None:
+    client, tokens = closed
+    assert client.post("/v1/jobs", json=JOB, headers=bearer(tokens[scope])).status_code == 202
+    assert client.get("/v1/jobs", headers=bearer(tokens[scope])).status_code == 200
+
+
+def test_a_revoked_key_is_refused_from_the_next_request_on(
+    closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile
+) -> None:
+    client, tokens = closed
+    keys.revoke("read")
+    assert client.get("/v1/jobs", headers=bearer(tokens[Scope.READ])).status_code == 401
+
+
+def test_health_needs_no_key(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    assert closed[0].get("/healthz").status_code == 200
+
+
+def test_a_visitor_without_a_key_is_shown_the_way_in(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    answer = closed[0].get("/", headers={"Accept": "text/html"}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+
+
+def test_a_key_opens_a_session_and_its_end_ends_it(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
+    client, tokens = closed
+    answer = client.post("/login", data={"key": tokens[Scope.SUBMIT]}, follow_redirects=False)
+    cookie = answer.headers["set-cookie"]
+    assert all(word in cookie for word in ("HttpOnly", "SameSite=strict", "Secure"))
+    assert tokens[Scope.SUBMIT] not in cookie
+    assert client.get("/").status_code == 200
+    keys.revoke("submit")
+    assert client.get("/v1/jobs").status_code == 401
+
+
+def test_a_forged_session_is_refused(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
+    client, _ = closed
+    claim, _, _ = keys.open_session(keys.list()[2]).partition(".")
+    client.cookies.set("graspd_session", f"{claim}.{'0' * 64}")
+    assert client.get("/v1/jobs").status_code == 401
+
+
+@pytest.mark.parametrize("cookie", ["", "x", "x.y", ".", "é.é"])
+def test_a_session_of_nonsense_is_refused(keys: KeyFile, cookie: str) -> None:
+    keys.add("me", Scope.READ)
+    assert keys.find_session(cookie) is None
+
+
+def test_keys_are_kept_hashed_in_a_private_file(keys: KeyFile) -> None:
+    token = keys.add("me", Scope.ADMIN)
+    assert token not in keys.path.read_text()
+    assert stat.S_IMODE(keys.path.stat().st_mode) == 0o600
+
+
+def test_two_live_keys_cannot_share_a_name(keys: KeyFile) -> None:
+    keys.add("me", Scope.READ)
+    with pytest.raises(ConflictError):
+        keys.add("me", Scope.READ)
+
+
+def test_a_revoked_name_may_be_used_again(keys: KeyFile) -> None:
+    keys.add("me", Scope.READ)
+    keys.revoke("me")
+    token = keys.add("me", Scope.SUBMIT)
+    found = keys.find(token)
+    assert found is not None
+    assert found.scope is Scope.SUBMIT
+
+
+def test_revoking_an_unknown_key_says_so(keys: KeyFile) -> None:
+    with pytest.raises(NotFoundError):
+        keys.revoke("nobody")
+
+
+def test_a_rotated_key_keeps_its_scope_and_limits_and_loses_its_secret(keys: KeyFile) -> None:
+    old = keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=3))
+    new = keys.rotate("me")
+    found = keys.find(new)
+    assert found is not None
+    assert (found.scope, found.limits.jobs_per_day) == (Scope.SUBMIT, 3)
+    assert keys.find(old) is None
+
+
+def test_both_secrets_open_during_the_grace_of_a_rotation(keys: KeyFile) -> None:
+    old = keys.add("me", Scope.READ)
+    new = keys.rotate("me", grace=timedelta(hours=1))
+    assert keys.find(old) is not None
+    assert keys.find(new) is not None
+    keys.revoke("me")
+    assert (keys.find(old), keys.find(new)) == (None, None)
+
+
+def test_the_grace_of_a_rotation_ends(keys: KeyFile) -> None:
+    old = keys.add("me", Scope.READ)
+    keys.rotate("me", grace=timedelta(microseconds=1))
+    assert keys.find(old) is None
+
+
+def test_a_key_opens_until_it_expires(keys: KeyFile) -> None:
+    assert keys.find(keys.add("later", Scope.READ, lifetime=timedelta(hours=1))) is not None
+    assert keys.find(keys.add("past", Scope.READ, lifetime=timedelta(microseconds=1))) is None
+
+
+def test_keys_made_at_the_same_time_are_all_kept(keys: KeyFile) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        tokens = list(pool.map(lambda i: KeyFile(keys.path).add(f"key-{i}", Scope.READ), range(12)))
+    assert all(keys.find(token) for token in tokens)
+
+
+def test_a_service_whose_last_key_was_revoked_stays_closed(
+    closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile
+) -> None:
+    for scope in Scope:
+        keys.revoke(scope.value)
+    assert closed[0].get("/v1/jobs").status_code == 401
+
+
+def test_a_damaged_key_file_opens_nothing(closed: tuple[TestClient, dict[Scope, str]], keys: KeyFile) -> None:
+    keys.path.write_text("{")
+    answer = closed[0].get("/v1/jobs")
+    assert (answer.status_code, answer.json()["type"]) == (503, "/problems/unavailable")
+
+
+@pytest.mark.parametrize("name", ["X-Forwarded-For", "Forwarded", "Via"])
+def test_an_open_service_answers_nobody_behind_a_proxy(http: TestClient, name: str) -> None:
+    answer = http.get("/v1/jobs", headers={name: "203.0.113.9"})
+    assert answer.status_code == 403
+    assert "graspd keys add" in answer.json()["detail"]
+
+
+def test_an_open_service_answers_its_own_machine_only(app: FastAPI) -> None:
+    elsewhere = TestClient(app, base_url="http://127.0.0.1:8000", client=("203.0.113.9", 50000))
+    assert elsewhere.get("/v1/jobs").status_code == 403
+
+
+def test_only_who_may_read_is_told_what_is_wrong_with_a_part(
+    closed: tuple[TestClient, dict[Scope, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> float:
+        raise QueueUnavailable("Redis does not answer at redis://inside:6379")
+
+    monkeypatch.setattr(MemoryQueue, "ping", away)
+    client, tokens = closed
+    assert "inside" not in client.get("/readyz").text
+    assert "inside" in client.get("/readyz", headers=bearer(tokens[Scope.READ])).text
+
+
+def test_metrics_of_a_closed_service_need_a_key(closed: tuple[TestClient, dict[Scope, str]]) -> None:
+    client, tokens = closed
+    assert client.get("/metrics").status_code == 401
+    assert client.get("/metrics", headers=bearer(tokens[Scope.READ])).status_code == 200
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90d", 90 * 86400), ("12h", 43200), ("30m", 1800), ("45s", 45)])
+def test_a_length_of_time_is_read(text: str, seconds: int) -> None:
+    assert duration(text).total_seconds() == seconds
+
+
+@pytest.mark.parametrize("text", ["", "90", "d", "-1d", "1w", "1.5h"])
+def test_what_is_no_length_of_time_is_said_so(text: str) -> None:
+    with pytest.raises(InputError, match="90d"):
+        duration(text)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "graspd.example"])
+def test_an_address_strangers_reach_needs_a_key(settings: Settings, parts: Parts, keys: KeyFile, host: str) -> None:
+    exposed = settings.model_copy(update={"host": host})
+    with pytest.raises(InputError, match="graspd keys add"):
+        create_app(exposed, parts)
+    keys.add("me", Scope.ADMIN)
+    assert create_app(exposed, parts)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+        {"Origin": "https://evil.example"},
+        {"Origin": "null"},
+    ],
+)
+def test_a_form_on_a_foreign_page_is_refused(http: TestClient, headers: dict[str, str]) -> None:
+    assert http.post("/submit", data=JOB, headers=headers).status_code == 403
+
+
+def test_a_rebound_host_name_reaches_nothing_while_the_service_is_open(http: TestClient) -> None:
+    assert http.get("/v1/jobs", headers={"Host": "evil.example"}).status_code == 421
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:9", "localhost", "[::1]:8000"])
+def test_this_machine_has_several_names(http: TestClient, host: str) -> None:
+    assert http.get("/healthz", headers={"Host": host}).status_code == 200

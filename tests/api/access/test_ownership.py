@@ -1,0 +1,250 @@
+"""Who may cancel, retry and delete what: the key that submitted it, or an admin's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from starlette.testclient import TestClient
+
+from api.access.auth import NotYours, caller, must_own
+from api.access.keys import Key, KeyFile, Scope
+from api.app import create_app
+from service.index.index import Index
+from service.index.rebuild import rebuild
+from service.model import names
+from service.model.domain import AssetKind, State
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.settings import Settings
+from service.store.records import read_record
+from tests.api.factories import add_job, fail
+
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+MATRIX = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
+Headers = dict[str, str]
+
+
+@pytest.fixture
+def keys(settings: Settings) -> KeyFile:
+    return KeyFile(settings.resolved_keys_file)
+
+
+@pytest.fixture
+def people(keys: KeyFile) -> dict[str, Headers]:
+    """Headers of two keys that may submit, of one that may read and of one that may all."""
+    scopes = {"ann": Scope.SUBMIT, "bob": Scope.SUBMIT, "eve": Scope.READ, "root": Scope.ADMIN}
+    return {name: {"Authorization": f"Bearer {keys.add(name, scope)}"} for name, scope in scopes.items()}
+
+
+@pytest.fixture
+def client(people: dict[str, Headers], settings: Settings, parts: Parts) -> Iterator[TestClient]:
+    with TestClient(create_app(settings, parts), base_url="https://graspd.example") as opened:
+        yield opened
+
+
+def submitted(client: TestClient, headers: Headers) -> str:
+    return str(client.post("/v1/jobs", json=JOB, headers=headers).json()["id"])
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 202), ("bob", 403), ("eve", 403), ("root", 202)])
+def test_a_job_is_cancelled_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    job = submitted(client, people["ann"])
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=people[who]).status_code == status
+    cancelled = client.get(f"/v1/jobs/{job}", headers=people["eve"]).json()["state"] == "cancelled"
+    assert cancelled is (status == 202)
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 202), ("bob", 403), ("root", 202)])
+def test_a_job_is_retried_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+) -> None:
+    job = submitted(client, people["ann"])
+    fail(parts, read_record(JobRecord, parts.store, names.job_record(job)), "it broke")
+    assert client.post(f"/v1/jobs/{job}/retry", headers=people[who]).status_code == status
+
+
+@pytest.mark.parametrize("action", ["cancel", "retry"])
+@pytest.mark.parametrize("prefix", ["/v1/datasets", "/datasets"])
+def test_a_dataset_of_another_key_is_left_alone(
+    client: TestClient, people: dict[str, Headers], prefix: str, action: str
+) -> None:
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    assert client.post(f"{prefix}/d/{action}", headers=people["bob"]).status_code == 403
+    assert client.get("/v1/datasets/d", headers=people["bob"]).json()["cancelled"] is False
+
+
+@pytest.mark.parametrize("who", ["ann", "root"])
+def test_a_dataset_is_cancelled_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str
+) -> None:
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    assert client.post("/v1/datasets/d/cancel", headers=people[who]).status_code == 202
+
+
+def test_a_job_of_another_key_survives_the_end_of_a_dataset_that_has_it_too(
+    client: TestClient, people: dict[str, Headers], parts: Parts
+) -> None:
+    job = submitted(client, people["ann"])
+    client.post("/v1/datasets", json=MATRIX | {"objects": ["mug", "bottle"]}, headers=people["bob"])
+    while DatasetRounds(parts).advance(10):
+        pass
+    assert client.post("/v1/datasets/d/cancel", headers=people["bob"]).status_code == 202
+    while DatasetRounds(parts).advance(10):
+        pass
+    states = {cell.job_id == job: cell.state for cell in parts.index.dataset_cells("d").items}
+    assert states == {True: State.QUEUED, False: State.CANCELLED}
+
+
+def test_jobs_of_a_dataset_belong_to_its_key(client: TestClient, people: dict[str, Headers], parts: Parts) -> None:
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    while DatasetRounds(parts).advance(10):
+        pass
+    job = parts.index.dataset_cells("d").items[0].job_id
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"]).status_code == 202
+
+
+def test_who_finds_a_job_that_was_there_may_not_cancel_it(client: TestClient, people: dict[str, Headers]) -> None:
+    job = submitted(client, people["ann"])
+    assert submitted(client, people["bob"]) == job
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403
+
+
+def test_a_job_from_before_there_were_keys_takes_an_admin(
+    client: TestClient, people: dict[str, Headers], parts: Parts
+) -> None:
+    old = add_job(parts, seed=7).id
+    assert client.post(f"/v1/jobs/{old}/cancel", headers=people["ann"]).status_code == 403
+    assert client.post(f"/v1/jobs/{old}/cancel", headers=people["root"]).status_code == 202
+
+
+def test_a_rotated_key_keeps_what_it_submitted(client: TestClient, people: dict[str, Headers], keys: KeyFile) -> None:
+    job = submitted(client, people["ann"])
+    fresh = {"Authorization": f"Bearer {keys.rotate('ann')}"}
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=fresh).status_code == 202
+
+
+def test_a_later_key_of_the_same_name_owns_nothing_of_the_old_one(
+    client: TestClient, people: dict[str, Headers], keys: KeyFile
+) -> None:
+    job = submitted(client, people["ann"])
+    keys.revoke("ann")
+    other = {"Authorization": f"Bearer {keys.add('ann', Scope.SUBMIT)}"}
+    assert client.post(f"/v1/jobs/{job}/cancel", headers=other).status_code == 403
+
+
+def test_keys_of_before_there_were_ids_have_one_through_rotation(keys: KeyFile) -> None:
+    old = {"name": "ann", "scope": "submit", "sha256": "a" * 64, "created": "2026-01-01T00:00:00Z"}
+    key, again = Key.model_validate(old), Key.model_validate(old | {"sha256": "b" * 64, "created": "2026-02-01"})
+    assert key.id and key.id == again.id
+    assert key.id != Key.model_validate(old | {"name": "bob"}).id
+
+
+def test_owners_are_in_the_store_and_survive_a_lost_index(
+    client: TestClient, people: dict[str, Headers], parts: Parts, keys: KeyFile
+) -> None:
+    ann = next(key.id for key in keys.list() if key.name == "ann")
+    job = submitted(client, people["ann"])
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    file = ("ball.stl", b"solid ball\nendsolid ball\n")
+    added = client.post("/v1/objects", files={"file": file}, headers=people["ann"])
+    assert added.status_code == 202
+    fresh = Index("sqlite://")
+    rebuild(fresh, parts.store)
+    found = fresh.job(job).owner, fresh.dataset("d").owner, fresh.asset(AssetKind.OBJECT, "ball").owner
+    fresh.close()
+    assert found == (ann, ann, ann)
+
+
+def test_who_has_no_key_changes_everything_while_the_service_is_open(http: TestClient) -> None:
+    job = str(http.post("/v1/jobs", json=JOB).json()["id"])
+    assert http.post(f"/v1/jobs/{job}/cancel").status_code == 202
+
+
+@pytest.mark.parametrize(("scope", "passes"), [(Scope.READ, False), (Scope.SUBMIT, False), (Scope.ADMIN, True)])
+def test_what_has_no_owner_is_changed_by_an_admin_alone(scope: Scope, passes: bool) -> None:
+    token = caller.set(Key(id="1", name="me", scope=scope, sha256="", created=""))
+    try:
+        if passes:
+            must_own("", "hand 'mine'")
+        else:
+            with pytest.raises(NotYours, match=r"hand 'mine'.*'me'.*admin"):
+                must_own("", "hand 'mine'")
+    finally:
+        caller.reset(token)
+
+
+@pytest.mark.parametrize(("who", "shown"), [("ann", True), ("bob", False), ("eve", False), ("root", True)])
+def test_pages_show_a_button_only_to_whom_it_would_serve(
+    client: TestClient, people: dict[str, Headers], who: str, shown: bool
+) -> None:
+    job = submitted(client, people["ann"])
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    for page, action in ((f"/jobs/{job}", f"/jobs/{job}/cancel"), ("/datasets/d", "/datasets/d/cancel")):
+        assert (f'action="{action}"' in client.get(page, headers=people[who]).text) is shown
+
+
+@pytest.mark.parametrize(("who", "shown"), [("bob", True), ("eve", False)])
+def test_who_may_only_read_sees_nothing_to_submit(
+    client: TestClient, people: dict[str, Headers], who: str, shown: bool
+) -> None:
+    page = client.get("/datasets", headers=people[who]).text
+    assert ('action="/datasets"' in page, 'value="cancel"' in page, 'href="/submit"' in page) == (shown,) * 3
+
+
+def test_chosen_jobs_of_others_are_counted_as_left(client: TestClient, people: dict[str, Headers]) -> None:
+    job = submitted(client, people["ann"])
+    chosen = {"action": "cancel", "cell": "allegro|mug"}
+    answer = client.post("/datasets/cells", data=chosen, headers=people["bob"], follow_redirects=False)
+    assert "done=0&left=1" in answer.headers["location"]
+    assert client.get(f"/v1/jobs/{job}", headers=people["bob"]).json()["state"] == "queued"
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("eve", 403), ("root", 204)])
+def test_a_job_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    job = submitted(client, people["ann"])
+    assert client.delete(f"/v1/jobs/{job}", headers=people["root"]).status_code == 409, "it has not ended"
+    client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"])
+    assert client.delete(f"/v1/jobs/{job}", headers=people[who]).status_code == status
+    assert client.get(f"/v1/jobs/{job}", headers=people["eve"]).status_code == (404 if status == 204 else 200)
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
+def test_an_object_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    client.post("/v1/objects", files={"file": ("box.stl", b"solid")}, headers=people["ann"])
+    assert client.delete("/v1/objects/box", headers=people[who]).status_code == status
+    assert client.delete("/v1/objects/mug", headers=people[who]).status_code == 409, "it comes with graspd"
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])
+def test_a_dataset_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], parts: Parts, who: str, status: int
+) -> None:
+    client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
+    assert client.delete("/v1/datasets/d", headers=people["ann"]).status_code == 409, "it has not ended"
+    client.post("/v1/datasets/d/cancel", headers=people["ann"])
+    DatasetRounds(parts).advance()
+    assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 201), ("bob", 403), ("eve", 403), ("root", 201)])
+def test_a_set_of_objects_gets_a_new_version_from_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    def put(headers: Headers, *objects: str) -> int:
+        return client.post("/v1/object-sets", json={"name": "s", "objects": objects}, headers=headers).status_code
+
+    assert put(people["ann"], "mug") == 201
+    assert put(people["root"], "mug") == 201
+    assert put(people[who], "mug", "block") == status
+    held = client.get("/v1/object-sets/s", headers=people["eve"]).json()["objects"]
+    assert ("block" in held) is (status == 201)
+    assert put(people["ann"], "block") == 201

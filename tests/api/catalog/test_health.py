@@ -1,0 +1,45 @@
+"""Readiness: an index that may lack jobs of the store says so."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from api.app import create_app
+from service.index.index import Index
+from service.index.rebuild import rebuild
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from tests.api.factories import add_job
+from tests.damage import overwrite
+
+
+def asked_anew(app: FastAPI) -> dict[str, object]:
+    app.state.catalog._probes._known = None
+    with TestClient(app, base_url="http://127.0.0.1:8000") as http:
+        answer = http.get("/readyz")
+        return {"status": answer.status_code, **answer.json()["parts"]["index"]}
+
+
+def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings, parts: Parts) -> None:
+    record = add_job(parts)
+    fresh = Index(f"sqlite:///{settings.data_dir / 'fresh.sqlite'}")
+    lost = Parts(settings, parts.store, fresh, parts.queue)
+    app = create_app(settings, lost)
+    fresh.add_job(record)
+    assert (found := asked_anew(app))["status"] == 503
+    assert not found["ok"]
+    assert "keeper" in str(found["detail"])
+    rebuild(fresh, parts.store)
+    assert asked_anew(app)["status"] == 200
+    fresh.close()
+
+
+def test_an_index_without_damaged_records_names_them(settings: Settings, parts: Parts) -> None:
+    key = f"jobs/{add_job(parts).id}/job.json"
+    app = create_app(settings, parts)
+    overwrite(parts.store, key, b'{"x": 1}')
+    rebuild(parts.index, parts.store)
+    found = asked_anew(app)
+    assert found["status"] == 200
+    assert key in str(found["detail"])

@@ -1,0 +1,96 @@
+"""A folder of meshes on the command line: which objects it is, and that one bad mesh stops nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+from api.client import add_sets
+from api.client.add_commands import add_object
+from api.client.client import Client
+from service.model.domain import AssetKind
+from service.model.errors import InputError
+from service.store.asset_options import sizes_of
+from service.store.assets import pack
+from service.store.object_sets import files_of_set
+
+STL = b"solid box\nendsolid box\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A set as YCB is laid out, with one object whose description is broken."""
+    root = tmp_path / "ycb"
+    for name in ("003_cracker_box", "025_mug", "broken"):
+        (root / name / "google_16k").mkdir(parents=True)
+        (root / name / "google_16k" / "nontextured.stl").write_bytes(STL + name.encode())
+    (root / "broken" / "google_16k" / "asset.json").write_text("{}")
+    return root
+
+
+def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> tuple[int, dict[str, list[object]]]:
+    client = Client("http://127.0.0.1:8000")
+    client._http = http
+    monkeypatch.setattr(client, "close", lambda: None)
+    monkeypatch.setattr(add_sets, "open_client", lambda url: client)
+    app = typer.Typer()
+    app.command()(add_object)
+    result = CliRunner().invoke(app, [*arguments, "--no-wait", "--json"])
+    return result.exit_code, json.loads(result.stdout.splitlines()[-1])
+
+
+def test_every_object_of_a_folder_is_uploaded_and_a_bad_one_stops_nothing(
+    monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
+) -> None:
+    code, told = add(monkeypatch, http, str(folder), "--units", "mm")
+    assert (code, told["refused"]) == (2, ["broken"])
+    known = {asset["name"] for asset in http.get(f"/v1/{AssetKind.OBJECT.value}s").json()["items"]}
+    assert {"003_cracker_box", "025_mug"} <= known and "broken" not in known
+
+
+def test_adding_a_set_again_changes_nothing(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
+    add(monkeypatch, http, str(folder))
+    before = http.get("/v1/objects").json()
+    add(monkeypatch, http, str(folder))
+    assert http.get("/v1/objects").json() == before
+
+
+def test_a_name_goes_before_those_of_the_set(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
+    _, told = add(monkeypatch, http, str(folder), "--name", "ycb")
+    assert told["refused"] == ["ycb-broken"]
+
+
+def test_a_sweep_makes_an_object_of_each_size_and_a_set_of_them(
+    monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
+) -> None:
+    mesh = folder / "025_mug" / "google_16k" / "nontextured.stl"
+    code, told = add(monkeypatch, http, str(mesh), "--name", "mug", "--scale-to", "0.06,0.08,0.125")
+    assert (code, told["set"]) == (0, "mug")
+    assert http.get("/v1/object-sets/mug").json()["objects"] == ["mug-125mm", "mug-60mm", "mug-80mm"]
+    (folder / "toys").mkdir()
+    for name in ("ball", "rod"):
+        (folder / "toys" / f"{name}.stl").write_bytes(STL + name.encode())
+    code, told = add(monkeypatch, http, str(folder / "toys"), "--scale-to", "0.06,0.08")
+    assert (code, told["set"]) == (0, "toys")
+    assert http.get("/v1/object-sets/toys").json()["objects"] == ["ball-60mm", "ball-80mm", "rod-60mm", "rod-80mm"]
+
+
+@pytest.mark.parametrize("text", ["0", "-0.1", "small", "0.1,", "inf", "nan"])
+def test_a_size_that_is_none_is_a_mistake(text: str) -> None:
+    with pytest.raises(InputError, match="must be a size in metres"):
+        sizes_of(text)
+
+
+def test_a_zip_of_several_meshes_is_a_set_and_of_one_is_an_object(tmp_path: Path) -> None:
+    (tmp_path / "many.zip").write_bytes(pack({"egad/A0.obj": b"v", "egad/B1.obj": b"v"}))
+    (tmp_path / "one.zip").write_bytes(pack({"A0.obj": b"v"}))
+    described = {"asset.json": b'{"file": "a.obj"}', "a.obj": b"v", "b.obj": b"v"}
+    (tmp_path / "described.zip").write_bytes(pack(described))
+    assert set(files_of_set(tmp_path / "many.zip") or {}) == {"A0", "B1"}
+    assert files_of_set(tmp_path / "one.zip") is None
+    assert files_of_set(tmp_path / "described.zip") is None

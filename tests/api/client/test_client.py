@@ -1,0 +1,143 @@
+"""The client turns problem documents back into the exceptions they came from, and outlives a restart of the API."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.client.client import Client, parse_events
+from api.models import Job, Shard
+from service.model.domain import AssetKind, Stage, State
+from service.model.errors import (
+    ConflictError,
+    GraspdError,
+    InputError,
+    NotFoundError,
+    QueueUnavailable,
+    QuotaError,
+    UnavailableError,
+)
+
+Handler = Callable[[httpx.Request], httpx.Response]
+
+
+def client_of(handler: Handler) -> Client:
+    return Client("http://127.0.0.1:8000", key="gd_secret", transport=httpx.MockTransport(handler))
+
+
+def job(state: State) -> Job:
+    return Job(
+        id="a" * 32, state=state, hand="allegro", object="mug", method="fast_graspd", fidelity="standard",
+        requested=32, grasps=0, valid=0, progress=0.0, created="2026-01-01T00:00:00Z", stages=[],
+    )  # fmt: skip
+
+
+def event(name: str, state: State) -> bytes:
+    return f"event: {name}\ndata: {job(state).model_dump_json()}\n\n".encode()
+
+
+@pytest.mark.parametrize(
+    ("slug", "status", "kind"),
+    [
+        ("not-found", 404, NotFoundError),
+        ("conflict", 409, ConflictError),
+        ("queue-unavailable", 503, QueueUnavailable),
+        ("invalid-input", 422, InputError),
+        ("unauthorized", 401, InputError),
+        ("internal", 500, GraspdError),
+        ("something-newer", 503, UnavailableError),
+    ],
+)
+def test_a_problem_document_becomes_its_exception(slug: str, status: int, kind: type[GraspdError]) -> None:
+    answer = httpx.Response(status, json={"type": f"/problems/{slug}", "detail": "what is wrong"})
+    with client_of(lambda _: answer) as client, pytest.raises(kind, match="what is wrong") as caught:
+        client.job("a")
+    assert type(caught.value) is kind
+
+
+def test_an_answer_that_is_not_graspds_is_said_so() -> None:
+    with client_of(lambda _: httpx.Response(404, text="<html>nginx")) as client, pytest.raises(InputError, match="404"):
+        client.job("a")
+
+
+def test_the_key_goes_with_every_request() -> None:
+    seen: list[str] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request.headers["authorization"])
+        return httpx.Response(200, json={"items": [], "next": None})
+
+    with client_of(handler) as client:
+        client.jobs()
+    assert seen == ["Bearer gd_secret"]
+
+
+def test_lists_are_read_to_their_last_page() -> None:
+    def handler(request: httpx.Request) -> httpx.Response:
+        cursor = request.url.params.get("cursor")
+        name = {None: "one", "2": "two"}[cursor]
+        asset = {
+            "kind": "hand", "name": name, "digest": "d", "filename": "h.urdf", "files": [], "size_bytes": 1,
+            "created": "", "builtin": True, "verdict": "accept", "message": None, "repairs": [], "facts": {},
+        }  # fmt: skip
+        return httpx.Response(200, json={"items": [asset], "next": "2" if cursor is None else None})
+
+    with client_of(handler) as client:
+        assert [asset.name for asset in client.assets(AssetKind.HAND)] == ["one", "two"]
+
+
+def test_watching_goes_on_where_the_stream_broke() -> None:
+    streams = iter([event("progress", State.RUNNING), event("end", State.SUCCEEDED)])
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        return httpx.Response(200, content=next(streams))
+
+    with client_of(handler) as client:
+        assert [seen.state for seen in client.watch("a")] == [State.RUNNING, State.SUCCEEDED]
+
+
+def test_an_event_may_come_in_pieces_with_comments_between() -> None:
+    lines = [": ping", "", "event: progress", 'data: {"done":', "data: 1}", "id: 7", "", "data: 2", ""]
+    assert list(parse_events(iter(lines))) == [("progress", {"done": 1}), ("message", 2)]
+
+
+def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
+    def broken(request: httpx.Request) -> httpx.Response:
+        raise httpx.ReadError("connection lost", request=request)
+
+    shard = Shard(
+        id="a", kind="base", stage=Stage.SYNTHESIZE, key="k", sha256="", size_bytes=1, count=1, hand="h", object="o",
+        hand_digest="", object_digest="", batch=0, seed=0, inputs=[], device="cpu", worker="w", seconds=1.0,
+        created="", file="/v1/shards/a/file",
+    )  # fmt: skip
+    with client_of(broken) as client, pytest.raises(UnavailableError, match="connection lost"):
+        client.download(shard, tmp_path / "a.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_opened_is_the_callers_mistake(tmp_path: Path) -> None:
+    with client_of(lambda _: httpx.Response(500)) as client, pytest.raises(InputError, match="nowhere"):
+        client.upload(AssetKind.OBJECT, tmp_path / "nowhere.stl")
+
+
+def test_requests_that_come_too_fast_are_sent_again_when_the_service_says() -> None:
+    answers = iter([429, 429, 200])
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        status = next(answers)
+        body = {"type": "/problems/too-many-requests", "detail": "slower"} if status == 429 else {"items": []}
+        return httpx.Response(status, json=body, headers={"Retry-After": "0"})
+
+    assert client_of(handler).jobs().items == []
+
+
+def test_a_quota_that_is_used_up_is_reported_at_once() -> None:
+    def handler(request: httpx.Request) -> httpx.Response:
+        problem = {"type": "/problems/quota-exceeded", "detail": "no more jobs today"}
+        return httpx.Response(429, json=problem, headers={"Retry-After": "3600"})
+
+    with pytest.raises(QuotaError, match="no more jobs today"):
+        client_of(handler).jobs()

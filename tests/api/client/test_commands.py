@@ -1,0 +1,189 @@
+"""The commands against the real service: embedded Redis, file store, SQLite, API process. No worker, so jobs wait."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.client.reports import job_summary
+from api.models import JobDetail, MeanMetrics
+from service.model.domain import AssetKind, JobRequest, State
+from service.run.supervisor import Supervisor
+from service.settings import Settings
+from service.store.library import load_asset_files
+from service.store.store import open_store
+
+STL = b"solid box\nendsolid box\n"
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Runs `graspd` as a user does."""
+
+    environment: dict[str, str]
+
+    def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "graspd", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, env=self.environment, timeout=60, check=False)
+
+    def json(self, *arguments: str) -> dict[str, Any]:
+        done = self(*arguments, "--json")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Supervisor]:
+    settings = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0)
+    with Supervisor(settings, workers=0) as supervisor:
+        supervisor.wait_ready(60)
+        yield supervisor
+
+
+@pytest.fixture(scope="module")
+def graspd(service: Supervisor) -> Shell:
+    names = {"GRASPD_API_URL": service.api_url, "GRASPD_DATA_DIR": str(service.settings.data_dir)}
+    return Shell({name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")} | names)
+
+
+def said(done: subprocess.CompletedProcess[str]) -> str:
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1, done.stderr
+    return lines[0]
+
+
+def test_a_submitted_job_is_listed_shown_cancelled_and_retried(graspd: Shell) -> None:
+    job = graspd.json("submit", "--hand", "allegro", "--object", "mug", "--seed", "1", "--scenes", "1")
+    assert job["state"] == "queued"
+    assert job["job"] in {entry["id"] for entry in graspd.json("jobs")["jobs"]}
+    assert graspd.json("status", job["job"][:10])["stages"]["scene"]["tasks"] == 1
+    assert graspd.json("cancel", job["job"])["state"] == "cancelled"
+    assert graspd.json("retry", job["job"])["state"] == "queued"
+    assert graspd.json("logs", job["job"])["attempts"] == []
+
+
+def test_a_job_can_ask_for_larger_pictures_with_more_channels(graspd: Shell) -> None:
+    wanted = ("--scenes", "1", "--views", "1", "--channels", "normals", "--width", "640", "--height", "480")
+    plain = graspd.json("submit", "--hand", "allegro", "--object", "mug", "--scenes", "1", "--views", "1")
+    rich = graspd.json("submit", "--hand", "allegro", "--object", "mug", *wanted)
+    assert rich["state"] == "queued"
+    assert rich["job"] != plain["job"], "other pictures are another job"
+
+
+def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
+    assert "allegro" in {hand["name"] for hand in graspd.json("hands", "list")["hands"]}
+    assert graspd.json("objects", "show", "mug")["verdict"] == "accept"
+
+
+def test_an_object_can_be_added_from_a_file(graspd: Shell, tmp_path: Path) -> None:
+    (tmp_path / "box.stl").write_bytes(STL)
+    assert graspd.json("objects", "add", str(tmp_path / "box.stl"), "--no-wait")["name"] == "box"
+
+
+def test_the_licence_of_an_object_is_kept_with_its_files(graspd: Shell, tmp_path: Path) -> None:
+    (tmp_path / "crate.stl").write_bytes(STL + b" ")
+    said = ("--licence", "CC-BY-4.0", "--source", "https://example.org/crate")
+    made = graspd.json("objects", "add", str(tmp_path / "crate.stl"), *said, "--no-wait")
+    store = open_store((Path(graspd.environment["GRASPD_DATA_DIR"]) / "store").as_uri())
+    kept = json.loads(load_asset_files(store, AssetKind.OBJECT, made["digest"])["asset.json"])
+    assert (kept["licence"], kept["source"]) == ("CC-BY-4.0", "https://example.org/crate")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--hand", "claw", "--object", "mug"), "'claw'"),
+        (("--hand", "allegro", "--object", "teapot"), "'teapot'"),
+        (("--hand", "allegro", "--object", "mug", "-n", "0"), "--grasps"),
+        (("--hand", "allegro", "--object", "mug", "-n", "-5"), "--grasps"),
+        (("--hand", "allegro", "--object", "mug", "--fidelity", "perfect"), "standard"),
+        (("--hand", "allegro", "--object", "mug", "--views", "2"), "scenes"),
+        (("--hand", "allegro", "--object", "mug", "--channels", "infrared"), "channels"),
+        (("--hand", "allegro", "--object", "nowhere/box.stl"), "nowhere/box.stl"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: tuple[str, ...], words: str) -> None:
+    done = graspd("submit", *arguments)
+    assert done.returncode == 2
+    assert words in said(done)
+
+
+@pytest.mark.parametrize("command", ["status", "cancel", "retry", "logs"])
+def test_an_unknown_job_is_exit_2(graspd: Shell, command: str) -> None:
+    done = graspd(command, "0123456789")
+    assert done.returncode == 2
+    assert "0123456789" in said(done)
+
+
+def test_no_service_is_exit_1_and_says_how_to_start_one(graspd: Shell) -> None:
+    done = Shell(graspd.environment | {"GRASPD_API_URL": "http://127.0.0.1:9"})("jobs")
+    assert done.returncode == 1
+    assert "graspd up" in said(done)
+
+
+def test_an_address_that_is_no_graspd_is_said_so(graspd: Shell) -> None:
+    done = graspd("jobs", "--url", f"{graspd.environment['GRASPD_API_URL']}/static/")
+    assert done.returncode == 2
+    assert "static" in said(done)
+
+
+def test_a_taken_port_is_one_line_and_exit_1(graspd: Shell) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = graspd("api", "--port", str(taken.getsockname()[1]))
+    assert done.returncode == 1
+    assert "taken" in said(done)
+
+
+def test_the_api_refuses_strangers_without_a_key(graspd: Shell) -> None:
+    done = graspd("api", "--host", "0.0.0.0", "--port", "0")
+    assert done.returncode == 2
+    assert "graspd keys add" in said(done)
+
+
+def test_a_store_that_cannot_be_written_is_one_line_and_exit_1(graspd: Shell, tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_bytes(b"")
+    environment = graspd.environment | {"GRASPD_STORE_URL": (blocked / "store").as_uri()}
+    done = Shell(environment)("api", "--port", "0")
+    assert done.returncode == 1
+    assert str(blocked) in said(done)
+
+
+def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None:
+    shell = Shell(graspd.environment | {"GRASPD_DATA_DIR": str(tmp_path)})
+    made = shell.json("keys", "add", "lab", "--scope", "read")
+    assert made["key"].startswith("gd_")
+    assert [(key["name"], key["revoked"]) for key in shell.json("keys", "list")["keys"]] == [("lab", None)]
+    shell.json("keys", "revoke", "lab")
+    assert shell.json("keys", "list")["keys"][0]["revoked"] is not None
+
+
+def test_an_idempotency_key_binds_to_its_request(service: Supervisor) -> None:
+    body = {"hand": "allegro", "object": "mug", "seed": 5}
+    with httpx.Client(base_url=service.api_url, headers={"Idempotency-Key": "one"}, trust_env=False) as http:
+        first, second = (http.post("/v1/jobs", json=body) for _ in range(2))
+        other = http.post("/v1/jobs", json=body | {"seed": 6})
+    assert first.json()["id"] == second.json()["id"]
+    assert (other.status_code, "Idempotency-Key" in other.json()["detail"]) == (422, True)
+
+
+def test_the_keys_that_scripts_rely_on_are_there() -> None:
+    job = JobDetail(
+        id="a" * 32, state=State.SUCCEEDED, hand="allegro", object="mug", method="fast_graspd", fidelity="standard",
+        requested=32, grasps=32, valid=20, progress=1.0, created="2026-01-01T00:00:00Z", stages=[],
+        request=JobRequest(hand="allegro", object="mug"), hand_digest="b" * 32, object_digest="c" * 32,
+        attempts=[], mean=MeanMetrics(epsilon=0.1), shards=[],
+    )  # fmt: skip
+    summary = job_summary(job)
+    assert {"job", "state", "grasps", "valid", "stages", "mean", "shards"} <= set(summary)
+    assert set(summary["mean"]) == {"epsilon", "contact_area_cm2", "intersection_volume_cm3"}

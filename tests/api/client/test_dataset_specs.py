@@ -1,0 +1,88 @@
+"""Specs of datasets in files: what they say, what options say over them, what is wrong with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.client.dataset_specs import Wanted, read_spec, wanted
+from service.model.errors import InputError
+from service.pipeline.datasets.spec import MAX_CELLS
+
+ROOT = Path(__file__).resolve().parents[3]
+TOML = """
+name = "kitchen"
+hands = ["allegro", "barrett"]
+objects = ["mug", "block"]
+total_grasps = 1000
+scenes = 2
+stereo = true
+fidelity = "draft"
+"""
+
+
+def spec(folder: Path, text: str, name: str = "kitchen.toml") -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def asked(file: Path | None, *, hands: str | None = None, objects: str | None = None, **options: Any) -> Wanted:
+    return wanted(file, name=None, hands=hands, objects=objects, options=options)
+
+
+def test_a_spec_says_it_all(tmp_path: Path) -> None:
+    found = asked(spec(tmp_path, TOML), stereo=False)  # a flag that was not set
+    assert (found.name, found.hands, found.objects) == ("kitchen", "allegro,barrett", "mug,block")
+    assert found.options == {"scenes": 2, "stereo": True, "fidelity": "draft"}
+    assert found.shared_out({"hands": ["a", "b"]}, 3)["grasps"] == 167  # a sixth of 1000, rounded up
+
+
+def test_json_says_the_same(tmp_path: Path) -> None:
+    text = json.dumps({"hands": ["allegro"], "objects": ["mug"], "grasps": 7, "options": {"steps": 20}})
+    found = asked(spec(tmp_path, text, "kitchen.json"))
+    assert found.options == {"grasps": 7, "options": {"steps": 20}} and found.total is None
+
+
+def test_an_option_goes_before_the_spec(tmp_path: Path) -> None:
+    found = asked(spec(tmp_path, TOML), hands="shadow", fidelity="fine", grasps=5, options=["steps=3"])
+    assert (found.hands, found.objects) == ("shadow", "mug,block")
+    assert found.options["fidelity"] == "fine" and found.options["options"] == {"steps": 3}
+    assert found.total is None and found.options["grasps"] == 5
+
+
+def test_a_folder_of_objects_lies_beside_the_spec(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    found = asked(spec(tmp_path, 'hands = ["allegro"]\nobjects = "./meshes"'))
+    assert Path(found.objects) == tmp_path / "meshes"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("hands = [", "is no TOML"),
+        ('hands = ["allegro"]\ncolour = 1', "colour"),
+        ('hands = ["allegro"]\ngrasps = 0', "grasps"),
+        ("grasps = 3\ntotal_grasps = 4", "say one of them"),
+        ('hands = ["allegro"]', "say which objects"),
+        ('objects = ["mug"]', "say which hands"),
+    ],
+)
+def test_a_spec_that_cannot_be_used_says_what_is_wrong(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        asked(spec(tmp_path, text))
+
+
+def test_a_spec_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml cannot be read"):
+        read_spec(tmp_path / "none.toml")
+
+
+def test_the_million_of_the_examples_is_a_spec() -> None:
+    found = asked(ROOT / "examples" / "million" / "million.toml", objects="mug,block")
+    hands = found.hands.split(",")
+    assert found.total == 1_000_000 and len(hands) == 3
+    assert found.shared_out({"hands": hands}, 100)["grasps"] * 3 * 100 >= 1_000_000
+    assert len(hands) * 10_000 < MAX_CELLS

@@ -1,0 +1,107 @@
+"""The matrix: cells with their yield, actions on chosen ones, datasets made and steered by forms."""
+
+from __future__ import annotations
+
+import pytest
+from starlette.testclient import TestClient
+
+from api.dashboard.figures.matrix import of_service
+from service.index.views import MatrixCell
+from service.model.domain import State
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.datasets.spec import DatasetRequest
+from tests.api.factories import add_job, fail, finish_all
+
+
+def cell(**fields: object) -> MatrixCell:
+    counts = dict.fromkeys(("jobs", "queued", "running", "failed", "grasps", "valid", "tried"), 0)
+    return MatrixCell.model_validate({"hand": "h", "object": "o"} | counts | fields)
+
+
+@pytest.mark.parametrize(
+    ("counts", "state", "shade"),
+    [
+        ({"valid": 30, "tried": 40}, "succeeded", "y8"),
+        ({"running": 1, "failed": 1}, "running", "none"),
+        ({"queued": 1, "failed": 1}, "queued", "none"),
+        ({"failed": 1, "valid": 0, "tried": 10}, "failed", "y0"),
+    ],
+)
+def test_a_cell_tells_its_state_and_yield(counts: dict[str, int], state: str, shade: str) -> None:
+    shown = of_service([cell(**counts)], ["h"], ["o"]).rows[0][1][0]
+    assert shown is not None
+    assert (shown.state, shown.shade) == (state, shade)
+
+
+def test_pairs_without_work_have_a_cell_to_choose() -> None:
+    grid = of_service([cell()], ["h", "i"], ["a", "o"])
+    assert grid.hands == ["h", "i"]
+    assert [name for name, _ in grid.rows] == ["o", "a"]  # those with work first
+    assert all(shown is not None for _, cells in grid.rows for shown in cells)
+
+
+def test_chosen_pairs_are_submitted(http: TestClient, parts: Parts) -> None:
+    form = {"action": "submit", "cell": ["allegro|mug", "shadow|block"], "grasps": "64", "fidelity": "draft"}
+    answer = http.post("/datasets/cells", data=form)
+    assert "2 jobs submitted." in answer.text
+    made = parts.index.jobs().items
+    assert {(job.request.hand, job.request.object, job.request.grasps) for job in made} == {
+        ("allegro", "mug", 64),
+        ("shadow", "block", 64),
+    }
+
+
+def test_chosen_pairs_are_cancelled_and_retried(http: TestClient, parts: Parts) -> None:
+    waiting, failed = add_job(parts), add_job(parts, object="block")
+    fail(parts, failed, "lost")
+    pairs = ["allegro|mug", "allegro|block"]
+    assert "1 job cancelled." in http.post("/datasets/cells", data={"action": "cancel", "cell": pairs}).text
+    assert parts.index.job(waiting.id).state is State.CANCELLED
+    assert "2 jobs retried." in http.post("/datasets/cells", data={"action": "retry", "cell": pairs}).text
+    assert parts.index.job(failed.id).state is State.QUEUED
+
+
+@pytest.mark.parametrize(
+    "form", [{"action": "burn", "cell": "allegro|mug"}, {"action": "submit", "cell": "a|b", "grasps": "0"}]
+)
+def test_an_action_that_cannot_be_done_says_why(http: TestClient, form: dict[str, str]) -> None:
+    answer = http.post("/datasets/cells", data=form)
+    assert answer.status_code == 422
+    assert "That cannot be done" in answer.text
+
+
+def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, parts: Parts) -> None:
+    form = {"name": "kitchen", "grasps": "32", "fidelity": "draft", "hands": ["allegro"], "objects": ["mug", "block"]}
+    page = http.post("/datasets", data=form).text
+    assert "kitchen" in page
+    assert page.count('class="cell queued') == 2
+    DatasetRounds(parts).advance()
+    assert (
+        "1 job cancelled"
+        in http.post(
+            "/datasets/kitchen/cells",
+            data={"action": "cancel", "cell": [parts.index.dataset_cells("kitchen").items[0].job_id]},
+        ).text
+    )
+    assert http.post("/datasets/kitchen/retry").status_code == 200
+    finish_all(parts, add_job(parts, fidelity="draft"))
+    answer = http.post("/datasets/kitchen/snapshot")
+    assert "The snapshot is taken" in answer.text
+    assert len(parts.index.snapshots("kitchen").items) == 1
+
+
+def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: TestClient) -> None:
+    answer = http.post("/datasets", data={"name": "kitchen", "grasps": "7", "objects": ["mug"]})
+    assert answer.status_code == 422
+    assert "hands" in answer.text
+    assert 'value="kitchen"' in answer.text
+    assert 'value="7"' in answer.text
+
+
+def test_cells_of_one_state_are_a_list(http: TestClient, parts: Parts) -> None:
+    wanted = DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug", "block"]})
+    actions.create(parts, wanted)
+    assert http.get("/datasets/k", params={"state": "queued"}).text.count('name="cell"') == 2
+    assert "No cell is failed" in http.get("/datasets/k", params={"state": "failed"}).text

@@ -1,0 +1,91 @@
+"""One grasp: its document, its page, the models it is shown with; and the list in both views."""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+from starlette.testclient import TestClient
+
+from api.catalog.grasp_files import OUTCOMES
+from service.pipeline.backends import Parts
+from service.store.shards import read_shard
+from tests.api.factories import JOINTS, add_job, finish_all
+from worker.quality.referee.protocol import Outcome
+
+
+def test_a_grasp_is_the_row_of_its_shard(http: TestClient, parts: Parts) -> None:
+    manifest = finish_all(parts, add_job(parts))[0]
+    shard = read_shard(parts.store.get(manifest.key))
+    document = http.get(f"/v1/grasps/{manifest.shard_id}/5").json()
+    np.testing.assert_allclose(document["postures"]["squeeze"]["hand_pose"], shard["squeeze/hand_pose"][5])
+    np.testing.assert_allclose(document["sweep"]["epsilon"], shard["quality/epsilon"][5])
+    assert len(document["joint_names"]) == len(document["postures"]["grasp"]["joint_positions"]) == JOINTS
+    assert document["hand_digest"] == manifest.hand_digest
+
+
+@pytest.mark.parametrize("row", [32, -1])
+def test_a_grasp_that_is_not_there_is_named(http: TestClient, parts: Parts, row: int) -> None:
+    shard = finish_all(parts, add_job(parts))[0].shard_id
+    answer = http.get(f"/v1/grasps/{shard}/{row}")
+    assert answer.status_code == 404
+    assert f"there is no grasp {row}" in answer.json()["detail"]
+
+
+def test_a_grasp_whose_file_is_gone_is_a_clear_error(http: TestClient, parts: Parts) -> None:
+    manifest = finish_all(parts, add_job(parts))[0]
+    (parts.settings.data_dir / "store" / manifest.key).unlink()
+    answer = http.get(f"/grasps/{manifest.shard_id}/0", headers={"Accept": "text/html"})
+    assert answer.status_code == 500
+    assert manifest.key in answer.text
+
+
+def test_pushes_are_called_what_the_referee_calls_them() -> None:
+    assert {int(outcome): outcome.name.lower().replace("_", " ") for outcome in Outcome} == OUTCOMES
+
+
+def test_the_page_of_a_grasp_tells_quality_and_where_it_is_kept(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts)
+    shard = finish_all(parts, record)[0].shard_id
+    page = http.get(f"/grasps/{shard}/3").text
+    assert f'href="/v1/shards/{shard}/file"' in page
+    assert f'href="/jobs/{record.id}"' in page
+    assert f'rel="prev" href="/grasps/{shard}/2"' in page
+    assert "shard[&#34;grasp/hand_pose&#34;][3]" in page
+    assert "cm³" in page
+
+
+@pytest.mark.parametrize(("kind", "name"), [("hands", "allegro"), ("objects", "mug")])
+def test_models_are_served_as_gltf_and_kept_under_their_digest(http: TestClient, kind: str, name: str) -> None:
+    digest = http.get(f"/v1/{kind}/{name}").json()["digest"]
+    by_name, by_digest = http.get(f"/v1/{kind}/{name}/model"), http.get(f"/v1/{kind}/{digest}/model")
+    assert by_name.content == by_digest.content
+    magic, version, length = struct.unpack("<4sII", by_name.content[:12])
+    assert (magic, version, length) == (b"glTF", 2, len(by_name.content))
+    assert "immutable" in by_digest.headers["cache-control"]
+    assert by_name.headers["cache-control"] == "no-cache"
+
+
+@pytest.mark.parametrize("channel", ["depth", "segmentation"])
+def test_depth_and_segmentation_are_pictures_too(http: TestClient, parts: Parts, channel: str) -> None:
+    record = add_job(parts, scenes=1, views=1, width=64, height=48)
+    shard = finish_all(parts, record)[-1].shard_id
+    answer = http.get(f"/shards/{shard}/pictures/0.png", params={"channel": channel, "width": 32})
+    assert Image.open(io.BytesIO(answer.content)).size == (32, 24)
+
+
+def test_an_unknown_channel_is_refused(http: TestClient) -> None:
+    assert http.get("/shards/x/pictures/0.png", params={"channel": "sound"}).status_code == 422
+
+
+@pytest.mark.parametrize(("bounds", "kept"), [({"max_epsilon": 0.3}, True), ({"min_contact_area_cm2": 900}, False)])
+def test_metrics_are_bounded_from_both_sides(
+    http: TestClient, parts: Parts, bounds: dict[str, float], kept: bool
+) -> None:
+    finish_all(parts, add_job(parts))
+    items = http.get("/v1/grasps", params={**bounds, "limit": 200}).json()["items"]
+    assert bool(items) == kept
+    assert all(item["epsilon"] <= bounds.get("max_epsilon", 99) for item in items)

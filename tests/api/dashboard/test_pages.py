@@ -1,0 +1,220 @@
+"""The pages: complete without JavaScript, escaped, honest when empty."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pytest
+from PIL import Image
+from starlette.testclient import TestClient
+
+from service.index.index import Index
+from service.index.notes import Damage
+from service.model.domain import State
+from service.model.errors import IndexUnavailable, QueueUnavailable
+from service.model.planning import plan
+from service.pipeline.backends import Parts
+from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+from tests.memory_queue import MemoryQueue
+
+FORM = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "standard", "seed": "0", "friction": "1.0"}
+
+
+def test_an_empty_service_says_what_to_do(http: TestClient) -> None:
+    page = http.get("/").text
+    assert "graspd submit" in page
+    assert "graspd worker" in page
+
+
+@pytest.mark.parametrize("path", ["/", "/workers"])
+def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some(
+    http: TestClient, parts: Parts, path: str
+) -> None:
+    assert "graspd store verify" not in http.get(path).text
+    parts.index.set_damage([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
+    page = http.get(path).text
+    assert "7 objects of the store are damaged or missing" in page
+    assert "graspd store verify --repair" in page
+    if path == "/":
+        assert "shards/base/0.h5" in page
+        assert "its &lt;file&gt; is gone" in page
+        assert "and 2 more" in page
+    parts.index.replace_damage([])
+    assert "damaged or missing" not in http.get(path).text
+
+
+def test_home_shows_jobs_workers_and_failures(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, seed=1)
+    finish_all(parts, record)
+    fail(parts, add_job(parts, seed=2), "the mesh has 12 open edges")
+    add_worker(parts, "worker-7", "busy")
+    page = http.get("/").text
+    assert f'href="/jobs/{record.id}"' in page
+    assert "worker-7" in page
+    assert "the mesh has 12 open edges" in page
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_home_filters_by_state(http: TestClient, parts: Parts, state: State) -> None:
+    add_job(parts)
+    page = http.get("/", params={"state": state.value}).text
+    assert ("allegro" in page) == (state is State.QUEUED)
+
+
+def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, scenes=1, views=2, stereo=True)
+    manifests = finish_all(parts, record)
+    page = http.get(f"/jobs/{record.id}").text
+    assert page.count("<img ") == 4 * 3  # colour, depth, segmentation
+    assert all(f"/v1/shards/{manifest.shard_id}/file" in page for manifest in manifests)
+    assert "cm²" in page
+    assert "h5py" in page
+
+
+def test_a_waiting_job_has_a_page_with_a_way_to_cancel(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, scenes=1, views=1)
+    page = http.get(f"/jobs/{record.id}").text
+    assert f'action="/jobs/{record.id}/cancel"' in page
+    assert f'data-events="/v1/jobs/{record.id}/events"' in page
+
+
+def test_a_running_job_has_a_page(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, grasps=96, scenes=1)
+    finish(parts, record, next(plan(record)))
+    assert "1 of 3" in http.get(f"/jobs/{record.id}").text
+
+
+def test_a_failed_job_says_why_and_offers_a_retry(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts)
+    fail(parts, record, "<b>not</b> watertight")
+    page = http.get(f"/jobs/{record.id}").text
+    assert "&lt;b&gt;not&lt;/b&gt; watertight" in page
+    assert f'action="/jobs/{record.id}/retry"' in page
+
+
+def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, scenes=1, views=1, width=64, height=48)
+    shard = finish_all(parts, record)[-1].shard_id
+    answer = http.get(f"/shards/{shard}/pictures/0.png")
+    picture = Image.open(io.BytesIO(answer.content))
+    assert (answer.headers["content-type"], picture.size) == ("image/png", (64, 48))
+    assert picture.getpixel((0, 0)) == (40, 40, 40)
+    assert http.get(f"/shards/{shard}/pictures/9.png").status_code == 404
+
+
+def test_a_shard_without_pictures_has_no_thumbnail(http: TestClient, parts: Parts) -> None:
+    shard = finish_all(parts, add_job(parts))[0].shard_id
+    assert http.get(f"/shards/{shard}/pictures/0.png").status_code == 404
+
+
+def test_the_table_of_grasps_keeps_its_filters_on_the_next_page(http: TestClient, parts: Parts) -> None:
+    finish_all(parts, add_job(parts, grasps=128))
+    page = http.get("/grasps", params={"valid": "true", "sort": "penetration_depth_mm", "order": "asc"}).text
+    link = re.search(r'href="([^"]*)" rel="next"|rel="next" href="([^"]*)"', page)
+    assert link is not None
+    address = (link.group(1) or link.group(2)).replace("&amp;", "&")
+    assert "valid=true" in address
+    assert http.get(address).text.count('<li class="card grasp">') > 2
+
+
+def test_a_filter_that_fits_nothing_says_so(http: TestClient, parts: Parts) -> None:
+    finish_all(parts, add_job(parts))
+    assert "No grasp fits these filters" in http.get("/grasps", params={"min_epsilon": 99}).text
+
+
+def test_a_filter_that_cannot_be_read_is_explained(http: TestClient) -> None:
+    answer = http.get("/grasps", params={"min_epsilon": "much"})
+    assert answer.status_code == 422
+    assert "min_epsilon" in answer.text
+
+
+def test_the_form_submits_a_job_and_shows_it(http: TestClient) -> None:
+    answer = http.post("/submit", data=FORM, follow_redirects=False)
+    assert answer.status_code == 303
+    assert http.get(answer.headers["location"]).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"grasps": "0"}, "greater than or equal to 1"), ({"views": "3", "scenes": "0"}, "views need scenes")],
+)
+def test_a_form_in_error_keeps_what_was_typed_and_says_what_is_wrong(
+    http: TestClient, change: dict[str, str], words: str
+) -> None:
+    answer = http.post("/submit", data=FORM | {"seed": "77"} | change)
+    assert answer.status_code == 422
+    assert words in answer.text
+    assert 'value="77"' in answer.text
+
+
+def test_a_form_with_a_bad_file_shows_the_reason(http: TestClient) -> None:
+    answer = http.post("/submit", data=FORM, files={"file": ("notes.txt", b"hello")})
+    assert answer.status_code == 422
+    assert "notes.txt holds no object file" in answer.text
+
+
+def test_the_buttons_cancel_and_retry_a_job(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts)
+    for action, state in (("cancel", "cancelled"), ("retry", "queued")):
+        answer = http.post(f"/jobs/{record.id}/{action}", follow_redirects=False)
+        assert (answer.status_code, answer.headers["location"]) == (303, f"/jobs/{record.id}")
+        assert http.get(f"/v1/jobs/{record.id}").json()["state"] == state
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/datasets", "/grasps", "/workers", "/chart", "/stability", "/submit", "/problems"]
+)
+def test_no_page_asks_for_anything_from_elsewhere_or_inline(http: TestClient, path: str) -> None:
+    page = http.get(path).text
+    addresses = re.findall(r'(?:src|href|action)="([^"]*)"', page)
+    assert addresses
+    assert all(address.startswith(("/", "#")) for address in addresses)
+    assert not re.search(r"\sstyle=|\son[a-z]+=|<style|<script>", page)
+
+
+@pytest.mark.parametrize("path", ["/static/style.css", "/static/live.js", "/static/mark.svg"])
+def test_what_the_pages_need_is_served(http: TestClient, path: str) -> None:
+    assert http.get(path).status_code == 200
+
+
+def test_pages_are_read_on_while_redis_is_away(http: TestClient, parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = add_job(parts)
+    finish_all(parts, record)
+
+    def away(*_: object) -> float:
+        raise QueueUnavailable("Redis does not answer at unix:///redis.sock")
+
+    for method in ("ping", "depths"):
+        monkeypatch.setattr(MemoryQueue, method, away)
+    page = http.get("/")
+    assert page.status_code == 200
+    assert "Redis does not answer at unix:///redis.sock" in page.text
+    assert http.get(f"/jobs/{record.id}").status_code == 200
+    health = http.get("/readyz")
+    assert (health.status_code, health.json()["parts"]["redis"]["ok"]) == (503, False)
+    assert 'graspd_part_up{part="redis"} 0.0' in http.get("/metrics").text
+
+
+def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise IndexUnavailable("the index does not answer")
+
+    for method in ("ping", "stats", "jobs"):
+        monkeypatch.setattr(Index, method, away)
+    answer = http.get("/", headers={"Accept": "text/html"})
+    assert (answer.status_code, answer.headers["content-type"]) == (503, "text/html; charset=utf-8")
+    assert "the index does not answer" in answer.text
+
+
+def test_an_unforeseen_error_is_a_page_that_gives_nothing_away(
+    http: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("a secret")
+
+    monkeypatch.setattr(Index, "stats", broken)
+    answer = http.get("/", headers={"Accept": "text/html"})
+    assert (answer.status_code, answer.headers["content-type"]) == (500, "text/html; charset=utf-8")
+    assert "a secret" not in answer.text
+    assert answer.headers["x-request-id"] in answer.text

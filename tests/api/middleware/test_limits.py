@@ -1,0 +1,245 @@
+"""Rates, requests at once and quotas, counted in a real Redis that two applications share."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, KeyLimits, Scope
+from api.app import create_app
+from api.middleware.body_limit import BodyLimit
+from api.middleware.rates import Allowance, Rates
+from service.model import names
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.queue.rq_queue import RqQueue
+from service.settings import Settings
+from service.store.records import read_record
+from tests.api.factories import finish_all
+
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+Twins = Callable[..., tuple[TestClient, TestClient]]
+
+
+@pytest.fixture
+def twins(settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue) -> Iterator[Twins]:
+    """Two applications over the same parts, keys and Redis."""
+    open_clients: list[TestClient] = []
+
+    def make(**changes: Any) -> tuple[TestClient, TestClient]:
+        wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server), **changes})
+        shared = Parts(wanted, parts.store, parts.index, parts.queue)
+        for _ in range(2):
+            client = TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000")
+            client.__enter__()
+            open_clients.append(client)
+        return open_clients[0], open_clients[1]
+
+    yield make
+    for client in open_clients:
+        client.__exit__(None, None, None)
+
+
+@pytest.fixture
+def keys(settings: Settings) -> KeyFile:
+    return KeyFile(settings.resolved_keys_file)
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+def test_two_applications_share_one_rate(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=6)))
+    first, second = twins()
+    answers = [client.get("/v1/stats", headers=headers).status_code for client in (first, second) * 4]
+    assert answers == [200] * 6 + [429] * 2
+
+
+def test_a_refusal_says_when_to_come_again(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=2)))
+    client, _ = twins()
+    client.get("/v1/stats", headers=headers)
+    assert client.get("/v1/stats", headers=headers).headers["ratelimit"].startswith('"requests";r=0;t=')
+    answer = client.get("/v1/stats", headers=headers)
+    assert (answer.status_code, answer.headers["content-type"]) == (429, "application/problem+json")
+    assert answer.json()["type"] == "/problems/too-many-requests"
+    assert answer.headers["ratelimit-policy"] == '"requests";q=2;w=60'
+    # One request of two a minute comes back every 30 s.
+    assert 28 <= int(answer.headers["retry-after"]) <= 30
+
+
+def test_a_key_without_a_limit_of_its_own_has_that_of_the_settings(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.READ))
+    client, _ = twins(requests_per_minute=1)
+    assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 429]
+
+
+def test_strangers_are_counted_by_address_and_do_not_use_up_a_key(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.READ))
+    client, _ = twins(address_requests_per_minute=2)
+    assert [client.get("/v1/stats", headers=bearer("gd_guess")).status_code for _ in range(3)] == [401, 401, 429]
+    assert client.get("/v1/stats", headers=headers).status_code == 200
+
+
+def test_whoever_guesses_keys_at_the_login_is_slowed_down(twins: Twins, keys: KeyFile) -> None:
+    keys.add("me", Scope.READ)
+    client, _ = twins(address_requests_per_minute=3)
+    answers = [client.post("/login", data={"key": f"gd_{i}"}).status_code for i in range(4)]
+    assert answers == [401, 401, 401, 429]
+
+
+def test_health_is_never_refused(twins: Twins, keys: KeyFile) -> None:
+    keys.add("me", Scope.READ)
+    client, _ = twins(address_requests_per_minute=1)
+    assert {client.get("/healthz").status_code for _ in range(4)} == {200}
+
+
+def test_an_open_service_counts_nothing(twins: Twins) -> None:
+    client, _ = twins(requests_per_minute=1, address_requests_per_minute=1)
+    assert {client.get("/v1/stats").status_code for _ in range(4)} == {200}
+
+
+def test_without_redis_the_limits_let_everybody_in(settings: Settings, parts: Parts, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.READ, limits=KeyLimits(requests_per_minute=1)))
+    with TestClient(create_app(settings, parts), base_url="http://127.0.0.1:8000") as client:
+        assert [client.get("/v1/stats", headers=headers).status_code for _ in range(2)] == [200, 200]
+
+
+def test_only_so_many_requests_are_answered_at_once(redis_server: str, rq_queue: RqQueue) -> None:
+    allowance = Allowance(per_minute=0, concurrency=2)
+
+    async def use() -> list[str]:
+        rates = Rates(redis_server)
+        found = [await rates.enter("key:me", allowance, name) for name in "abc"]
+        await rates.leave("key:me", "a")
+        found.append(await rates.enter("key:me", allowance, "d"))
+        found.append(await rates.enter("key:other", allowance, "e"))
+        await rates.close()
+        return [admission.refused for admission in found if admission is not None]
+
+    assert asyncio.run(use()) == ["", "", "concurrency", "", ""]
+
+
+def test_requests_of_a_killed_process_count_for_a_minute_at_most(redis_server: str, rq_queue: RqQueue) -> None:
+    rq_queue.connection.zadd("graspd:held:key:me", {"lost": time.time() - 1})
+
+    async def enter() -> str:
+        rates = Rates(redis_server)
+        admission = await rates.enter("key:me", Allowance(0, 1), "new")
+        await rates.close()
+        assert admission is not None
+        return admission.refused
+
+    assert asyncio.run(enter()) == ""
+    assert 0 < rq_queue.connection.pttl("graspd:held:key:me") <= 60_000
+
+
+def test_a_clock_set_back_shuts_nobody_out_for_longer_than_a_minute(redis_server: str, rq_queue: RqQueue) -> None:
+    rq_queue.connection.set("graspd:rate:key:me", time.time() + 86400)
+
+    async def enter() -> float:
+        rates = Rates(redis_server)
+        admission = await rates.enter("key:me", Allowance(10, 0), "new")
+        await rates.close()
+        assert admission is not None
+        return admission.seconds
+
+    assert asyncio.run(enter()) <= 60
+
+
+def test_more_jobs_a_day_than_the_quota_are_refused_until_midnight(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=2)))
+    clients = twins()
+    answers = [clients[i % 2].post("/v1/jobs", json=JOB | {"seed": i}, headers=headers) for i in range(3)]
+    assert [answer.status_code for answer in answers] == [202, 202, 429]
+    assert answers[2].json()["type"] == "/problems/quota-exceeded"
+    now = datetime.now(UTC)
+    left = 86400 - (now.hour * 3600 + now.minute * 60 + now.second)
+    assert abs(int(answers[2].headers["retry-after"]) - left) <= 5
+
+
+def test_the_same_job_again_costs_nothing(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1, grasps_in_flight=32)))
+    client, _ = twins()
+    assert {client.post("/v1/jobs", json=JOB, headers=headers).status_code for _ in range(3)} == {202}
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 429
+
+
+def test_a_refused_submission_costs_nothing(twins: Twins, keys: KeyFile) -> None:
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1)))
+    client, _ = twins()
+    assert client.post("/v1/jobs", json=JOB | {"hand": "claw"}, headers=headers).status_code == 404
+    assert client.post("/v1/jobs", json=JOB, headers=headers).status_code == 202
+
+
+def test_grasps_in_flight_come_free_as_jobs_end(twins: Twins, keys: KeyFile, parts: Parts) -> None:
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
+    client, _ = twins()
+    first = client.post("/v1/jobs", json=JOB, headers=headers).json()["id"]
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
+    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
+
+
+def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
+    twins: Twins, keys: KeyFile, parts: Parts
+) -> None:
+    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
+    client, _ = twins()
+    matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}
+    large = client.post("/v1/datasets", json=matrix | {"grasps": 33}, headers=headers)
+    assert large.status_code == 429 and client.get("/v1/datasets", headers=headers).json()["items"] == []
+    for _ in range(2):
+        assert client.post("/v1/datasets", json=matrix, headers=headers).status_code == 202
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 429
+    assert client.post("/v1/datasets/d/cancel", headers=headers).status_code == 202
+    while DatasetRounds(parts).advance(10):
+        pass
+    assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
+    assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
+
+
+def test_the_quota_of_one_key_is_not_that_of_another(twins: Twins, keys: KeyFile) -> None:
+    mine, yours = (keys.add(name, Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1)) for name in ("me", "you"))
+    client, _ = twins()
+    answers = [
+        client.post("/v1/jobs", json=JOB | {"seed": i}, headers=bearer(key)) for i, key in enumerate((mine, yours))
+    ]
+    assert {answer.status_code for answer in answers} == {202}
+
+
+def test_an_idempotency_key_belongs_to_the_key_that_sent_it(twins: Twins, keys: KeyFile) -> None:
+    mine, yours = (bearer(keys.add(name, Scope.SUBMIT)) | {"Idempotency-Key": "1"} for name in ("me", "you"))
+    first, second = twins()
+    assert first.post("/v1/jobs", json=JOB, headers=mine).status_code == 202
+    assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=mine).status_code == 422
+    assert second.post("/v1/jobs", json=JOB | {"seed": 1}, headers=yours).status_code == 202
+
+
+def test_a_body_that_stops_coming_is_given_up() -> None:
+    sent: list[dict[str, Any]] = []
+
+    async def reads_all(scope: Any, receive: Any, send: Any) -> None:
+        while (await receive()).get("more_body"):
+            pass
+
+    async def silent() -> dict[str, Any]:
+        await asyncio.sleep(60)
+        return {}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1, piece_s=0.05)
+    scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
+    asyncio.run(limit(scope, silent, send))
+    assert sent[0]["status"] == 408

@@ -1,0 +1,82 @@
+"""Conditional requests and HEAD on downloads (RFC 9110), methods that an address takes, and the framing of bodies."""
+
+from __future__ import annotations
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.pipeline.backends import Parts
+from tests.api.factories import add_job, finish_all
+
+
+@pytest.fixture
+def file(http: TestClient, parts: Parts) -> str:
+    """Address of a shard's file."""
+    return f"/v1/shards/{finish_all(parts, add_job(parts))[0].shard_id}/file"
+
+
+@pytest.fixture
+def model(parts: Parts) -> str:
+    return "/v1/hands/allegro/model"
+
+
+@pytest.mark.parametrize("what", ["file", "model"])
+@pytest.mark.parametrize("form", ["{}", "W/{}", '"other", {}', "*"])
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_what_a_client_has_is_not_sent_again(
+    http: TestClient, request: pytest.FixtureRequest, what: str, form: str, method: str
+) -> None:
+    address = request.getfixturevalue(what)
+    etag = http.get(address).headers["etag"]
+    answer = http.request(method, address, headers={"If-None-Match": form.format(etag), "Range": "bytes=0-9"})
+    assert (answer.status_code, answer.content, answer.headers["etag"]) == (304, b"", etag)
+    assert "cache-control" in answer.headers
+
+
+@pytest.mark.parametrize("what", ["file", "model"])
+def test_another_tag_sends_the_file(http: TestClient, request: pytest.FixtureRequest, what: str) -> None:
+    address = request.getfixturevalue(what)
+    assert http.get(address, headers={"If-None-Match": '"other"'}).status_code == 200
+
+
+def test_half_a_file_is_completed_where_it_is_the_same(http: TestClient, file: str) -> None:
+    whole = http.get(file)
+    wanted = {"Range": "bytes=100-", "If-Range": whole.headers["etag"]}
+    part = http.get(file, headers=wanted)
+    assert (part.status_code, part.content) == (206, whole.content[100:])
+
+
+@pytest.mark.parametrize("validator", ['"other"', "W/{}", "Sat, 21 Nov 2026 00:00:00 GMT"])
+def test_half_a_file_is_sent_whole_where_it_may_be_another(http: TestClient, file: str, validator: str) -> None:
+    whole = http.get(file)
+    wanted = {"Range": "bytes=100-", "If-Range": validator.format(whole.headers["etag"])}
+    answer = http.get(file, headers=wanted)
+    assert (answer.status_code, answer.content) == (200, whole.content)
+
+
+@pytest.mark.parametrize("what", ["file", "model"])
+def test_head_says_what_get_would_and_sends_nothing(
+    http: TestClient, request: pytest.FixtureRequest, what: str
+) -> None:
+    address = request.getfixturevalue(what)
+    whole, head = http.get(address), http.head(address, headers={"Range": "bytes=0-9"})
+    assert (head.status_code, head.content) == (200, b"")
+    same = ("content-length", "content-type", "etag", "cache-control", "accept-ranges")
+    assert {name: head.headers.get(name) for name in same} == {name: whole.headers.get(name) for name in same}
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD", "PUT", "DELETE"])
+def test_the_address_of_estimates_takes_nothing_but_post(http: TestClient, method: str) -> None:
+    answer = http.request(method, "/v1/datasets/estimate")
+    assert (answer.status_code, answer.headers["allow"]) == (405, "POST")
+
+
+def test_no_dataset_takes_the_name_of_the_estimates(http: TestClient) -> None:
+    matrix = {"name": "estimate", "hands": ["allegro"], "objects": ["mug"]}
+    assert http.post("/v1/datasets", json=matrix).status_code == 422
+
+
+def test_a_body_of_two_lengths_is_refused_and_the_connection_ends(http: TestClient) -> None:
+    both = {"Transfer-Encoding": "chunked", "Content-Length": "2"}
+    answer = http.post("/v1/jobs", content=b"{}", headers=both)
+    assert (answer.status_code, answer.headers["connection"]) == (400, "close")

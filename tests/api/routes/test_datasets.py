@@ -1,0 +1,165 @@
+"""`/v1/datasets` and `/v1/object-sets`: answers, places, pages, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.model import names
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.store.records import read_record
+from service.store.study_records import publish
+from tests.api.factories import finish_all
+from tests.service.pipeline.test_fidelity_choice import CHART
+
+WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
+
+
+@pytest.fixture
+def kitchen(http: TestClient) -> dict[str, Any]:
+    answer = http.post("/v1/datasets", json=WANTED)
+    assert answer.status_code == 202
+    return answer.json()
+
+
+def carry_out(parts: Parts) -> None:
+    while DatasetRounds(parts).advance(10):
+        pass
+
+
+def finish_cells(parts: Parts, http: TestClient, count: int) -> None:
+    """Do all tasks of the first cells."""
+    carry_out(parts)
+    for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
+        finish_all(parts, read_record(JobRecord, parts.store, names.job_record(cell["job_id"])))
+
+
+def test_a_new_dataset_is_accepted_with_its_place(http: TestClient) -> None:
+    answer = http.post("/v1/datasets", json=WANTED)
+    assert answer.status_code == 202
+    assert answer.headers["Location"] == "/v1/datasets/kitchen" and answer.headers["Retry-After"] == "1"
+    dataset = http.get("/v1/datasets/kitchen").json()
+    assert dataset == answer.json()
+    assert (dataset["cells"], dataset["state"], dataset["asked"]) == (4, "queued", 256)
+    assert [one["name"] for one in http.get("/v1/datasets").json()["items"]] == ["kitchen"]
+
+
+def test_a_dataset_that_is_done_is_found_again_with_200(
+    http: TestClient, parts: Parts, kitchen: dict[str, Any]
+) -> None:
+    finish_cells(parts, http, 4)
+    again = http.post("/v1/datasets", json=WANTED)
+    assert again.status_code == 200 and again.json()["state"] == "succeeded"
+
+
+def test_options_of_the_method_reach_the_jobs_of_the_cells(http: TestClient, parts: Parts) -> None:
+    answer = http.post("/v1/datasets", json=WANTED | {"method": "graspit", "options": {"keep": 20}})
+    assert answer.json()["options"]["options"] == {"keep": 20}
+    carry_out(parts)
+    cell = http.get("/v1/datasets/kitchen/cells").json()["items"][0]
+    assert http.get(f"/v1/jobs/{cell['job_id']}").json()["request"]["options"] == {"keep": 20}
+    assert "graspit keep=20" in http.get("/datasets/kitchen").text
+
+
+def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, parts: Parts) -> None:
+    wanted = WANTED | {"fidelity": "auto", "target": "gsr>=0.6"}
+    for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", {**wanted, "name": None})):
+        body = {key: value for key, value in body.items() if value is not None}
+        answer = http.post(path, json=body)
+        assert answer.status_code == 422 and "graspd chart --publish" in answer.text
+    publish(parts.store, "charts", CHART)
+    assert http.post("/v1/datasets", json=wanted).status_code == 202
+    cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
+    assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}
+    assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
+
+
+def test_cells_come_in_pages_with_a_link_to_the_next(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
+    finish_cells(parts, http, 1)
+    first = http.get("/v1/datasets/kitchen/cells", params={"limit": 3})
+    address = first.headers["Link"].partition(">")[0].lstrip("<")
+    cells = first.json()["items"] + http.get(address).json()["items"]
+    pairs = [(cell["hand"], cell["object"]) for cell in cells]
+    assert pairs == [("allegro", "mug"), ("allegro", "block"), ("barrett", "mug"), ("barrett", "block")]
+    assert [cell["state"] for cell in cells] == ["succeeded", "queued", "queued", "queued"]
+    done = http.get("/v1/datasets/kitchen/cells", params={"state": "succeeded"}).json()["items"]
+    assert [cell["position"] for cell in done] == [0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "words"),
+    [
+        ({"hands": ["foot"]}, 404, "there is no hand 'foot'"),
+        ({"objects": []}, 422, "needs objects"),
+        ({"hands": []}, 422, "hands"),
+        ({"grasps": 0}, 422, "grasps"),
+        ({"views": 2}, 422, "views need scenes"),
+        ({"fidelity": "superb"}, 422, "unknown fidelity"),
+        ({"name": "../etc"}, 422, "name"),
+        ({"colour": "red"}, 422, "colour"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(http: TestClient, changes: dict[str, Any], status: int, words: str) -> None:
+    answer = http.post("/v1/datasets", json=WANTED | changes)
+    assert answer.status_code == status and words in answer.json()["detail"]
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert http.get("/v1/datasets").json()["items"] == []
+
+
+def test_another_dataset_of_the_same_name_is_a_conflict(http: TestClient, kitchen: dict[str, Any]) -> None:
+    answer = http.post("/v1/datasets", json=WANTED | {"grasps": 32})
+    assert answer.status_code == 409
+    assert answer.json()["detail"] == "there is another dataset named 'kitchen' (its grasps is 64); take another name"
+
+
+def test_an_estimate_records_nothing(http: TestClient) -> None:
+    matrix = {key: value for key, value in WANTED.items() if key != "name"}
+    found = http.post("/v1/datasets/estimate", json=matrix | {"grasps": 1_000_000, "scenes": 1}).json()
+    assert found["asked"] == 4_000_000 and [plan["workers"] for plan in found["plans"]] == [1, 8, 64]
+    assert all(rate["origin"].startswith("stored default") for rate in found["rates"])
+    assert http.get("/v1/datasets").json()["items"] == []
+
+
+def test_cancel_and_retry_are_accepted_once(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
+    carry_out(parts)
+    assert http.post("/v1/datasets/kitchen/retry").status_code == 409
+    assert http.post("/v1/datasets/kitchen/cancel").status_code == 202
+    assert http.post("/v1/datasets/kitchen/cancel").status_code == 409
+    carry_out(parts)
+    assert http.get("/v1/datasets/kitchen").json()["state"] == "cancelled"
+    assert http.post("/v1/datasets/kitchen/retry").status_code == 202
+    carry_out(parts)
+    assert http.get("/v1/datasets/kitchen").json()["state"] == "queued"
+
+
+def test_a_snapshot_is_made_once_and_names_checksums(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
+    assert http.post("/v1/datasets/kitchen/snapshots").status_code == 409
+    finish_cells(parts, http, 2)
+    taken = http.post("/v1/datasets/kitchen/snapshots")
+    assert taken.status_code == 201 and taken.json()["shards"] == 4 and not taken.json()["complete"]
+    assert http.post("/v1/datasets/kitchen/snapshots").status_code == 200
+    assert http.get("/v1/datasets/kitchen/snapshots").json()["items"] == [taken.json()]
+    whole = http.get(taken.headers["Location"]).json()
+    for shard in whole["shards"]:
+        assert shard["sha256"] == http.get(f"/v1/shards/{shard['id']}").json()["sha256"]
+
+
+def test_unknown_datasets_are_404(http: TestClient) -> None:
+    for path in ("", "/cells", "/snapshots", f"/snapshots/{'0' * 32}"):
+        assert http.get(f"/v1/datasets/none{path}").status_code == 404
+    for path in ("cancel", "retry", "snapshots"):
+        assert http.post(f"/v1/datasets/none/{path}").status_code == 404
+
+
+def test_objects_get_a_name_together_and_make_a_dataset(http: TestClient) -> None:
+    answer = http.post("/v1/object-sets", json={"name": "all", "objects": ["mug", "bottle", "block"]})
+    assert answer.status_code == 201 and answer.headers["Location"] == "/v1/object-sets/all"
+    assert http.get("/v1/object-sets").json() == [http.get("/v1/object-sets/all").json()]
+    dataset = http.post("/v1/datasets", json={"name": "d", "hands": ["allegro"], "sets": ["all"]}).json()
+    assert dataset["objects"] == ["block", "bottle", "mug"]
+    assert http.post("/v1/object-sets", json={"name": "all", "objects": ["moon"]}).status_code == 404
+    assert http.get("/v1/object-sets/none").status_code == 404

@@ -1,0 +1,109 @@
+"""`/v1/jobs`: submit, list, watch, cancel, retry."""
+
+from __future__ import annotations
+
+import pytest
+from starlette.testclient import TestClient
+
+from api.client.client import parse_events
+from service.model.planning import plan
+from service.pipeline.backends import Parts
+from tests.api.factories import add_job, fail, finish, finish_all
+
+JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1}
+
+
+def test_a_submitted_job_is_accepted_with_its_address(http: TestClient) -> None:
+    answer = http.post("/v1/jobs", json=JOB)
+    assert answer.status_code == 202
+    assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
+    assert int(answer.headers["retry-after"]) > 0
+    job = http.get(answer.headers["location"]).json()
+    assert job["state"] == "queued"
+    assert [(stage["stage"], stage["tasks"]) for stage in job["stages"]] == [
+        ("synthesize", 2),
+        ("scene", 2),
+        ("render", 2),
+    ]
+
+
+def test_the_same_request_is_the_same_job(http: TestClient) -> None:
+    first, second = (http.post("/v1/jobs", json=JOB).json()["id"] for _ in range(2))
+    assert first == second
+    assert len(http.get("/v1/jobs").json()["items"]) == 1
+
+
+def test_a_job_that_is_done_is_found_again_with_200(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, grasps=32)
+    finish_all(parts, record)
+    answer = http.post("/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 32})
+    assert (answer.status_code, answer.json()["id"]) == (200, record.id)
+
+
+def test_a_finished_job_says_its_counts_means_and_shards(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, grasps=40, scenes=2, views=3, stereo=True)
+    manifests = finish_all(parts, record)
+    job = http.get(f"/v1/jobs/{record.id}").json()
+    grasps = [grasp for manifest in manifests for grasp in manifest.grasps]
+    valid = [grasp for grasp in grasps if grasp.valid]
+    assert (job["state"], job["grasps"], job["valid"], job["progress"]) == ("succeeded", 40, len(valid), 1.0)
+    assert job["mean"]["epsilon"] == pytest.approx(sum(grasp.epsilon or 0 for grasp in valid) / len(valid))
+    assert {shard["id"] for shard in job["shards"]} == {manifest.shard_id for manifest in manifests}
+
+
+def test_a_half_done_job_says_how_far_each_stage_is(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, grasps=64, scenes=1)
+    tasks = list(plan(record))
+    finish(parts, record, tasks[0])
+    job = http.get(f"/v1/jobs/{record.id}").json()
+    assert {stage["stage"]: stage["progress"] for stage in job["stages"]} == {"synthesize": 0.5, "scene": 0.0}
+    assert job["progress"] == 0.25
+    assert job["stages"][0]["eta_s"] == pytest.approx(12.5)
+
+
+def test_a_failed_job_keeps_its_reason_and_its_attempts(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts)
+    fail(parts, record, "the mesh is not watertight")
+    job = http.get(f"/v1/jobs/{record.id}").json()
+    assert (job["state"], job["reason"]) == ("failed", "the mesh is not watertight")
+    assert [(attempt["number"], attempt["last"]) for attempt in job["attempts"]] == [(1, True)]
+
+
+def test_pages_of_jobs_meet_without_gap_or_overlap(http: TestClient, parts: Parts) -> None:
+    ids = [add_job(parts, seed=seed).id for seed in range(5)]
+    seen, path = [], "/v1/jobs?limit=2"
+    while path:
+        answer = http.get(path)
+        seen += [job["id"] for job in answer.json()["items"]]
+        path = answer.links["next"]["url"] if "next" in answer.links else ""
+    assert seen == ids[::-1]
+
+
+def test_jobs_are_filtered_by_state(http: TestClient, parts: Parts) -> None:
+    done = add_job(parts, seed=1)
+    finish_all(parts, done)
+    add_job(parts, seed=2)
+    assert [job["id"] for job in http.get("/v1/jobs?state=succeeded").json()["items"]] == [done.id]
+
+
+def test_a_cancelled_job_is_cancelled_and_can_be_retried(http: TestClient) -> None:
+    job = http.post("/v1/jobs", json=JOB).json()["id"]
+    assert http.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
+    assert http.post(f"/v1/jobs/{job}/cancel").status_code == 409
+    assert http.post(f"/v1/jobs/{job}/retry").json()["state"] == "queued"
+
+
+def test_events_of_a_finished_job_say_its_end(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts)
+    finish_all(parts, record)
+    with http.stream("GET", f"/v1/jobs/{record.id}/events") as answer:
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        events = list(parse_events(iter(answer.iter_lines())))
+    assert [name for name, _ in events] == ["progress", "end"]
+    assert events[-1][1]["state"] == "succeeded"
+
+
+def test_events_of_an_unknown_job_are_a_problem_not_a_stream(http: TestClient) -> None:
+    answer = http.get("/v1/jobs/none/events")
+    assert answer.status_code == 404
+    assert answer.headers["content-type"] == "application/problem+json"

@@ -1,0 +1,115 @@
+"""`/v1/shards` and `/v1/grasps`: what was made."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+import h5py
+import pytest
+from starlette.testclient import TestClient
+
+from api.dashboard.pictures import Pictures
+from api.routes.shards import parse_range
+from service.pipeline.backends import Parts
+from service.store.store import Store
+from tests.api.factories import add_job, finish_all
+from tests.damage import cut, flip, remove
+
+
+@pytest.fixture
+def shard(http: TestClient, parts: Parts) -> str:
+    record = add_job(parts)
+    return finish_all(parts, record)[0].shard_id
+
+
+def test_a_downloaded_shard_opens_as_hdf5(http: TestClient, shard: str) -> None:
+    answer = http.get(f"/v1/shards/{shard}/file")
+    assert answer.headers["content-type"] == "application/x-hdf5"
+    with h5py.File(io.BytesIO(answer.content)) as file:
+        assert file["grasp/hand_pose"].shape == (32, 7)
+
+
+def test_the_sum_of_a_shard_is_its_etag(http: TestClient, shard: str) -> None:
+    sha256 = http.get(f"/v1/shards/{shard}").json()["sha256"]
+    assert http.get(f"/v1/shards/{shard}/file").headers["etag"] == f'"{sha256}"'
+
+
+@pytest.mark.parametrize(
+    ("header", "start", "stop"), [("bytes=0-99", 0, 100), ("bytes=100-", 100, None), ("bytes=-7", -7, None)]
+)
+def test_a_range_gives_just_its_bytes(http: TestClient, shard: str, header: str, start: int, stop: int | None) -> None:
+    whole = http.get(f"/v1/shards/{shard}/file").content
+    part = http.get(f"/v1/shards/{shard}/file", headers={"Range": header})
+    assert part.status_code == 206
+    assert part.content == whole[start:stop]
+    assert part.headers["content-range"].endswith(f"/{len(whole)}")
+
+
+def test_a_range_behind_the_end_is_refused_with_the_size(http: TestClient, shard: str) -> None:
+    answer = http.get(f"/v1/shards/{shard}/file", headers={"Range": "bytes=99999999-"})
+    assert answer.status_code == 416
+    assert answer.headers["content-range"].startswith("bytes */")
+
+
+@pytest.mark.parametrize("header", [None, "bytes=-", "items=0-3", "bytes=0-1,4-5"])
+def test_a_range_that_is_not_a_single_byte_range_sends_the_whole(header: str | None) -> None:
+    assert parse_range(header, 100) is None
+
+
+def test_a_store_that_signs_hands_the_file_out_itself(
+    http: TestClient, parts: Parts, shard: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(type(parts.store), "sign", lambda *_, **__: "https://bucket.example/signed")
+    answer = http.get(f"/v1/shards/{shard}/file", follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (307, "https://bucket.example/signed")
+
+
+def test_grasps_come_in_the_order_asked_for(http: TestClient, shard: str) -> None:
+    grasps = http.get("/v1/grasps", params={"sort": "penetration_depth_mm", "order": "asc"}).json()["items"]
+    depths = [grasp["penetration_depth_mm"] for grasp in grasps]
+    assert depths == sorted(depths)
+
+
+def test_every_filter_of_grasps_holds(http: TestClient, shard: str) -> None:
+    query = {"hand": "allegro", "valid": "true", "min_epsilon": 0.1, "max_intersection_volume_cm3": 0.3}
+    grasps = http.get("/v1/grasps", params=query).json()["items"]
+    assert grasps
+    assert all(g["valid"] and g["epsilon"] >= 0.1 and g["intersection_volume_cm3"] <= 0.3 for g in grasps)
+    assert http.get("/v1/grasps", params=query | {"hand": "shadow"}).json()["items"] == []
+
+
+def test_an_unknown_filter_is_refused(http: TestClient) -> None:
+    assert http.get("/v1/grasps", params={"colour": "red"}).status_code == 422
+
+
+def test_pages_of_grasps_meet_without_gap_or_overlap(http: TestClient, shard: str) -> None:
+    seen, path = [], "/v1/grasps?limit=7"
+    while path:
+        answer = http.get(path)
+        seen += [(grasp["shard_id"], grasp["row"]) for grasp in answer.json()["items"]]
+        path = answer.links["next"]["url"] if "next" in answer.links else ""
+    assert len(seen) == len(set(seen)) == 32
+
+
+@pytest.mark.parametrize("harm", [flip, cut, remove])
+@pytest.mark.parametrize("path", ["/v1/shards/{}/file", "/v1/grasps/{}/0"])
+def test_a_damaged_shard_is_refused_with_its_name(
+    http: TestClient, parts: Parts, shard: str, harm: Callable[[Store, str], None], path: str
+) -> None:
+    harm(parts.store, f"shards/base/{shard}.h5")
+    answer = http.get(path.format(shard), headers={"Range": "bytes=0-9"})
+    assert (answer.status_code, answer.json()["type"]) == (500, "/problems/damaged-shard")
+    assert shard in answer.json()["detail"]
+    assert "etag" not in answer.headers
+    assert "immutable" not in answer.headers.get("cache-control", "")
+
+
+def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, parts: Parts) -> None:
+    views = finish_all(parts, add_job(parts, scenes=1, views=2, width=24, height=16))[-1]
+    assert http.get(f"/shards/{views.shard_id}/pictures/0.png").status_code == 200
+    flip(parts.store, views.key)
+    http.app.state.pictures = Pictures(parts.store)  # type: ignore[attr-defined]
+    answer = http.get(f"/shards/{views.shard_id}/pictures/0.png")
+    assert answer.status_code == 500
+    assert views.key in answer.text

@@ -1,0 +1,253 @@
+"""An index that is lost, removed under its readers, or damaged; and a store some of whose records are damaged."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from service.index.index import Index
+from service.index.rebuild import differences, rebuild
+from service.model import names
+from service.model.domain import AssetKind, State
+from service.model.errors import IndexUnavailable
+from service.model.planning import plan
+from service.model.records import AttemptRecord, JobRecord
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.keeper import Keeper
+from service.run.commands import app
+from service.settings import Settings
+from service.store.library import stored_assets
+from service.store.records import add_job_event, put_record, read_record
+from service.store.store import open_store
+from tests.damage import overwrite
+from tests.fakes import add_assets, make_shard, message_for, request
+from tests.memory_queue import MemoryQueue
+
+GOOD = 3
+DAMAGED = b'{"x": 1}'
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[Parts]:
+    """A service on files with some jobs."""
+    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
+    index = Index(settings.resolved_index_url)
+    made = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    add_assets(made)
+    for seed in range(GOOD):
+        job_actions.submit(made, request(seed=seed))
+    yield made
+    made.close()
+
+
+def lost(parts: Parts) -> Parts:
+    """The same service with an index that knows nothing."""
+    index = Index(f"sqlite:///{parts.settings.data_dir / 'fresh.sqlite'}")
+    return Parts(parts.settings, parts.store, index, MemoryQueue())
+
+
+def shown(index: Index) -> int:
+    return len(index.jobs(limit=99).items)
+
+
+def a_job(parts: Parts) -> str:
+    return parts.index.jobs().items[0].id
+
+
+def of_job(parts: Parts) -> str:
+    return names.job_record(a_job(parts))
+
+
+def of_manifest(parts: Parts) -> str:
+    return names.shard_manifest(*made_one(parts))
+
+
+def made_one(parts: Parts) -> tuple[object, str]:  # type: ignore[type-arg]
+    made = make_shard(parts.store, message_for(seed=99))
+    return made.stage, made.shard_id
+
+
+def of_attempt(parts: Parts) -> str:
+    task = next(plan(read_record(JobRecord, parts.store, of_job(parts))))
+    key = names.attempt(task.id, 1)
+    fields = {"stage": task.stage, "number": 1, "kind": "K", "reason": "r", "worker": "w", "ended": "", "last": False}
+    put_record(parts.store, key, AttemptRecord(task_id=task.id, job_id=a_job(parts), **fields))
+    return key
+
+
+def of_event(parts: Parts) -> str:
+    return names.job_event(a_job(parts), add_job_event(parts.store, a_job(parts), "cancelled").number, "cancelled")
+
+
+def of_asset(parts: Parts) -> str:
+    return names.asset_record(*next(a for a in stored_assets(parts.store) if a[0] is AssetKind.OBJECT))
+
+
+def of_check(parts: Parts) -> str:
+    return names.asset_check(*next(a for a in stored_assets(parts.store) if a[0] is AssetKind.OBJECT))
+
+
+def of_dataset(parts: Parts) -> str:
+    return put(parts, names.dataset_record("kitchen"))
+
+
+def of_snapshot(parts: Parts) -> str:
+    return put(parts, names.dataset_snapshot("kitchen", "a" * 32))
+
+
+def put(parts: Parts, key: str) -> str:
+    parts.store.put(key, b"{}")
+    return key
+
+
+RECORDS = [of_job, of_manifest, of_attempt, of_event, of_asset, of_check, of_dataset, of_snapshot]
+
+
+@pytest.mark.parametrize("record", RECORDS)
+def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(parts: Parts, record: Callable[[Parts], str]) -> None:
+    key = record(parts)
+    overwrite(parts.store, key, DAMAGED)
+    fresh = lost(parts)
+    Keeper(fresh).round()
+    assert shown(fresh.index) == GOOD - (record is of_job)
+    made = fresh.index.completeness()
+    assert made is not None
+    assert (made.left_out, made.names) == (1, (key,))
+    fresh.index.close()
+
+
+def test_a_record_that_was_mended_is_there_again(parts: Parts) -> None:
+    key = of_job(parts)
+    whole = parts.store.get(key)
+    overwrite(parts.store, key, DAMAGED)
+    fresh = lost(parts)
+    Keeper(fresh).round()
+    overwrite(parts.store, key, whole)
+    Keeper(fresh).round()
+    assert shown(fresh.index) == GOOD
+    assert (made := fresh.index.completeness()) is not None
+    assert made.left_out == 0
+    fresh.index.close()
+
+
+def test_one_new_job_does_not_make_a_lost_index_whole(parts: Parts) -> None:
+    fresh = lost(parts)
+    fresh.index.add_job(read_record(JobRecord, parts.store, of_job(parts)))
+    assert fresh.index.completeness() is None
+    Keeper(fresh).round()
+    assert shown(fresh.index) == GOOD
+    assert differences(fresh.index, fresh.store) == []
+    fresh.index.close()
+
+
+def test_a_damaged_attempt_fails_its_task_and_stops_no_round(parts: Parts) -> None:
+    clock = Clock()
+    keeper = Keeper(parts, clock=clock)
+    keeper.round()
+    overwrite(parts.store, of_attempt(parts), DAMAGED)
+    delivery = parts.queue.take("w")  # type: ignore[attr-defined]
+    parts.queue._held.clear()  # type: ignore[attr-defined]
+    for _ in range(6):
+        clock.now += 1.0
+        keeper.round()
+    assert delivery is not None
+    assert sum(job.state is State.FAILED for job in parts.index.jobs().items) <= 1
+
+
+class Clock:
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def remove_file(folder: Path) -> None:
+    for path in folder.glob("index.sqlite*"):
+        path.unlink()
+
+
+def remove_only_the_file(folder: Path) -> None:
+    (folder / "index.sqlite").unlink()
+
+
+@pytest.mark.parametrize("remove", [remove_file, remove_only_the_file])
+def test_an_index_removed_under_its_readers_is_made_again_for_all_of_them(
+    parts: Parts, remove: Callable[[Path], None]
+) -> None:
+    keeper = Keeper(parts)
+    keeper.round()
+    other = Index(parts.settings.resolved_index_url)
+    assert shown(other) == GOOD
+    remove(parts.settings.data_dir)
+    keeper.round()
+    assert shown(other) == shown(parts.index) == GOOD
+    job_actions.submit(Parts(parts.settings, parts.store, other, parts.queue), request(seed=50))
+    assert shown(parts.index) == GOOD + 1
+    assert differences(parts.index, parts.store) == []
+    other.close()
+
+
+def scribble_over_the_log(folder: Path) -> None:
+    """Of writes, while others have it open."""
+    log = folder / "index.sqlite-wal"
+    with log.open("r+b") as file:
+        file.write(os.urandom(log.stat().st_size))
+
+
+def scribble_over_the_file(folder: Path) -> None:
+    with sqlite3.connect(folder / "index.sqlite") as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    (folder / "index.sqlite").write_bytes(os.urandom((folder / "index.sqlite").stat().st_size))
+
+
+def scribble_over_its_tables(folder: Path) -> None:
+    with sqlite3.connect(folder / "index.sqlite") as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    with (folder / "index.sqlite").open("r+b") as file:
+        file.seek(4096)
+        file.write(os.urandom(file.seek(0, 2) - 4096))
+
+
+HARMS = [scribble_over_the_log, scribble_over_the_file, scribble_over_its_tables]
+
+
+@pytest.mark.parametrize("harm", HARMS)
+def test_a_damaged_file_gives_way_to_a_rebuilt_one(parts: Parts, harm: Callable[[Path], None]) -> None:
+    rebuild(parts.index, parts.store)
+    harm(parts.settings.data_dir)
+    command = ["index", "rebuild", "--json", "--data-dir", str(parts.settings.data_dir)]
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 0, told.output
+    assert json.loads(told.stdout.splitlines()[-1])["jobs"] == GOOD
+    assert shown(parts.index) == GOOD, "who had it open sees the new one"
+    assert CliRunner().invoke(app, [*command, "--check"]).exit_code == 0
+
+
+@pytest.mark.parametrize("harm", HARMS)
+def test_a_keeper_outlives_a_damaged_index(parts: Parts, harm: Callable[[Path], None]) -> None:
+    keeper = Keeper(parts)
+    keeper.round()
+    harm(parts.settings.data_dir)
+    for _ in range(4):
+        try:
+            keeper.round()
+        except IndexUnavailable:
+            continue
+    assert shown(parts.index) == GOOD
+    assert differences(parts.index, parts.store) == []
+
+
+def test_a_check_names_a_damaged_record_and_exits_with_1(parts: Parts) -> None:
+    rebuild(parts.index, parts.store)
+    key = of_job(parts)
+    overwrite(parts.store, key, DAMAGED)
+    told = CliRunner().invoke(app, ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)])
+    assert told.exit_code == 1
+    assert key in told.output

@@ -1,0 +1,94 @@
+"""Migrations up and down with data in them, on every database: no row is lost that the older schema can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Engine, create_engine, inspect, text
+
+from benchmarks.large_index import fill
+from service.index.database import _MIGRATIONS, downgrade
+from service.index.index import Index
+from service.index.tables import metadata
+from service.index.views import Stats
+from service.model.errors import IndexUnavailable, InputError
+from service.store.store import open_store
+
+_CONFIG = Config()
+_CONFIG.set_main_option("script_location", str(_MIGRATIONS))
+REVISIONS = [script.revision for script in ScriptDirectory.from_config(_CONFIG).walk_revisions()][::-1]
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of an index with some data, of each kind in turn."""
+    made = f"sqlite:///{tmp_path / 'index.sqlite'}"
+    if request.param == "postgres":
+        made = request.getfixturevalue("postgres_server").database()
+    index = Index(made)
+    fill(index, open_store("memory://"), grasps=600, jobs=20)
+    index.close()
+    return made
+
+
+@pytest.fixture
+def engine(url: str) -> Iterator[Engine]:
+    made = create_engine(url)
+    yield made
+    made.dispose()
+
+
+def rows(engine: Engine) -> dict[str, int]:
+    """Number of rows of each table that is there."""
+    with engine.connect() as connection:
+        tables = inspect(connection).get_table_names()
+        return {name: connection.scalar(text(f'SELECT count(*) FROM "{name}"')) for name in tables}
+
+
+def read(url: str) -> tuple[Stats, list[str], list[float | None]]:
+    """What the index answers once it is at the newest revision."""
+    index = Index(url)
+    try:
+        jobs = [f"{job.id} {job.state} {job.grasps} {job.valid}" for job in index.jobs(limit=50).items]
+        return index.stats(), jobs, [grasp.epsilon for grasp in index.grasps(limit=200).items]
+    finally:
+        index.close()
+
+
+@pytest.mark.parametrize("revision", REVISIONS[:-1])
+def test_a_schema_goes_back_and_forward_with_its_rows(url: str, engine: Engine, revision: str) -> None:
+    before, counts = read(url), rows(engine)
+    downgrade(url, revision)
+    kept = rows(engine)
+    assert kept["grasps"] > 0
+    assert {name: number for name, number in counts.items() if name in kept} == kept
+    assert read(url) == before
+    with engine.connect() as connection:
+        made = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(made, metadata) == []
+
+
+def test_the_first_revision_can_be_taken_back_too(url: str, engine: Engine) -> None:
+    downgrade(url, "base")
+    assert set(rows(engine)) == {"alembic_version"}
+    index = Index(url)
+    assert not index.has_jobs()
+    index.close()
+
+
+def test_a_revision_that_is_not_there_is_named(url: str) -> None:
+    with pytest.raises(InputError, match="'4711'"):
+        downgrade(url, "4711")
+
+
+def test_an_index_of_a_newer_graspd_is_refused_with_the_ways_out(url: str, engine: Engine) -> None:
+    with engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    with pytest.raises(IndexUnavailable, match=r"another version of graspd .*9999.*delete the index"):
+        Index(url)

@@ -1,0 +1,88 @@
+"""Cores are those that the process is given: affinity and control groups of both versions."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from service.model.cores import available_cores
+
+MACHINE = 16
+
+
+@pytest.fixture(autouse=True)
+def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2 * MACHINE)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(MACHINE)), raising=False)
+
+
+def system(root: Path, group: str, **files: str) -> Path:
+    """A file system in which this process is in `group`; names of files are paths, with __ for a slash."""
+    held = {"proc/self/cgroup": group + "\n"}
+    held |= {"sys/fs/cgroup/" + name.replace("__", "/").replace("_max", ".max"): text for name, text in files.items()}
+    for name, text in held.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return root
+
+
+def v1(root: Path, folder: str, quota: int) -> None:
+    place = root / "sys/fs/cgroup" / folder
+    place.mkdir(parents=True)
+    (place / "cpu.cfs_quota_us").write_text(f"{quota}\n")
+    (place / "cpu.cfs_period_us").write_text("100000\n")
+
+
+def test_without_control_groups_the_affinity_counts_not_the_machine(tmp_path: Path) -> None:
+    assert available_cores(tmp_path) == MACHINE
+
+
+def test_a_system_without_affinity_gives_its_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert available_cores(tmp_path) == 2 * MACHINE
+
+
+@pytest.mark.parametrize(
+    ("limit", "cores"),
+    [("200000 100000", 2), ("150000 100000", 2), ("50000 100000", 1), ("max 100000", MACHINE), ("9900000 100000", 16)],
+)
+def test_the_quota_of_a_container_counts(tmp_path: Path, limit: str, cores: int) -> None:
+    assert available_cores(system(tmp_path, "0::/", cpu_max=limit)) == cores
+
+
+def test_the_least_quota_on_the_way_up_counts(tmp_path: Path) -> None:
+    root = system(tmp_path, "0::/pods/mine", pods__cpu_max="300000 100000", pods__mine__cpu_max="max 100000")
+    assert available_cores(root) == 3
+
+
+@pytest.mark.parametrize("folder", ["cpu", "cpu,cpuacct"])
+def test_the_quota_of_version_1_counts(tmp_path: Path, folder: str) -> None:
+    # In a container the path is the host's, and only the controller's root is there.
+    root = system(tmp_path, "4:memory:/docker/x\n3:cpu,cpuacct:/docker/x\n0::/")
+    v1(root, folder, 400_000)
+    assert available_cores(root) == 4
+
+
+def test_no_quota_of_version_1_is_no_limit(tmp_path: Path) -> None:
+    root = system(tmp_path, "3:cpu,cpuacct:/")
+    v1(root, "cpu", -1)
+    assert available_cores(root) == MACHINE
+
+
+@pytest.mark.parametrize("text", ["", "what", "1 2 3", "100000 0"])
+def test_what_cannot_be_read_is_no_limit(tmp_path: Path, text: str) -> None:
+    assert available_cores(system(tmp_path, "0::/", cpu_max=text)) == MACHINE
+
+
+def test_no_other_count_of_cores_is_asked_for() -> None:
+    here = Path(__file__).parents[3]
+    rooms = ("api", "service", "worker", "benchmarks", "examples")
+    files = [file for room in rooms for file in (here / room).rglob("*.py")] + list(here.glob("*.py"))
+    asking = [
+        str(file.relative_to(here))
+        for file in files
+        if any(word in file.read_text() for word in ("cpu_count(", "sched_getaffinity("))
+    ]
+    assert asking == ["service/model/cores.py"]

@@ -1,0 +1,88 @@
+"""What users may say of a scene, and what they are told when it is nonsense."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.model.errors import InputError
+from service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene
+
+TABLE = {"supports": [{"kind": "half_space"}]}
+
+
+@pytest.mark.parametrize("kind", ["free", "table", "bin", "shelf"])
+def test_a_kind_is_a_scene(kind: str) -> None:
+    assert parse_scene(kind) == SceneSpec(kind=kind)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".yaml"])
+def test_a_file_says_supports_and_the_targets_pose(tmp_path: Path, suffix: str) -> None:
+    said = {
+        "supports": [{"kind": "half_space", "normal": [0, 0, 1]}, {"kind": "box", "size": [0.1, 0.2, 0.3]}],
+        "target": [0, 0, 0.1, 1, 0, 0, 0],
+    }
+    path = tmp_path / f"scene{suffix}"
+    path.write_text(json.dumps(said))  # JSON is YAML
+    found = parse_scene(str(path))
+    assert found.kind == "file"
+    assert [s.kind for s in found.supports] == ["half_space", "box"]
+    assert found.target == (0, 0, 0.1, 1, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        ({}, "supports"),
+        ({"supports": []}, "supports"),
+        ({"supports": [{"kind": "ball"}]}, "supports"),
+        ({"supports": [{"kind": "half_space", "normal": [0, 0, 0]}]}, "not zero"),
+        ({"supports": [{"kind": "half_space", "offset": 1e9}]}, "offset"),
+        ({"supports": [{"kind": "box", "size": [1, 0, 1]}]}, "size"),
+        ({"supports": [{"kind": "box", "size": [1, 1, 1], "pose": [0, 0, 0, 0, 0, 0, 0]}]}, "unit length"),
+        ({"supports": [{"kind": "box"}] * 33}, "supports"),
+        ({**TABLE, "target": [0, 0, 0, 2, 0, 0, 0]}, "unit length"),
+        ({**TABLE, "colour": "red"}, "colour"),
+        ([1, 2], "one object"),
+    ],
+)
+def test_nonsense_in_a_file_is_told_in_one_line_that_names_the_file(tmp_path: Path, said: object, reason: str) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(said))
+    with pytest.raises(InputError) as error:
+        parse_scene(str(path))
+    text = str(error.value)
+    assert "scene.json" in text
+    assert reason in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    "content", [b"{", b"\xff\xfe\x00", b"[" * 20_000, b"a: &x [*x, *x]\n", b" " * (MAX_FILE_BYTES + 1)]
+)
+@pytest.mark.parametrize("suffix", [".json", ".yaml"])
+def test_a_file_that_is_none_is_refused(tmp_path: Path, content: bytes, suffix: str) -> None:
+    path = tmp_path / f"scene{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="scene file"):
+        parse_scene(str(path))
+
+
+def test_an_unknown_kind_lists_those_there_are() -> None:
+    with pytest.raises(InputError, match="free, table, bin, shelf"):
+        parse_scene("garden")
+
+
+def test_a_missing_file_is_told() -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        parse_scene("nowhere.yaml")
+
+
+def test_a_free_object_has_no_faces_to_choose() -> None:
+    with pytest.raises(ValidationError, match="free"):
+        SceneSpec(kind="free", faces="all")
+    with pytest.raises(InputError, match="free"):
+        parse_scene("free", faces="all")

@@ -1,0 +1,44 @@
+"""A service without processes with two hands and three objects, on SQLite and on PostgreSQL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pydantic import SecretStr
+
+from service.index.index import Index
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from service.store.store import open_store
+from tests.fakes import add_assets
+from tests.memory_queue import MemoryQueue
+from tests.servers import PostgresServer
+from tests.service.pipeline.datasets.makers import add_asset
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
+    """The service on an empty index of each kind in turn."""
+    url = f"sqlite:///{tmp_path / 'index.sqlite'}"
+    if request.param == "postgres":
+        server: PostgresServer = request.getfixturevalue("postgres_server")
+        url = server.database()
+    yield from _service(tmp_path, url)
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[Parts]:
+    """The service on SQLite."""
+    yield from _service(tmp_path, f"sqlite:///{tmp_path / 'index.sqlite'}")
+
+
+def _service(folder: Path, url: str) -> Iterator[Parts]:
+    settings = Settings(data_dir=folder, retry_backoff_s=0.0, index_url=SecretStr(url))
+    made = Parts(settings, open_store("memory://"), Index(url), MemoryQueue())
+    add_assets(made)
+    for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
+        add_asset(made, kind, name)
+    yield made
+    made.close()

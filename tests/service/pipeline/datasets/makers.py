@@ -1,0 +1,70 @@
+"""Hands and objects without content, datasets on them, and their tasks done or failed on the spot."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import AssetKind, Stage
+from service.model.planning import message_of, plan
+from service.model.records import AttemptRecord, JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.datasets.spec import DatasetRequest
+from service.store.library import publish_asset
+from service.store.records import put_record, read_record
+from tests.fakes import make_shard
+
+
+def add_asset(parts: Parts, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
+    """A hand or object; returns its digest."""
+    files = {"asset.json": b'{"file": "it"}', "it": f"{name} {content}".encode()}
+    asset = publish_asset(parts.store, AssetKind(kind), name, files)
+    found = {"verdict": verdict, "message": "as it is"} if verdict else None
+    if found:
+        parts.store.put(names.asset_check(AssetKind(kind), asset.digest), json.dumps(found).encode())
+    parts.index.add_asset(asset, found)
+    return asset.digest
+
+
+def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
+    """Two hands x two objects, one batch each."""
+    given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "referee": "certificate"}
+    return DatasetRequest.model_validate({"name": name, **given, **changes})
+
+
+def plan_all(parts: Parts) -> None:
+    """Rounds of the planner until nothing is left."""
+    planner = DatasetRounds(parts)
+    while planner.advance(5.0):
+        pass
+
+
+def finish(parts: Parts, job: str, *, batches: int | None = None) -> None:
+    """Do the first tasks of a job."""
+    record = read_record(JobRecord, parts.store, names.job_record(job))
+    for task in plan(record):
+        if batches is None or task.batch < batches:
+            parts.index.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
+
+
+def fail(parts: Parts, job: str, reason: str = "it broke") -> None:
+    """The first task of each batch of a job, failed for the last time."""
+    record = read_record(JobRecord, parts.store, names.job_record(job))
+    for task in plan(record):
+        if task.stage is not Stage.SYNTHESIZE:
+            continue
+        number = parts.index.task(task.id).attempt
+        attempt = AttemptRecord(
+            task_id=task.id, job_id=job, stage=task.stage, number=number, kind="ValueError", reason=reason,
+            worker="w", ended=timestamp(), last=True,
+        )  # fmt: skip
+        put_record(parts.store, names.attempt(task.id, number), attempt)
+        parts.index.add_attempt(attempt)
+
+
+def jobs_of(parts: Parts, name: str) -> list[str]:
+    """Jobs of a dataset's cells, in their order."""
+    return [cell.job_id for cell in parts.index.dataset_cells(name, limit=200).items]

@@ -1,0 +1,147 @@
+"""Options of the method and fidelity `auto` in a dataset: what its cells ask for, and what stays as it was."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from service.index.rebuild import rebuild
+from service.model import digests, names
+from service.model.dataset_records import DatasetRecord, request_of
+from service.model.domain import JobRequest
+from service.model.errors import ConflictError, InputError
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.cost import estimate
+from service.pipeline.datasets.spec import DatasetRequest
+from service.pipeline.fidelity_choice import Resolver
+from service.store.datasets import load_dataset
+from service.store.records import read_record
+from service.store.study_records import publish
+from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
+
+ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
+AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
+
+
+def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> dict[str, Any]:
+    """The gripper needs standard on all but the cube, the claw a fidelity of one's choice on all."""
+
+    def run(fidelity: str, speed: float, gsr: float, hand: str, object_: str) -> dict[str, Any]:
+        return {
+            "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_, "valid_per_second": speed,
+            "gsr": gsr, "epsilon": 0.3, "pd_mm": 0.1,
+        }  # fmt: skip
+
+    runs = [run("draft", 40, 0.3, "gripper", "ball"), run("standard", 15, 0.8, "gripper", "ball")]
+    runs += [run("draft", 40, 0.9, "gripper", "cube"), run(claw, 6, 0.7, "claw", "elsewhere")]
+    return {"created": created, "runs": runs}
+
+
+def requests_of(parts: Parts, name: str = "grasps") -> list[JobRequest]:
+    plan_all(parts)
+    return [read_record(JobRecord, parts.store, names.job_record(job)).request for job in jobs_of(parts, name)]
+
+
+def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The id was computed by graspd 0.1.0 before datasets had options."""
+    monkeypatch.setattr(digests, "STAGE_REVISIONS", {"synthesize": 1})
+    given = {"name": "x", "hands": ["allegro"], "objects": ["mug"], "grasps": 64, "scenes": 2}
+    request = request_of(DatasetRequest.model_validate(given).shared, "allegro", "mug")
+    assert digests.job_id(request, "0" * 32, "1" * 32) == "3451e42bdce0eab4549fc73883b4bbbd"
+
+
+def test_options_of_the_method_are_those_of_each_cells_job(either: Parts) -> None:
+    actions.create(either, wanted(**ANNEALED))
+    assert [(r.method, r.options) for r in requests_of(either)] == 4 * [("graspit", {"keep": 20, "steps": 40000})]
+
+
+def test_other_options_are_another_dataset(parts: Parts) -> None:
+    actions.create(parts, wanted(**ANNEALED))
+    with pytest.raises(ConflictError, match="its options is"):
+        actions.create(parts, wanted(**ANNEALED | {"options": {"keep": 5}}))
+
+
+def test_batches_with_other_options_say_nothing_about_the_cost(parts: Parts) -> None:
+
+    actions.create(parts, wanted(**ANNEALED))
+    plan_all(parts)
+    for job in jobs_of(parts, "grasps"):
+        finish(parts, job)
+    assert estimate(parts.index, wanted(**ANNEALED)).measured_share == 1
+    assert estimate(parts.index, wanted(method="graspit")).measured_share == 0
+
+
+def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Parts) -> None:
+    publish(either.store, "charts", chart())
+    actions.create(either, wanted(**AUTO))
+    assert [(r.fidelity, r.target) for r in requests_of(either)] == [
+        ("standard", ""), ("draft", ""), ("fine", ""), ("fine", ""),
+    ]  # fmt: skip
+    cells = either.index.dataset_cells("grasps").items
+    assert [cell.fidelity for cell in cells] == ["standard", "draft", "fine", "fine"]
+    assert either.index.dataset("grasps").options.target == "gsr>=0.6"
+
+
+def test_a_cell_that_auto_chose_is_the_job_that_names_its_fidelity(parts: Parts) -> None:
+    publish(parts.store, "charts", chart())
+    actions.create(parts, wanted("chosen", **AUTO))
+    actions.create(parts, wanted("named", fidelity="fine"))
+    assert jobs_of(parts, "chosen")[2:] == jobs_of(parts, "named")[2:]
+
+
+def test_a_later_chart_changes_nothing_of_a_dataset_that_is_there(parts: Parts) -> None:
+    publish(parts.store, "charts", chart())
+    actions.create(parts, wanted(**AUTO))
+    before = jobs_of(parts, "grasps")
+    publish(parts.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
+    _, new = actions.create(parts, wanted(**AUTO))
+    assert not new and jobs_of(parts, "grasps") == before
+    publish(parts.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
+    assert actions.create(parts, wanted(**AUTO))[1] is False
+
+
+def test_a_rebuilt_index_knows_the_fidelity_of_each_cell(parts: Parts) -> None:
+    publish(parts.store, "charts", chart())
+    actions.create(parts, wanted(**AUTO))
+    rebuild(parts.index, parts.store)
+    assert [cell.fidelity for cell in parts.index.dataset_cells("grasps").items] == [
+        "standard",
+        "draft",
+        "fine",
+        "fine",
+    ]
+
+
+def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(parts: Parts) -> None:
+    publish(parts.store, "charts", chart())
+    with pytest.raises(InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
+        actions.create(parts, wanted(**AUTO | {"target": "gsr>=0.75"}))
+    assert not parts.store.exists(names.dataset_record("grasps"))
+
+
+def test_the_cost_of_auto_is_that_of_the_fidelities_it_stands_for(parts: Parts) -> None:
+    publish(parts.store, "charts", chart())
+    both = estimate(parts.index, wanted(hands=("gripper",), **AUTO), Resolver(parts.store))
+    apart = [
+        estimate(parts.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
+        for obj, fidelity in (("ball", "standard"), ("cube", "draft"))
+    ]
+    assert both.seconds == pytest.approx(sum(one.seconds for one in apart))
+
+
+def test_a_record_from_before_has_neither_and_is_read(parts: Parts) -> None:
+    actions.create(parts, wanted())
+    stored = json.loads(parts.store.get(names.dataset_record("grasps")))
+    stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
+    del stored["fidelities"]
+    assert DatasetRecord.model_validate(stored) == load_dataset(parts.store, "grasps")
+
+
+@pytest.mark.parametrize("changes", [{"fidelity": "auto"}, {"target": "gsr>=0.6"}])
+def test_auto_and_target_go_together(changes: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match="target"):
+        wanted(**changes)

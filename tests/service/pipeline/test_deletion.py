@@ -1,0 +1,233 @@
+"""What a user deletes is gone at once, from the index and from one made anew; its objects go with the keeper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from service.index.rebuild import differences
+from service.model import names
+from service.model.domain import AssetKind, State
+from service.model.errors import ConflictError, NotFoundError
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.datasets.spec import DatasetRequest
+from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
+from service.pipeline.sweeper import Sweeper
+from service.store.deletions import pending
+from service.store.library import publish_asset
+from tests.fakes import OBJECT_FILES, make_shard, request
+
+
+def finished(parts: Parts, **changes: Any) -> str:
+    """A job whose shards are there."""
+    job, _ = job_actions.submit(parts, request(**changes))
+    _make_all(parts)
+    assert parts.index.job(job.id).state is State.SUCCEEDED
+    return job.id
+
+
+def _make_all(parts: Parts) -> None:
+    queue: Any = parts.queue
+    while (delivery := queue.take("w")) is not None:
+        parts.index.add_manifest(make_shard(parts.store, delivery.message))
+        queue.finish(delivery)
+        for job in parts.index.jobs().items:
+            job_actions._start(parts, job.id)
+
+
+def dataset(parts: Parts, name: str = "d", **changes: Any) -> str:
+    """A finished dataset of one cell."""
+    wanted = DatasetRequest(name=name, hands=("gripper",), objects=("ball",), **{"grasps": 32, **changes})
+    actions.create(parts, wanted)
+    DatasetRounds(parts).advance()
+    _make_all(parts)
+    assert parts.index.dataset(name).state is State.SUCCEEDED
+    return name
+
+
+def keys(parts: Parts, *prefixes: str) -> set[str]:
+    return {entry.key for prefix in prefixes for entry in parts.store.list(prefix)}
+
+
+def graceless(parts: Parts) -> Sweeper:
+    """A sweeper to which every released shard is old."""
+    eager = parts.settings.model_copy(update={"shard_grace_s": -1.0})
+    return Sweeper(Parts(eager, parts.store, parts.index, parts.queue))
+
+
+def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_keeper(parts: Parts) -> None:
+    job = finished(parts)
+    delete_job(parts, job)
+    with pytest.raises(NotFoundError):
+        parts.index.job(job)
+    assert differences(parts.index, parts.store) == [], "an index made anew knows it as little"
+    assert not Sweeper(parts).advance()
+    assert keys(parts, "jobs", "tasks", "deletions") == set()
+    assert differences(parts.index, parts.store) == []
+
+
+def test_shards_that_nobody_needs_go_after_the_grace_time(parts: Parts) -> None:
+    job = finished(parts)
+    delete_job(parts, job)
+    Sweeper(parts).advance()
+    assert not Sweeper(parts).collect()
+    assert len(keys(parts, "shards")) == 2, "there is grace"
+    assert not graceless(parts).collect()
+    assert keys(parts, "shards", "released") == set()
+    assert parts.index.stats().grasps == 0
+    assert differences(parts.index, parts.store) == []
+
+
+def test_a_shard_that_another_job_needs_stays(parts: Parts) -> None:
+    short, long = finished(parts), finished(parts, grasps=64)
+    delete_job(parts, short)
+    Sweeper(parts).advance()
+    assert not graceless(parts).collect()
+    assert len(keys(parts, "shards")) == 4
+    assert parts.index.job(long).grasps == 64
+
+
+def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(parts: Parts) -> None:
+    job = finished(parts)
+    delete_job(parts, job)
+    with pytest.raises(ConflictError, match="still being removed"):
+        job_actions.submit(parts, request())
+    assert names.job_record(job) in keys(parts, "jobs")
+    Sweeper(parts).advance()
+    again, new = job_actions.submit(parts, request())
+    assert (again.id, new, again.state) == (job, True, State.SUCCEEDED)
+    assert not graceless(parts).collect()
+    assert len(keys(parts, "shards")) == 2, "it needs them again"
+    assert differences(parts.index, parts.store) == []
+
+
+def test_a_job_that_runs_is_in_use(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request())
+    with pytest.raises(ConflictError, match="is queued; cancel it first"):
+        delete_job(parts, job.id)
+    assert not pending(parts.store)
+
+
+def test_a_job_of_a_dataset_is_in_use(parts: Parts) -> None:
+    dataset(parts)
+    (job,) = parts.index.jobs().items
+    with pytest.raises(ConflictError, match="belongs to dataset 'd'"):
+        delete_job(parts, job.id)
+
+
+def test_a_deleted_dataset_takes_its_own_jobs_with_it(parts: Parts) -> None:
+    own = finished(parts, seed=7)
+    dataset(parts)
+    dataset(parts, "other", grasps=64)
+    actions.snapshot(parts, "d")
+    delete_dataset(parts, "d")
+    assert differences(parts.index, parts.store) == []
+    with pytest.raises(ConflictError, match="still being removed"):
+        dataset(parts)
+    while Sweeper(parts).advance():
+        pass
+    Sweeper(parts).advance()
+    assert {view.name for view in parts.index.datasets().items} == {"other"}
+    assert len(parts.index.jobs().items) == 2
+    assert parts.index.job(own)
+    assert keys(parts, "datasets") == {names.dataset_record("other")}
+    assert differences(parts.index, parts.store) == []
+    dataset(parts, "d", grasps=96)
+
+
+def test_a_dataset_that_runs_is_in_use(parts: Parts) -> None:
+    actions.create(parts, DatasetRequest(name="d", hands=("gripper",), objects=("ball",)))
+    with pytest.raises(ConflictError, match="cancel it first"):
+        delete_dataset(parts, "d")
+
+
+def test_a_hand_that_a_job_needs_is_in_use(parts: Parts) -> None:
+    job = finished(parts)
+    with pytest.raises(ConflictError, match=f"needed by job {job}"):
+        delete_asset(parts, AssetKind.HAND, "gripper")
+    delete_job(parts, job)
+    delete_asset(parts, AssetKind.HAND, "gripper")
+    with pytest.raises(NotFoundError):
+        job_actions.submit(parts, request())
+
+
+def test_an_object_of_a_set_is_in_use(parts: Parts) -> None:
+    actions.add_object_set(parts, "kitchen", ["ball"])
+    with pytest.raises(ConflictError, match="the set of objects 'kitchen'"):
+        delete_asset(parts, AssetKind.OBJECT, "ball")
+
+
+def test_a_deleted_object_frees_its_name_and_its_files(parts: Parts) -> None:
+    digest = parts.index.asset(AssetKind.OBJECT, "ball").digest
+    delete_asset(parts, AssetKind.OBJECT, "ball")
+    assert differences(parts.index, parts.store) == []
+    with pytest.raises(ConflictError, match="still being removed"):
+        publish_asset(parts.store, AssetKind.OBJECT, "ball", OBJECT_FILES)
+    Sweeper(parts).advance()
+    assert keys(parts, f"assets/object/{digest}", "deletions") == set()
+    assert publish_asset(parts.store, AssetKind.OBJECT, "orb", OBJECT_FILES).name == "orb"
+
+
+def test_a_job_entered_while_its_hand_is_deleted_is_not_kept(parts: Parts) -> None:
+    record = job_actions.prepare(parts, request())
+    delete_asset(parts, AssetKind.HAND, "gripper")
+    with pytest.raises(NotFoundError, match="deleted just now"):
+        job_actions.enter(parts, record)
+    assert keys(parts, "jobs") == set()
+
+
+@pytest.mark.parametrize("what", ["job", "dataset", "object"])
+def test_a_deletion_that_broke_off_is_carried_out_by_the_next_keeper(
+    parts: Parts, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each removal of an object in turn, and between the record and the rows."""
+    acts: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {
+        "job": (lambda: finished(parts, seed=3), lambda: delete_job(parts, next(iter(_jobs(parts))))),
+        "dataset": (lambda: dataset(parts), lambda: delete_dataset(parts, "d")),
+        "object": (lambda: None, lambda: delete_asset(parts, AssetKind.OBJECT, "ball")),
+    }
+    make, act = acts[what]
+    make()
+    remove = {"job": "remove_job", "dataset": "remove_dataset", "object": "remove_asset"}[what]
+    with monkeypatch.context() as patch:
+        patch.setattr(type(parts.index), remove, _break)
+        with pytest.raises(KeyboardInterrupt):
+            act()
+    assert pending(parts.store)
+    real, place = type(parts.store).delete, 0
+    while keys(parts, "deletions"):
+        with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, StopIteration)):
+            patch.setattr(type(parts.store), "delete", _after(place, real))
+            if not Sweeper(parts).advance():
+                raise StopIteration
+        place += 1
+    assert differences(parts.index, parts.store) == []
+    assert (
+        keys(parts, *{"job": ("jobs",), "dataset": ("datasets", "jobs"), "object": ("assets/object",)}[what]) == set()
+    )
+
+
+def _jobs(parts: Parts) -> list[str]:
+    return [job.id for job in parts.index.jobs().items]
+
+
+def _break(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _after(count: int, real: Any) -> Any:
+    """A removal that works so often, and ends the process then."""
+    left = [count]
+
+    def delete(store: Any, key: str) -> None:
+        if left[0] == 0:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        real(store, key)
+
+    return delete

@@ -1,0 +1,447 @@
+"""The keeper on the in-memory parts: lost workers, lost events, lost queue, lost index, parts that are away."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import pytest
+
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import AssetKind, IngestMessage, Stage, State, TaskMessage
+from service.model.errors import QueueUnavailable, StoreUnavailable
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.keeper import Keeper
+from service.pipeline.reaper import LOST_AFTER_S
+from service.queue.port import Event, EventKind
+from service.store.library import publish_asset, stored_assets
+from tests.fakes import HAND_FILES, fake_stages, make_shard, request
+from tests.memory_queue import Delivery, MemoryQueue
+from worker.process.runner import Runner
+from worker.stages.context import StopReason, TaskContext
+
+
+class Clock:
+    """Time that passes when told to."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Bench:
+    """A keeper and one worker, both moved step by step."""
+
+    def __init__(self, parts: Parts) -> None:
+        assert isinstance(parts.queue, MemoryQueue)
+        self.parts, self.queue, self.clock = parts, parts.queue, Clock()
+        self.keeper = Keeper(parts, clock=self.clock)
+
+    def pass_time(self, seconds: float, *, beating: Delivery | None = None) -> None:
+        """Rounds of the keeper, one a second."""
+        for _ in range(round(seconds)):
+            self.clock.now += 1.0
+            if beating is not None:
+                self.queue.beat(beating)
+            self.keeper.round()
+
+    def take(self) -> Delivery:
+        delivery = self.queue.take("w")
+        assert delivery is not None
+        return delivery
+
+    def do(self, delivery: Delivery, **stages: Any) -> Event | None:
+        """What a worker does with a task."""
+        runner = Runner(
+            fake_stages() | {Stage(k): v for k, v in stages.items()}, worker="w", publish=self.queue.publish
+        )
+        raw = delivery.message.model_dump(mode="json", by_alias=True)
+        outcome = runner.run(raw, TaskContext(self.parts.store))
+        self.queue.finish(delivery)
+        if outcome is not None:
+            self.queue.publish(outcome)
+        return outcome
+
+    def work_off(self, **stages: Any) -> None:
+        """Worker and keeper in turns until nothing waits."""
+        self.pass_time(1)
+        while (delivery := self.queue.take("w")) is not None:
+            self.do(delivery, **stages)
+            self.pass_time(1)
+
+
+@pytest.fixture
+def bench(parts: Parts) -> Bench:
+    made = Bench(parts)
+    made.keeper.round()
+    return made
+
+
+def explode(message: TaskMessage, context: TaskContext) -> None:
+    raise ValueError("the planner lost its way")
+
+
+def test_a_job_goes_through_all_its_stages(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request(grasps=70, scenes=2))
+    bench.work_off()
+    done = bench.parts.index.job(job.id)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 70)
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_listeners_hear_how_a_job_goes(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    bench.work_off()
+    told = [e.message for _, e in bench.queue.tail("0", limit=99, wait_s=0) if e.kind is EventKind.JOB]
+    assert told == ["queued", "running", "succeeded"]
+    assert all(e.job_id == job.id for _, e in bench.queue.tail("0", limit=99, wait_s=0))
+
+
+def test_a_task_of_a_lost_worker_is_queued_again_with_its_reason_kept(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    bench.take()
+    bench.pass_time(bench.parts.settings.lease_s + 2)
+    again = bench.take()
+    assert again.message.attempt == 2
+    (attempt,) = bench.parts.index.attempts(job=job.id)
+    assert (attempt.kind, attempt.last) == ("WorkerLost", False)
+    assert "no sign of life for 6 s" in attempt.reason
+    bench.do(again)
+    bench.pass_time(1)
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_a_worker_that_gives_signs_of_life_keeps_its_task(bench: Bench) -> None:
+    job_actions.submit(bench.parts, request())
+    delivery = bench.take()
+    bench.pass_time(100, beating=delivery)
+    assert [lease.key for lease in bench.queue.leases()] == [delivery.key]
+
+
+def test_time_in_which_the_keeper_did_not_look_is_no_silence(bench: Bench) -> None:
+    job_actions.submit(bench.parts, request())
+    bench.take()
+    bench.pass_time(2)
+    bench.clock.now += 3600
+    bench.keeper.round()
+    assert len(bench.queue.leases()) == 1
+
+
+def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_actions.submit(bench.parts, request())
+    held = bench.take()
+    bench.pass_time(2, beating=held)
+
+    def full(part: str, seconds: float) -> None:
+        raise QueueUnavailable("Redis does not answer (MISCONF: the disk is full)")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.queue, "announce", full)
+        for _ in range(10 * round(bench.parts.settings.lease_s)):
+            bench.clock.now += 1.0
+            with pytest.raises(QueueUnavailable):
+                bench.keeper.round()
+    bench.pass_time(2, beating=held)
+    assert [lease.key for lease in bench.queue.leases()] == [held.key]
+    assert bench.parts.index.attempts() == []
+
+
+def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    slow = bench.take()
+    bench.pass_time(bench.parts.settings.lease_s + 2)
+    bench.do(bench.take())
+    bench.pass_time(1)
+    (before,) = bench.parts.index.shards(job=job.id).items
+    bench.do(slow)
+    bench.pass_time(1)
+    (after,) = bench.parts.index.shards(job=job.id).items
+    assert after == before
+    assert bench.parts.index.stats().grasps == 32
+
+
+def test_a_worker_lost_after_its_manifest_was_put_costs_no_attempt(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    delivery = bench.take()
+    assert isinstance(delivery.message, TaskMessage)
+    make_shard(bench.parts.store, delivery.message)
+    bench.pass_time(bench.parts.settings.lease_s + 2)
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.attempts(job=job.id) == []
+
+
+def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request(scenes=1))
+    for _ in range(bench.parts.settings.task_attempts):
+        bench.take()
+        bench.pass_time(bench.parts.settings.lease_s + 2)
+    assert bench.queue.take("w") is None
+    failed = bench.parts.index.job(job.id)
+    assert failed.state is State.FAILED
+    assert failed.reason is not None
+    assert "was lost" in failed.reason
+    assert [a.number for a in bench.parts.index.attempts(job=job.id)] == [3, 2, 1]
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_a_failing_task_fails_its_job_alone_and_keeps_each_reason(bench: Bench) -> None:
+    bad, _ = job_actions.submit(bench.parts, request(seed=1))
+    for _ in range(3):
+        bench.do(bench.take(), synthesize=explode)
+        bench.pass_time(1)
+    good, _ = job_actions.submit(bench.parts, request(seed=2))
+    bench.work_off()
+    assert bench.parts.index.job(bad.id).state is State.FAILED
+    assert bench.parts.index.job(bad.id).reason == "the planner lost its way"
+    assert bench.parts.index.job(good.id).state is State.SUCCEEDED
+    attempts = bench.parts.index.attempts(job=bad.id)
+    assert [(a.number, a.kind, a.last) for a in attempts] == [
+        (3, "ValueError", True),
+        (2, "ValueError", False),
+        (1, "ValueError", False),
+    ]
+    assert attempts[0].trace is not None
+    assert "explode" in attempts[0].trace
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_a_failed_attempt_waits_before_the_next(bench: Bench) -> None:
+    patient = bench.parts.settings.model_copy(update={"retry_backoff_s": 60.0})
+    bench = Bench(Parts(patient, bench.parts.store, bench.parts.index, bench.parts.queue))
+    job_actions.submit(bench.parts, request())
+    bench.do(bench.take(), synthesize=explode)
+    bench.pass_time(5)
+    assert bench.queue.take("w") is None
+
+
+def test_a_store_that_is_away_costs_no_attempt_and_says_so(bench: Bench) -> None:
+    def away(message: TaskMessage, context: TaskContext) -> None:
+        raise StoreUnavailable("the store is full")
+
+    job, _ = job_actions.submit(bench.parts, request())
+    outcome = bench.do(bench.take(), synthesize=away)
+    assert outcome is not None
+    assert outcome.kind is EventKind.DEFERRED
+    bench.keeper._index_events(0)
+    waiting = bench.parts.index.tasks(job=job.id).items[0]
+    assert (waiting.state, waiting.message) == (State.QUEUED, "waits: the store is full")
+    bench.work_off()
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.attempts(job=job.id) == []
+
+
+def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object, **__: object) -> None:
+        raise StoreUnavailable("the store does not answer")
+
+    job, _ = job_actions.submit(bench.parts, request(grasps=64))
+    bench.do(bench.take())
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.parts.store, "get", away)
+        bench.do(bench.take(), synthesize=away)
+        for _ in range(3):
+            with pytest.raises(StoreUnavailable, match="1 events wait for it"):
+                bench.pass_time(1)
+        states = [(task.state, task.message) for task in bench.parts.index.tasks(job=job.id).items]
+        assert states == [(State.RUNNING, None), (State.QUEUED, "waits: the store does not answer")]
+    bench.work_off()
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.attempts(job=job.id) == []
+
+
+def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
+    def told_to_stop(message: TaskMessage, context: TaskContext) -> None:
+        context.stop(StopReason.SHUTDOWN)
+        context.check()
+
+    job, _ = job_actions.submit(bench.parts, request())
+    bench.do(bench.take(), synthesize=told_to_stop)
+    bench.pass_time(1)
+    again = bench.take()
+    assert again.message.attempt == 1
+    assert bench.parts.index.job(job.id).state is State.QUEUED
+
+
+def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request(grasps=96, scenes=1))
+    bench.do(bench.take())
+    bench.take()
+    empty = MemoryQueue()
+    bench = Bench(Parts(bench.parts.settings, bench.parts.store, bench.parts.index, empty))
+    bench.pass_time(LOST_AFTER_S + 2)
+    assert len(empty.waiting()) == 3, "two syntheses, and the scene of the shard whose event was lost"
+    bench.work_off()
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_a_lost_failure_event_is_made_good_from_the_store(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    delivery = bench.take()
+    runner = Runner({Stage.SYNTHESIZE: explode}, worker="w", publish=lambda event: None)  # type: ignore[dict-item]
+    runner.run(delivery.message.model_dump(mode="json", by_alias=True), TaskContext(bench.parts.store))
+    bench.queue.finish(delivery)
+    bench.pass_time(LOST_AFTER_S + 2)
+    assert bench.take().message.attempt == 2
+    assert [a.number for a in bench.parts.index.attempts(job=job.id)] == [1]
+
+
+def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> None:
+    bad, _ = job_actions.submit(bench.parts, request(seed=1))
+    delivery = bench.take()
+    assert isinstance(delivery.message, TaskMessage)
+    key = names.shard_manifest(delivery.message.stage, delivery.message.output)
+    bench.parts.store.put(key, b'{"version": 1, "shard_id": torn')
+    bench.do(delivery)
+    good, _ = job_actions.submit(bench.parts, request(seed=2))
+    bench.work_off()
+    bench.pass_time(LOST_AFTER_S + 2)
+    assert bench.parts.index.job(good.id).state is State.SUCCEEDED
+    failed = bench.parts.index.job(bad.id)
+    assert failed.state is State.FAILED
+    assert key in (failed.reason or "")
+    assert "remove it and retry its job" in (failed.reason or "")
+
+
+def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
+    job_actions.submit(bench.parts, request())
+    delivery = bench.take()
+    bench.queue._held.clear()
+    bench.pass_time(LOST_AFTER_S - 1)
+    assert bench.queue.waiting() == set()
+    bench.queue._held[delivery.key] = delivery
+    bench.pass_time(LOST_AFTER_S + 1, beating=delivery)
+    assert bench.queue.waiting() == set()
+
+
+def test_files_below_an_asset_do_not_stop_a_keeper_or_a_rebuild(bench: Bench) -> None:
+    (digest, *_) = [digest for kind, digest in stored_assets(bench.parts.store) if kind is AssetKind.OBJECT]
+    bench.parts.store.put(names.object_pieces(digest, "32"), b"pieces")
+    bench.keeper.round()
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request(grasps=64, scenes=1))
+    bench.do(bench.take())
+    bench.pass_time(1)
+    fresh = Index(f"sqlite:///{bench.parts.settings.data_dir / 'fresh.sqlite'}")
+    bench = Bench(Parts(bench.parts.settings, bench.parts.store, fresh, bench.queue))
+    bench.keeper.round()
+    waiting = len(bench.queue.waiting())
+    bench.pass_time(LOST_AFTER_S + 2)
+    assert len(bench.queue.waiting()) == waiting == 2, "what was in the queue is not queued twice"
+    bench.work_off()
+    assert fresh.job(job.id).state is State.SUCCEEDED
+    assert differences(fresh, bench.parts.store) == []
+    fresh.close()
+
+
+def test_events_not_yet_in_the_index_come_again_to_the_next_keeper(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    bench.do(bench.take())
+
+    def away(*_: object, **__: object) -> None:
+        raise StoreUnavailable("away")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.parts.store, "get", away)
+        with pytest.raises(StoreUnavailable):
+            bench.keeper.round()
+    bench.queue.restart_consumer()
+    bench = Bench(bench.parts)
+    bench.keeper.round()
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+
+
+def test_forged_events_are_left_out_and_stop_nothing(bench: Bench) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    for output in ("../../etc/passwd", "0" * 32, "hand/x", ""):
+        for kind in (EventKind.FINISHED, EventKind.FAILED, EventKind.STARTED):
+            for stage in (Stage.SYNTHESIZE, Stage.INGEST):
+                forged = {"kind": kind, "at": timestamp(), "task_id": "../x", "stage": stage, "output": output}
+                bench.queue.publish(Event.model_construct(**forged, attempt=1))
+    bench.work_off()
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+
+
+def test_a_cancelled_task_that_still_runs_is_stopped(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    job, _ = job_actions.submit(bench.parts, request())
+    delivery = bench.take()
+
+    def away(task_ids: object) -> None:
+        raise QueueUnavailable("Redis does not answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.queue, "discard", away)
+        assert job_actions.cancel(bench.parts, job.id).state is State.CANCELLED
+    assert bench.queue.beat(delivery) == (False, False)
+    bench.pass_time(1)
+    assert bench.queue.beat(delivery)[0], "the keeper tells it"
+
+
+def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
+    small = bench.parts.settings.model_copy(update={"queue_window": 4})
+    bench = Bench(Parts(small, bench.parts.store, bench.parts.index, bench.parts.queue))
+    job, _ = job_actions.submit(bench.parts, request(grasps=32 * 12))
+    deepest = 0
+    while (delivery := bench.queue.take("w")) is not None:
+        deepest = max(deepest, len(bench.queue.waiting()) + 1)
+        bench.do(delivery)
+        bench.pass_time(1)
+    assert deepest == 4
+    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+
+
+def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
+    asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
+    bench.parts.index.add_asset(asset, None)
+
+    def check(message: IngestMessage, context: TaskContext) -> None:
+        found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
+        context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+
+    bench.work_off(ingest=check)
+    view = bench.parts.index.asset(AssetKind.HAND, "upload")
+    assert (view.verdict, view.repairs, view.facts) == ("repair", ["hole"], {"faces": 12})
+    assert differences(bench.parts.index, bench.parts.store) == []
+
+
+def test_an_upload_that_kills_every_worker_is_refused(bench: Bench) -> None:
+    asset = publish_asset(bench.parts.store, AssetKind.HAND, "bomb", HAND_FILES | {"extra": b"4"})
+    bench.parts.index.add_asset(asset, None)
+    bench.pass_time(1)
+    for _ in range(bench.parts.settings.task_attempts):
+        bench.take()
+        bench.pass_time(bench.parts.settings.lease_s + 2)
+    assert bench.queue.take("w") is None
+    assert bench.parts.index.asset(AssetKind.HAND, "bomb").verdict == "refuse"
+
+
+def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(
+    parts: Parts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop, rounds = threading.Event(), 0
+
+    def failing(*, wait_s: float = 0.0) -> None:
+        nonlocal rounds
+        rounds += 1
+        if rounds == 3:
+            stop.set()
+        raise (QueueUnavailable("away"), KeyError("a bug"))[rounds % 2]
+
+    keeper = Keeper(parts)
+    monkeypatch.setattr(keeper, "round", failing)
+    monkeypatch.setattr(stop, "wait", lambda seconds: None)
+    keeper.run(stop)
+    assert rounds == 3

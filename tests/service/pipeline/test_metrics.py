@@ -1,0 +1,166 @@
+"""What is told to Prometheus: true numbers, at a cost that does not grow with queue or index."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy.dialects import sqlite
+
+from api.metrics import Metrics, Snapshot
+from service.index import at_scrape
+from service.index.index import Index
+from service.index.notes import Damage
+from service.model.domain import Lane, Stage, State, TaskMessage
+from service.pipeline.backends import Parts
+from service.pipeline.job_actions import submit
+from service.pipeline.series import SERIES
+from service.pipeline.tally import MOST_KINDS, OTHER_KIND, Tally, parse_field
+from service.queue.rq_queue import WORKERS, RqQueue, worker_key
+from tests.conftest import REPOSITORY
+from tests.fakes import make_shard, message_for, request
+
+
+class Sums:
+    """Counters in a dictionary."""
+
+    def __init__(self) -> None:
+        self.sums: dict[tuple[str, ...], float] = {}
+
+    def count(self, amounts: Any) -> None:
+        for text, amount in amounts.items():
+            parsed = parse_field(text)
+            assert parsed is not None
+            key = (parsed[0], *parsed[1])
+            self.sums[key] = self.sums.get(key, 0.0) + amount
+
+    def counted(self) -> dict[str, float]:
+        return {}
+
+
+def tasks(count: int) -> list[TaskMessage]:
+    """Messages of as many tasks."""
+    return [message_for().model_copy(update={"task_id": f"{number:032x}"}) for number in range(count)]
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        at_scrape.count_jobs(State.QUEUED),
+        at_scrape.oldest_job(State.RUNNING),
+        at_scrape.made_since(datetime.now(UTC)),
+    ],
+)
+def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: Any) -> None:
+    index = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    text = str(query.compile(dialect=sqlite.dialect(), compile_kwargs={"literal_binds": True}))
+    with index.reading() as connection:
+        steps = [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
+    index.close()
+    tables = [step for step in steps if re.search(r"\b(jobs|shards)\b", step)]
+    assert tables
+    assert all(step.startswith("SEARCH") and "USING" in step for step in tables)
+
+
+def test_damage_of_the_store_is_told(parts: Parts) -> None:
+    assert at_scrape.read_index(parts.index).damaged == 0
+    parts.index.set_damage([Damage("shards/base/a.h5", "its file is gone", "a")])
+    assert at_scrape.read_index(parts.index).damaged == 1
+    shown = Snapshot()
+    shown.add_index(at_scrape.read_index(parts.index))
+    assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
+
+
+def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(parts: Parts) -> None:
+    submit(parts, request(grasps=32))
+    manifest = make_shard(parts.store, message_for())
+    parts.index.add_manifest(manifest)
+    found = at_scrape.read_index(parts.index)
+    assert found.jobs[State.QUEUED] == 1
+    assert 0 <= found.oldest_s[State.QUEUED] < 60
+    assert found.grasps_per_s == pytest.approx(manifest.count / 60)
+    assert found.valid_per_s == pytest.approx(manifest.valid / 60)
+
+
+_BUSY = {
+    "name": "w1", "host": "here", "pid": 1, "device": "cpu", "device_name": "", "stages": [], "version": "0",
+    "state": "busy", "task_id": "", "started": "", "seen": "",
+}  # fmt: skip
+
+
+def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
+    rq_queue.enqueue(tasks(2), Lane.BULK)
+    rq_queue.connection.sadd(WORKERS, "w1", "gone")
+    rq_queue.connection.set(worker_key("w1"), json.dumps(_BUSY), px=400_000)
+    found = rq_queue.now(lease_s=600)
+    place = (Lane.BULK, Stage.SYNTHESIZE)
+    assert found.depth[place] == 2
+    assert 0 <= found.oldest_s[place] < 60
+    assert set(found.workers) == {"w1"}
+    assert found.workers["w1"].state == "busy"
+    assert 200.0 <= found.workers["w1"].lease_age_s < 400.0
+
+
+def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> None:
+    def commands() -> int:
+        before = rq_queue.connection.info("commandstats")
+        rq_queue.now(lease_s=6)
+        after = rq_queue.connection.info("commandstats")
+        return sum(after[name]["calls"] - before.get(name, {"calls": 0})["calls"] for name in after)
+
+    rq_queue.enqueue(tasks(1), Lane.BULK)
+    few = commands()
+    rq_queue.enqueue(tasks(40), Lane.BULK)
+    assert commands() == few
+
+
+def test_forged_entries_in_redis_do_not_break_the_metrics(rq_queue: RqQueue) -> None:
+    rq_queue.connection.rpush("rq:queue:bulk-scene", "forged")
+    rq_queue.connection.sadd(WORKERS, "forged")
+    rq_queue.connection.set(worker_key("forged"), b"\xff{")
+    found = rq_queue.now(lease_s=6)
+    assert found.depth[Lane.BULK, Stage.SCENE] == 1
+    assert (Lane.BULK, Stage.SCENE) not in found.oldest_s
+    assert not found.workers
+
+
+def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
+    for _ in range(2):
+        tally = Tally(rq_queue)
+        tally.ended(State.SUCCEEDED)
+        tally.flush()
+        tally.flush()
+    assert rq_queue.counted() == {'["graspd_jobs_ended_total", "succeeded"]': 2.0}
+
+
+def test_a_shard_counts_its_grasps_and_its_seconds(parts: Parts) -> None:
+    sums = Sums()
+    tally = Tally(sums)
+    manifest = make_shard(parts.store, message_for())
+    tally.made([manifest])
+    tally.flush()
+    assert sums.sums["graspd_grasps_total", "all"] == 32
+    assert sums.sums["graspd_grasps_total", "valid"] == manifest.valid
+    assert sums.sums["graspd_stage_seconds_bucket", "synthesize", "1.0"] == 1
+    assert sums.sums["graspd_stage_seconds_sum", "synthesize"] == pytest.approx(manifest.seconds)
+
+
+def test_error_names_cannot_become_series_without_end() -> None:
+    sums = Sums()
+    tally = Tally(sums)
+    for number in range(3 * MOST_KINDS):
+        tally.failed("scene", f"Error{number}")
+    tally.flush()
+    assert len(sums.sums) == MOST_KINDS + 1
+    assert sums.sums["graspd_task_failures_total", "scene", OTHER_KIND] == 2 * MOST_KINDS
+
+
+def test_the_page_of_metrics_asks_only_for_series_that_exist() -> None:
+    text = (REPOSITORY / "docs" / "metrics.md").read_text()
+    questions = text[text.index("```promql") :]
+    named = {name.removesuffix("_bucket") for name in re.findall(r"graspd_[a-z_]+", questions)}
+    assert named <= set(SERIES)

@@ -1,0 +1,171 @@
+"""`graspd store verify`: five kinds of damage are five findings, on files and on S3; what can be made again is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.model import names
+from service.model.domain import State
+from service.model.errors import DamagedShard
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.pipeline.keeper import Keeper
+from service.pipeline.repair import repair
+from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
+from service.queue.port import EventKind
+from service.settings import Settings
+from service.store.manifests import ShardManifest, load_manifest, load_shard
+from service.store.store import open_store
+from tests.damage import cut, flip, overwrite, remove
+from tests.fakes import add_assets, fake_stages, request
+from tests.memory_queue import MemoryQueue
+from worker.process.runner import Runner
+from worker.stages.context import TaskContext
+
+SHARDS = 6
+
+
+@pytest.fixture(params=["files", pytest.param("s3", marks=pytest.mark.s3)])
+def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
+    url = request.getfixturevalue("s3_url") if request.param == "s3" else (tmp_path / "store").as_uri()
+    settings = Settings(data_dir=tmp_path, store_url=url, retry_backoff_s=0.0)
+    made = Parts(settings, open_store(url), Index(settings.resolved_index_url), MemoryQueue())
+    add_assets(made)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def shards(parts: Parts) -> list[ShardManifest]:
+    """Finished shards, in the order of their batches."""
+    job, _ = job_actions.submit(parts, request(grasps=32 * SHARDS))
+    work_off(parts)
+    assert parts.index.job(job.id).state is State.SUCCEEDED
+    found = [load_manifest(parts.store, s.stage, s.id) for s in parts.index.shards(job=job.id, limit=99).items]
+    return sorted(found, key=lambda manifest: manifest.batch)
+
+
+def work_off(parts: Parts, *, device: str = "cpu", seed: int = 0) -> list[EventKind]:
+    """Worker and keeper in turns until nothing waits."""
+    keeper, ends = Keeper(parts), []
+    keeper.round()
+    while (delivery := parts.queue.take("w")) is not None:  # type: ignore[attr-defined]
+        runner = Runner(fake_stages(), worker="w", publish=parts.queue.publish)
+        raw = delivery.message.model_dump(mode="json", by_alias=True)
+        outcome = runner.run(raw, TaskContext(parts.store, device=device))
+        parts.queue.finish(delivery)  # type: ignore[attr-defined]
+        assert outcome is not None
+        parts.queue.publish(outcome)
+        ends.append(outcome.kind)
+        keeper.round()
+    return ends
+
+
+def harm(parts: Parts, shards: list[ShardManifest]) -> dict[str, str]:
+    """Five kinds of damage: what each does to which shard."""
+    flip(parts.store, shards[0].key)
+    cut(parts.store, shards[1].key)
+    remove(parts.store, shards[2].key)
+    overwrite(parts.store, names.shard_manifest(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
+    remove(parts.store, names.shard_manifest(shards[4].stage, shards[4].shard_id))
+    return {
+        shards[0].shard_id: "SHA-256",
+        shards[1].shard_id: "bytes, expected",
+        shards[2].shard_id: MISSING,
+        shards[3].shard_id: BAD_MANIFEST,
+        shards[4].shard_id: NO_MANIFEST,
+    }
+
+
+def test_five_kinds_of_damage_are_five_findings(parts: Parts, shards: list[ShardManifest]) -> None:
+    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
+    done = harm(parts, shards)
+    found = {wrong.shard: wrong.what for _, wrong in scan(parts.store) if wrong is not None}
+    assert found.keys() == done.keys()
+    assert all(done[shard] in what for shard, what in found.items())
+
+
+def test_what_is_made_again_has_the_checksum_it_had(parts: Parts, shards: list[ShardManifest]) -> None:
+    harm(parts, shards)
+    before = {m.shard_id: m.sha256 for m in shards}
+    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+    repaired, left = repair(parts, found)
+    # The worker of a file without a manifest may be about to put it.
+    assert [one.what for one in left] == [f"{NO_MANIFEST}; its manifest may be on its way; run it again in a minute"]
+    assert len(repaired) == 4
+    work_off(parts)
+    for manifest in (*shards[:4], shards[5]):
+        load_shard(parts.store, manifest.stage, manifest.shard_id)
+        made = load_manifest(parts.store, manifest.stage, manifest.shard_id)
+        assert made.sha256 == before[manifest.shard_id]
+    assert [wrong.what for _, wrong in scan(parts.store) if wrong is not None] == [NO_MANIFEST]
+
+
+def test_what_comes_out_otherwise_is_not_put(parts: Parts, shards: list[ShardManifest]) -> None:
+    remove(parts.store, shards[0].key)
+    repair(parts, [wrong for _, wrong in scan(parts.store) if wrong is not None])
+    assert work_off(parts, device="cuda:0") == [EventKind.CANCELLED]
+    with pytest.raises(DamagedShard):
+        load_shard(parts.store, shards[0].stage, shards[0].shard_id)
+    assert differences(parts.index, parts.store) == []
+
+
+def test_a_foreign_object_is_found_and_moved_aside(parts: Parts, shards: list[ShardManifest]) -> None:
+    parts.store.put("shards/base/notes.txt", b"mine")
+    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+    assert [one.what for one in found] == [FOREIGN]
+    repair(parts, found)
+    assert parts.store.get("damaged/shards/base/notes.txt") == b"mine"
+    assert [wrong for _, wrong in scan(parts.store) if wrong is not None] == []
+
+
+def test_a_damaged_record_is_found_and_said_to_need_a_copy(parts: Parts, shards: list[ShardManifest]) -> None:
+    key = names.job_record(parts.index.jobs().items[0].id)
+    overwrite(parts.store, key, b'{"x": 1}')
+    found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
+    assert [one.key for one in found] == [key]
+    repaired, left = repair(parts, found)
+    assert not repaired
+    assert "put a copy in its place" in left[0].what
+
+
+def test_the_command_tells_what_is_damaged_and_exits_with_1(
+    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from typer.testing import CliRunner
+
+    from service.run.store_commands import app
+
+    monkeypatch.setenv("GRASPD_STORE_URL", parts.store.url)
+    command = ["store", "verify", "--json", "--data-dir", str(parts.settings.data_dir)]
+    sound = CliRunner().invoke(app, command)
+    assert (sound.exit_code, json.loads(sound.stdout)["damaged"]) == (0, []), sound.output
+    done = harm(parts, shards)
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 1
+    said = json.loads(told.stdout.splitlines()[-1])
+    assert {one["shard"] for one in said["damaged"]} | set(said["missing"]) == done.keys()
+    assert said["missing"] == [shards[2].shard_id]
+    assert parts.index.known_damage()[0] == 5
+
+
+def test_a_check_of_the_index_sees_damaged_shards_too(
+    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from typer.testing import CliRunner
+
+    from service.run.commands import app
+
+    monkeypatch.setenv("GRASPD_STORE_URL", parts.store.url)
+    command = ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    flip(parts.store, shards[0].key)
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 1
+    assert shards[0].key in told.output

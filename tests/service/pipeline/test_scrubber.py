@@ -1,0 +1,187 @@
+"""The keeper's slow look through the store: what it finds, how fast, where it goes on, and for whom it makes way."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from service.index.index import Index
+from service.model import names
+from service.pipeline.backends import Parts
+from service.pipeline.keeper import Keeper
+from service.pipeline.scrub import FOLDERS, MISSING, NO_MANIFEST
+from service.pipeline.scrubber import Interrupted, Scrubber, Turn
+from service.settings import Settings
+from service.store.manifests import ShardManifest
+from service.store.store import open_store
+from tests.damage import flip, overwrite, remove
+from tests.fakes import make_shard, message_for
+from tests.memory_queue import MemoryQueue
+
+WAIT_S = 30.0
+
+
+class Slept(threading.Event):
+    """An event whose waits take no time, but are counted; the clock of whom it is given to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.now += timeout or 0.0
+        return self.is_set()
+
+    def clock(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def shards(parts: Parts) -> list[ShardManifest]:
+    return [make_shard(parts.store, message_for(seed=seed)) for seed in range(4)]
+
+
+def a_round(parts: Parts, stop: Slept | None = None) -> None:
+    stop = stop or Slept()
+    scrubber = Scrubber(parts, stop, clock=stop.clock)
+    for _ in FOLDERS:
+        scrubber.advance()
+    scrubber.end()
+    assert parts.index.scrub_note().ended
+
+
+def found(parts: Parts) -> dict[str, str]:
+    return {one.shard: one.what for one in parts.index.known_damage()[1]}
+
+
+def test_a_round_notes_what_is_damaged_and_nothing_else(parts: Parts, shards: list[ShardManifest]) -> None:
+    a_round(parts)
+    assert parts.index.known_damage() == (0, [])
+    parts.index.set_scrub_note(type(parts.index.scrub_note())())
+    flip(parts.store, shards[0].key)
+    remove(parts.store, shards[1].key)
+    a_round(parts)
+    noted = found(parts)
+    assert noted.keys() == {shards[0].shard_id, shards[1].shard_id}
+    assert "SHA-256" in noted[shards[0].shard_id]
+    assert noted[shards[1].shard_id] == MISSING
+
+
+def test_what_is_mended_or_removed_since_is_forgotten(parts: Parts, shards: list[ShardManifest]) -> None:
+    whole = parts.store.get(shards[0].key)
+    parts.store.put("shards/base/notes.txt", b"mine")
+    for manifest in shards[:3]:
+        flip(parts.store, manifest.key)
+    a_round(parts)
+    assert parts.index.known_damage()[0] == 4
+    overwrite(parts.store, shards[0].key, whole)
+    remove(parts.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
+    remove(parts.store, shards[1].key)
+    remove(parts.store, "shards/base/notes.txt")
+    Scrubber(parts, Slept()).look_again()
+    assert found(parts).keys() == {shards[2].shard_id}
+
+
+def test_a_file_whose_manifest_may_be_on_its_way_is_no_damage(parts: Parts, shards: list[ShardManifest]) -> None:
+    remove(parts.store, names.shard_manifest(shards[0].stage, shards[0].shard_id))
+    a_round(parts)
+    assert NO_MANIFEST not in found(parts).values()
+
+
+def test_it_reads_no_faster_than_the_settings_say(parts: Parts, shards: list[ShardManifest]) -> None:
+    size = sum(manifest.size_bytes for manifest in shards)
+    stop = Slept()
+    slow = Parts(
+        parts.settings.model_copy(update={"scrub_mb_per_s": size / 2**20 / 100}), parts.store, parts.index, parts.queue
+    )
+    a_round(slow, stop)
+    assert stop.now > 99.0
+
+
+def test_a_successor_goes_on_where_it_stopped(parts: Parts, shards: list[ShardManifest]) -> None:
+    for manifest in shards:
+        flip(parts.store, manifest.key)
+    ordered = sorted(names.shard_manifest(one.stage, one.shard_id) for one in shards)
+    note = parts.index.scrub_note()
+    parts.index.set_scrub_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
+    a_round(parts)
+    assert {names.shard_manifest(shards[0].stage, shard) for shard in found(parts)} == set(ordered[2:])
+
+
+def test_a_small_store_is_not_read_over_and_over(parts: Parts, shards: list[ShardManifest]) -> None:
+    a_round(parts)
+    flip(parts.store, shards[0].key)
+    scrubber = Scrubber(parts, Slept())
+    assert not scrubber.advance()
+    note = parts.index.scrub_note()
+    parts.index.set_scrub_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
+    assert scrubber.advance()
+    assert found(parts).keys() == {shards[0].shard_id}
+
+
+def test_it_makes_way_for_a_verify_and_goes_on_afterwards(parts: Parts, shards: list[ShardManifest]) -> None:
+    stop = Slept()
+    scrubber = Scrubber(parts, stop, clock=stop.clock)
+    verify = Turn(parts, is_keeper=False)
+    assert verify.is_mine()
+    with pytest.raises(Interrupted):
+        scrubber.advance()
+    assert not Turn(parts, is_keeper=False).is_mine()
+    assert not Turn(parts, is_keeper=True).is_mine()
+    verify.end()
+    assert scrubber.advance()
+
+
+def test_a_verify_takes_the_turn_from_a_keeper(parts: Parts) -> None:
+    keeper = Turn(parts, is_keeper=True)
+    assert keeper.is_mine()
+    assert not Turn(parts, is_keeper=True).is_mine()
+    assert Turn(parts, is_keeper=False).is_mine()
+
+
+def test_a_second_verify_is_refused(
+    parts: Parts, shards: list[ShardManifest], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from typer.testing import CliRunner
+
+    from service.run.store_commands import app
+
+    folder = tmp_path / "one"
+    settings = Settings(data_dir=folder)
+    other = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
+    assert Turn(other, is_keeper=False).is_mine()
+    command = ["store", "verify", "--data-dir", str(folder)]
+    refused = CliRunner().invoke(app, command)
+    other.close()
+    assert refused.exit_code == 2
+    assert "another `graspd store verify`" in refused.output
+
+
+@pytest.mark.parametrize("rate", [100.0, 0.0])
+def test_the_keeper_scrubs_beside_its_rounds_unless_it_is_off(
+    parts: Parts, shards: list[ShardManifest], rate: float
+) -> None:
+    flip(parts.store, shards[0].key)
+    set_so = Parts(
+        parts.settings.model_copy(update={"scrub_mb_per_s": rate, "keeper_interval_s": 0.05}),
+        parts.store, parts.index, parts.queue,
+    )  # fmt: skip
+    stop = threading.Event()
+    thread = threading.Thread(target=Keeper(set_so).run, args=(stop,))
+    thread.start()
+    names_now = {one.name for one in threading.enumerate()}
+    try:
+        if rate:
+            pause = threading.Event()
+            for _ in range(round(WAIT_S / 0.05)):
+                if found(parts):
+                    break
+                pause.wait(0.05)
+    finally:
+        stop.set()
+        thread.join(WAIT_S)
+    assert found(parts).keys() == ({shards[0].shard_id} if rate else set())
+    assert ("scrub" in names_now) <= bool(rate)
+    assert not any(one.name == "scrub" for one in threading.enumerate())

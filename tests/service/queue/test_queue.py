@@ -1,0 +1,363 @@
+"""The queue's contract, held against Redis and against its twin in memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import pytest
+from rq import SimpleWorker
+from rq.executions import prepare_execution
+
+from service.model.clock import timestamp
+from service.model.domain import IngestMessage, Lane, Stage, TaskMessage
+from service.model.worker_beat import WorkerBeat
+from service.queue.allowed import AllowedJob, AllowedQueue
+from service.queue.port import BULK_EVERY, Event, EventKind, TaskQueue
+from service.queue.rq_queue import RqQueue, queue_names, worker_key
+from tests.fakes import request
+from tests.memory_queue import MemoryQueue
+from worker.process.heartbeat import Heartbeat, Hold, place_of
+from worker.process.pulse import Pulse
+from worker.stages.context import StopReason, TaskContext
+
+DIGEST = "0" * 32
+
+
+def task(name: str, *, stage: Stage = Stage.SYNTHESIZE, attempt: int = 1) -> TaskMessage:
+    return TaskMessage(
+        schema_=1,
+        task_id=name,
+        job_id="job",
+        stage=stage,
+        batch=0,
+        count=32,
+        attempt=attempt,
+        request=request(),
+        hand_digest=DIGEST,
+        object_digest=DIGEST,
+        output=DIGEST,
+    )
+
+
+@dataclass
+class Worker:
+    """A worker's side of a queue: what it takes, its signs of life, and what it hears in return."""
+
+    take: Callable[[], TaskMessage | None]
+    beat: Callable[[], StopReason | None]
+    finish: Callable[[], None]
+
+
+def memory_worker(queue: MemoryQueue) -> Worker:
+    held: list[Any] = []
+
+    def take() -> TaskMessage | None:
+        delivery = queue.take("w")
+        held[:] = [delivery] if delivery else []
+        return delivery.message if delivery else None  # type: ignore[return-value]
+
+    def beat() -> StopReason | None:
+        cancelled, lost = queue.beat(held[0])
+        return StopReason.CANCELLED if cancelled else StopReason.LEASE_LOST if lost else None
+
+    return Worker(take, beat, lambda: queue.finish(held[0]))
+
+
+@dataclass
+class RqSide:
+    """RQ's worker without its loop: the very calls the loop makes, one at a time."""
+
+    queue: RqQueue
+    name: str = "w"
+    execution: Any = None
+    job: Any = None
+    state: str = ""
+    taken: int = 0
+    context: TaskContext = field(default_factory=lambda: TaskContext(None))  # type: ignore[arg-type]
+
+    @property
+    def connection(self) -> Any:
+        return self.queue.connection
+
+    def get_heartbeat_ttl(self, job: Any) -> int:
+        return 60
+
+    def set_state(self, state: str, pipeline: Any = None) -> None:
+        self.state = state
+
+    def take(self) -> TaskMessage | None:
+        queues = [AllowedQueue.open(name, self.connection) for name in queue_names(tuple(Stage), self.taken)]
+        found = AllowedQueue.dequeue_any(
+            queues, None, connection=self.connection, job_class=AllowedJob, serializer=queues[0].serializer
+        )
+        if found is None:
+            return None
+        self.taken += 1
+        self.job = found[0]
+        prepare_execution(self, self.job)  # type: ignore[arg-type]
+        with self.connection.pipeline() as pipe:
+            self.job.prepare_for_execution(self.name, pipeline=pipe)
+            pipe.execute()
+        self.context = TaskContext(None)  # type: ignore[arg-type]
+        return TaskMessage.model_validate(self.job.args[0])
+
+    def beat(self) -> StopReason | None:
+        task_id = self.job.id.rpartition("-")[0]
+        hold = Hold.of(task_id, self.context, self.execution, self.job.started_job_registry, timeout_s=60)
+        for word in one_beat(self.connection, self.name, hold):
+            self.context.stop(StopReason(word))
+        return self.context.stop_reason
+
+    def finish(self) -> None:
+        with self.connection.pipeline() as pipe:
+            self.execution.delete(job=self.job, pipeline=pipe)
+            pipe.delete(self.job.key)
+            pipe.execute()
+
+
+def one_beat(connection: Any, name: str, hold: Hold | None = None) -> list[str]:
+    """Of a worker; returns why its task must stop."""
+    said: list[str] = []
+    pulse = Pulse(connection, place_of(name, 6), tell=lambda word, entry: said.append(word), end_worker=said.append)
+    pulse.take({"beat": asdict(beat_of(name)), "hold": hold.keys() if hold else None})
+    pulse.tick()
+    return said
+
+
+def beat_of(name: str) -> WorkerBeat:
+    now = timestamp()
+    return WorkerBeat(name, "host", 1, "cpu", "CPU", (Stage.SYNTHESIZE,), "0", "idle", "", now, now)
+
+
+@pytest.fixture(params=["memory", "redis"])
+def sides(request: pytest.FixtureRequest) -> tuple[TaskQueue, Worker]:
+    """A queue and a worker's side of it."""
+    if request.param == "memory":
+        queue = MemoryQueue()
+        return queue, memory_worker(queue)
+    redis: RqQueue = request.getfixturevalue("rq_queue")
+    side = RqSide(redis)
+    return redis, Worker(side.take, side.beat, side.finish)
+
+
+def test_tasks_come_out_as_they_went_in(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    assert queue.enqueue([task("a"), task("b")], Lane.BULK) == 2
+    assert queue.waiting() == {"a", "b"}
+    assert queue.depths()[Lane.BULK, Stage.SYNTHESIZE] == 2
+    assert worker.take() == task("a")
+    worker.finish()
+    assert worker.take() == task("b")
+
+
+def test_interactive_tasks_go_before_bulk_but_do_not_starve_it(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task(f"bulk{i}") for i in range(20)], Lane.BULK)
+    queue.enqueue([task(f"urgent{i}") for i in range(20)], Lane.INTERACTIVE)
+    taken = []
+    for _ in range(3 * BULK_EVERY):
+        found = worker.take()
+        assert found is not None
+        taken.append(found.task_id.rstrip("0123456789"))
+        worker.finish()
+    assert taken == 3 * [*["urgent"] * (BULK_EVERY - 1), "bulk"]
+
+
+def test_bulk_runs_at_full_rate_while_nothing_is_urgent(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task(f"bulk{i}") for i in range(2 * BULK_EVERY)], Lane.BULK)
+    for number in range(2 * BULK_EVERY):
+        assert worker.take() == task(f"bulk{number}")
+        worker.finish()
+    assert worker.take() is None
+
+
+def test_a_waiting_task_is_not_queued_twice(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a")], Lane.BULK)
+    assert queue.enqueue([task("a")], Lane.BULK) == 0
+    assert worker.take() is not None
+    assert queue.enqueue([task("a")], Lane.BULK) == 0, "it is running"
+    assert worker.take() is None
+
+
+def test_the_next_attempt_of_a_task_is_another_entry(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a")], Lane.BULK)
+    worker.take()
+    assert queue.enqueue([task("a", attempt=2)], Lane.BULK) == 1
+
+
+def test_a_lease_says_who_holds_which_attempt_of_what(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a", attempt=2)], Lane.BULK)
+    worker.take()
+    (lease,) = queue.leases()
+    assert (lease.task_id, lease.attempt, lease.worker) == ("a", 2, "w")
+    assert lease.message == task("a", attempt=2)
+    assert queue.waiting() == set()
+    worker.finish()
+    assert queue.leases() == []
+
+
+def test_a_lease_changes_with_each_sign_of_life_and_not_by_reading(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a")], Lane.BULK)
+    worker.take()
+    first = queue.leases()[0].beat
+    assert queue.leases()[0].beat == first
+    assert worker.beat() is None
+    assert queue.leases()[0].beat != first
+
+
+def test_a_worker_whose_lease_was_released_notices(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a")], Lane.BULK)
+    worker.take()
+    queue.release(queue.leases()[0])
+    assert queue.leases() == []
+    assert worker.beat() is StopReason.LEASE_LOST
+    assert queue.leases() == [], "a late sign of life does not bring the lease back"
+
+
+def test_a_discarded_task_never_starts(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a"), task("b")], Lane.BULK)
+    queue.discard(["a"])
+    assert queue.waiting() == {"b"}
+    assert worker.take() == task("b")
+
+
+def test_a_discarded_running_task_is_told_to_stop(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.enqueue([task("a")], Lane.BULK)
+    worker.take()
+    queue.discard(["a"])
+    assert worker.beat() is StopReason.CANCELLED
+
+
+def test_a_task_queued_again_after_it_was_discarded_runs(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, worker = sides
+    queue.discard(["a"])
+    queue.enqueue([task("a")], Lane.BULK)
+    worker.take()
+    assert worker.beat() is None
+
+
+def test_events_come_once_in_order_and_again_if_not_acknowledged(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, _ = sides
+    for name in "abc":
+        queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=name))
+    first = queue.consume(limit=2, wait_s=0)
+    assert [event.task_id for _, event in first] == ["a", "b"]
+    queue.acknowledge([event_id for event_id, _ in first[:1]])
+    assert [event.task_id for _, event in queue.consume(limit=9, wait_s=0)] == ["c"]
+    assert queue.consume(limit=9, wait_s=0) == []
+    restarted = _restarted(queue)
+    assert [event.task_id for _, event in restarted.consume(limit=9, wait_s=0)] == ["b", "c"]
+
+
+def _restarted(queue: TaskQueue) -> TaskQueue:
+    """The queue as a new keeper process finds it."""
+    if isinstance(queue, MemoryQueue):
+        queue.restart_consumer()
+        return queue
+    assert isinstance(queue, RqQueue)
+    return RqQueue(queue.connection)
+
+
+def test_any_number_of_readers_follow_the_stream(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, _ = sides
+    queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="queued"))
+    ((first_id, first),) = queue.tail("0", limit=9, wait_s=0)
+    assert first.message == "queued"
+    assert queue.tail(first_id, limit=9, wait_s=0) == []
+    queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="running"))
+    assert [event.message for _, event in queue.tail(first_id, limit=9, wait_s=0)] == ["running"]
+    assert len(queue.tail("0", limit=9, wait_s=0)) == 2
+
+
+def test_a_check_travels_like_any_task(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, _ = sides
+    message = IngestMessage(schema_=1, task_id="i", kind="hand", name="h", digest=DIGEST)
+    queue.enqueue([message], Lane.INTERACTIVE)
+    assert queue.depths()[Lane.INTERACTIVE, Stage.INGEST] == 1
+
+
+def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, _ = sides
+    assert not queue.announced("keeper")
+    queue.announce("keeper", 600)
+    queue.announce("brief", 0.05)
+    deadline = time.monotonic() + 60
+    while queue.announced("brief"):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert queue.announced("keeper")
+
+
+def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redis_server: str) -> None:
+    heart = Heartbeat(redis_server, beat_of("alive"), lease_s=6)
+    heart.start()
+    try:
+        deadline = time.monotonic() + 20
+        while not rq_queue.workers() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        (found,) = rq_queue.workers()
+        assert (found.name, found.stages) == ("alive", (Stage.SYNTHESIZE,))
+    finally:
+        heart.stop()
+    assert rq_queue.workers() == []
+
+
+def test_the_stream_of_events_is_bounded(rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.queue.rq_queue.EVENTS_KEPT", 200)
+    for _ in range(1000):
+        rq_queue.publish(Event(kind=EventKind.PROGRESS, at=timestamp()))
+    # Redis trims whole nodes of the stream, of 100 entries each.
+    assert rq_queue.connection.xlen("graspd:events") <= 300
+
+
+def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
+    side = RqSide(rq_queue)
+    before = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}
+    rq_queue.enqueue([task("a")], Lane.BULK)
+    side.take()
+    side.finish()
+    after = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}
+    assert after == before
+
+
+def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
+    worker = SimpleWorker(
+        [AllowedQueue.open(name, rq_queue.connection) for name in queue_names(tuple(Stage))],
+        connection=rq_queue.connection,
+        name="dead",
+        queue_class=AllowedQueue,
+        job_class=AllowedJob,
+    )
+    worker.register_birth()
+    one_beat(rq_queue.connection, "dead")
+    rq_queue.tidy()
+    assert [beat.name for beat in rq_queue.workers()] == ["dead"], "it lives"
+    rq_queue.connection.delete(worker_key("dead"))  # as its time to live does
+    rq_queue.tidy()
+    assert [key for key in rq_queue.connection.keys("*") if b"worker" in key] == []
+
+
+def test_a_lost_consumer_group_is_made_again(rq_queue: RqQueue) -> None:
+    assert rq_queue.consume(limit=1, wait_s=0) == []
+    rq_queue.connection.flushdb()
+    rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
+    assert [event.task_id for _, event in rq_queue.consume(limit=9, wait_s=0)] == ["a"]
+
+
+@pytest.mark.parametrize("data", [b"rubbish", b"{}", b"[]", b'{"name": 1}', b"\xff"])
+def test_a_forged_worker_is_left_out_and_hides_no_other(rq_queue: RqQueue, data: bytes) -> None:
+    one_beat(rq_queue.connection, "true")
+    rq_queue.connection.sadd("graspd:workers", "forged")
+    rq_queue.connection.set(worker_key("forged"), data)
+    assert [beat.name for beat in rq_queue.workers()] == ["true"]

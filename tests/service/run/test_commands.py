@@ -1,0 +1,157 @@
+"""The commands of the service: exit codes, one-line errors, JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from pydantic import BaseModel, Field
+from typer.testing import CliRunner
+
+from service.cli import load_settings, reporting_errors
+from service.model.errors import InputError, StoreUnavailable
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.run.commands import app
+from service.run.supervisor import _SETTLED, Supervisor
+from service.settings import Settings
+from service.store.store import open_store
+from tests.fakes import request
+from tests.service.index.test_index import run_all
+
+runner = CliRunner()
+
+
+@pytest.mark.parametrize("command", [["up"], ["keeper"], ["index", "rebuild"], ["index", "path"]])
+def test_every_command_shows_an_example(command: list[str]) -> None:
+    shown = runner.invoke(app, [*command, "--help"])
+    assert shown.exit_code == 0
+    assert f"graspd {' '.join(command)}" in shown.output
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (InputError("no such\n  hand"), 2, "graspd: no such hand\n"),
+        (StoreUnavailable("the disk is full"), 1, "graspd: the disk is full\n"),
+        (KeyboardInterrupt(), 130, "graspd: interrupted\n"),
+    ],
+)
+def test_an_error_is_one_line_and_an_exit_code(
+    error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @reporting_errors
+    def command() -> None:
+        raise error
+
+    with pytest.raises(typer.Exit) as ended:
+        command()
+    assert ended.value.exit_code == code
+    assert capsys.readouterr().err == line
+
+
+def test_a_bug_is_not_dressed_up_as_a_mistake() -> None:
+    @reporting_errors
+    def command() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        command()
+
+
+def test_a_bad_model_names_the_field(capsys: pytest.CaptureFixture[str]) -> None:
+    class Wanted(BaseModel):
+        grasps: int = Field(ge=1)
+
+    @reporting_errors
+    def command() -> None:
+        Wanted(grasps=0)
+
+    with pytest.raises(typer.Exit):
+        command()
+    assert capsys.readouterr().err == "graspd: grasps: Input should be greater than or equal to 1\n"
+
+
+def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRASPD_LEASE_S", "soon")
+    with pytest.raises(InputError, match=r"^GRASPD_LEASE_S: "):
+        load_settings()
+
+
+def on_disk(parts: Parts) -> Parts:
+    """The same service with its store in the data folder, as the commands find it."""
+    store = open_store(parts.settings.resolved_store_url)
+    for entry in list(parts.store.list("assets")):
+        store.put(entry.key, parts.store.get(entry.key))
+    return Parts(parts.settings, store, parts.index, parts.queue)
+
+
+def test_a_rebuild_of_a_sound_index_finds_no_difference(parts: Parts) -> None:
+    parts = on_disk(parts)
+    job, _ = job_actions.submit(parts, request())
+    run_all(parts, job.id)
+    shown = runner.invoke(app, ["index", "rebuild", "--data-dir", str(parts.settings.data_dir), "--json"])
+    assert shown.exit_code == 0, shown.output
+    told = json.loads(shown.stdout.splitlines()[-1])
+    assert (told["differences"], told["changed"]) == ([], False)
+    assert (told["jobs"], told["shards"]) == (1, 1)
+
+
+def test_a_check_tells_differences_changes_nothing_and_exits_with_1(parts: Parts) -> None:
+    parts = on_disk(parts)
+    job_actions.submit(parts, request())
+    damaged = ["index", "rebuild", "--check", "--data-dir", str(parts.settings.data_dir)]
+    assert runner.invoke(app, damaged).exit_code == 0
+    (parts.settings.data_dir / "index.sqlite").unlink()
+    for leftover in parts.settings.data_dir.glob("index.sqlite-*"):
+        leftover.unlink()
+    for _ in range(2):
+        shown = runner.invoke(app, damaged)
+        assert shown.exit_code == 1
+        assert "not in the index" in shown.output
+    assert runner.invoke(app, damaged[:2] + damaged[3:]).exit_code == 0
+    assert runner.invoke(app, damaged).exit_code == 0
+
+
+def test_up_on_a_taken_port_is_one_clear_line(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        shown = runner.invoke(app, ["up", "--port", str(port), "--data-dir", str(tmp_path / "data")])
+    assert shown.exit_code == 1
+    assert shown.stderr.splitlines()[-1].startswith(f"graspd: port {port} on 127.0.0.1 is taken; ")
+    with Supervisor(Settings(data_dir=tmp_path / "data", port=0), workers=0, api=False):
+        pass  # nothing was left locked
+
+
+def test_up_on_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    shown = runner.invoke(app, ["up", "--port", "0", "--data-dir", str(tmp_path / "file" / "data")])
+    assert shown.exit_code == 1
+    assert shown.stderr.splitlines()[-1].endswith("file/data cannot be made: Not a directory")
+
+
+def test_the_keeper_ends_well_on_sigterm(tmp_path: Path) -> None:
+    environment = os.environ | {"GRASPD_DATA_DIR": str(tmp_path), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
+    code = "from service.run.commands import app; app(['keeper'])"
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE) as keeper:
+        assert keeper.stderr is not None
+        first = keeper.stderr.readline().decode()
+        assert "Redis does not answer" in first, "it waits for Redis instead of giving up"
+        keeper.send_signal(signal.SIGTERM)
+        keeper.stderr.read()
+        assert keeper.wait(timeout=60) == 0
+
+
+def test_the_children_of_up_get_every_setting() -> None:
+    """A setting given in Python or on the command line must not stop at the parent."""
+    settled_by_up = {"data_dir", "redis_url", "host", "port", "api_url"}
+    assert set(_SETTLED) <= settled_by_up

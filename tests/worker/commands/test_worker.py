@@ -1,0 +1,25 @@
+"""The worker's command."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+_ENDING = """
+import atexit
+from worker.commands.worker import _end
+
+class Engine:
+    def __del__(self):
+        print("taken apart", flush=True)
+
+engine = Engine()
+atexit.register(print, "what waited was sent")
+_end(3)
+"""
+
+
+def test_a_worker_ends_at_once_without_taking_its_engine_apart() -> None:
+    """Warp and its kernels take two seconds of computing for that: too long for a busy machine to wait for."""
+    done = subprocess.run([sys.executable, "-c", _ENDING], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (3, "what waited was sent\n"), done.stderr

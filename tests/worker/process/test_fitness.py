@@ -1,0 +1,147 @@
+"""Which failures are the worker's own."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import pytest
+
+from service.model.domain import Stage, TaskMessage
+from service.model.errors import DamagedError, MeshError
+from service.queue.port import Event, EventKind
+from service.store.records import task_attempts
+from service.store.store import Store, open_store
+from tests.fakes import fake_synthesize, make_shard, message_for
+from worker.process import fitness as module
+from worker.process.fitness import Fitness
+from worker.process.runner import Runner
+from worker.process.selfcheck import EngineError
+from worker.stages.context import TaskContext
+
+
+class Bench:
+    """A worker's runner, whose engine and stage can be broken."""
+
+    def __init__(self) -> None:
+        self.store: Store = open_store("memory://")
+        self.engine_works = True
+        self.error: Exception | None = None
+        self.checked: list[tuple[Stage, ...]] = []
+        self.fitness = Fitness(self.store, self._check)
+
+    def _check(self, stages: Collection[Stage]) -> None:
+        self.checked.append(tuple(stages))
+        if not self.engine_works:
+            raise EngineError("synthesize: ImportError: libcuda.so.1")
+
+    def run(self, message: TaskMessage) -> Event:
+        def stage(message: TaskMessage, context: TaskContext) -> Any:
+            if self.error is not None:
+                raise self.error
+            return fake_synthesize(message, context)
+
+        runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, fitness=self.fitness)
+        event = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
+        assert event is not None
+        return event
+
+    def fail(self, seed: int) -> Event:
+        self.error = RuntimeError("no result")
+        return self.run(message_for(seed=seed).model_copy(update={"task_id": f"{seed:032x}"}))
+
+
+class Listing:
+    """What a worker told about itself."""
+
+    def __init__(self) -> None:
+        self.told: list[dict[str, str]] = []
+
+    def update(self, **facts: str) -> None:
+        self.told.append(facts)
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    monkeypatch.setattr(module, "PAUSES_S", (0.0, 0.0))
+    return Bench()
+
+
+def test_a_task_that_failed_because_the_engine_broke_goes_back_without_an_attempt(bench: Bench) -> None:
+    bench.engine_works = False
+    event = bench.fail(1)
+    assert (event.kind, event.message) == (EventKind.RETURNED, "synthesize: ImportError: libcuda.so.1")
+    assert task_attempts(bench.store, event.task_id) == []
+    assert bench.fitness.reason == event.message
+
+
+def test_a_task_that_fails_with_a_sound_engine_has_failed(bench: Bench) -> None:
+    assert bench.fail(1).kind is EventKind.FAILED
+    assert bench.checked == [(Stage.SYNTHESIZE,)], "what its stage runs on was tried"
+    assert bench.fitness.reason == ""
+
+
+@pytest.mark.parametrize("error", [MeshError("torn"), DamagedError("no JSON")])
+def test_bad_input_casts_no_doubt_on_the_worker(bench: Bench, error: Exception) -> None:
+    bench.engine_works, bench.error = False, error
+    assert bench.run(message_for()).kind is EventKind.FAILED
+    assert bench.checked == []
+
+
+def test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench: Bench) -> None:
+    for seed in (1, 2):
+        assert bench.fail(seed).kind is EventKind.FAILED
+        make_shard(bench.store, message_for(seed=seed), worker="another")
+    event = bench.fail(3)
+    assert (event.kind, task_attempts(bench.store, event.task_id)) == (EventKind.RETURNED, [])
+    assert bench.fitness.reason == "2 tasks in a row failed here and were done by other workers"
+
+
+def test_tasks_that_fail_everywhere_are_no_fault_of_the_worker(bench: Bench) -> None:
+    assert {bench.fail(seed).kind for seed in range(6)} == {EventKind.FAILED}
+
+
+def test_one_task_that_others_can_do_is_no_row(bench: Bench) -> None:
+    bench.fail(1)
+    make_shard(bench.store, message_for(seed=1), worker="another")
+    assert bench.fail(2).kind is EventKind.FAILED
+
+
+def test_a_success_in_between_ends_the_row(bench: Bench) -> None:
+    for seed in (1, 2):
+        bench.fail(seed)
+        make_shard(bench.store, message_for(seed=seed), worker="another")
+    bench.error = None
+    assert bench.run(message_for(seed=9)).kind is EventKind.FINISHED
+    assert bench.fail(3).kind is EventKind.FAILED
+
+
+def test_a_worker_comes_back_once_its_engine_works(bench: Bench) -> None:
+    listing = Listing()
+    bench.engine_works = False
+    assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
+    bench.engine_works = True
+    assert bench.fitness.sit_out((Stage.SYNTHESIZE,), listing, lambda: False)
+    assert listing.told == [
+        {"state": "quarantined", "reason": "synthesize: ImportError: libcuda.so.1"},
+        {"state": "idle", "reason": ""},
+    ]
+
+
+def test_a_worker_whose_engine_stays_broken_gives_up_after_some_tries(bench: Bench) -> None:
+    bench.engine_works = False
+    assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
+    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing(), lambda: False)
+    assert len(bench.checked) == 1 + len(module.PAUSES_S)
+
+
+def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(bench: Bench) -> None:
+    test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench)
+    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing(), lambda: False), "a fresh process must start"
+
+
+def test_a_worker_in_quarantine_stops_when_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PAUSES_S", (600.0,))
+    bench.engine_works = False
+    assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
+    assert not bench.fitness.sit_out((Stage.SYNTHESIZE,), Listing(), lambda: True)

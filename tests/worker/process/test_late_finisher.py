@@ -1,0 +1,57 @@
+"""How a worker closes its books on a task whose lease is gone, or when Redis takes no writes."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.model.domain import Lane, Stage, TaskMessage
+from service.queue.port import EventKind
+from service.queue.rq_queue import RqQueue
+from service.settings import Settings
+from tests.fakes import fake_synthesize, message_for
+from worker.process.main import run_worker
+from worker.stages.context import TaskContext
+
+
+def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(
+    rq_queue: RqQueue, redis_server: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def slow(message: TaskMessage, context: TaskContext) -> Any:
+        (lease,) = rq_queue.leases()
+        rq_queue.release(lease)
+        return fake_synthesize(message, TaskContext(context.store))
+
+    rq_queue.enqueue([message_for()], Lane.BULK)
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
+    with caplog.at_level(logging.INFO):
+        assert run_worker(settings, table={Stage.SYNTHESIZE: slow}, burst=True)
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
+    assert [record for record in caplog.records if "was taken from this worker" in record.getMessage()]
+    assert not rq_queue.connection.keys("rq:job:*"), "nothing is left of it"
+
+
+def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> None:
+    """Redis refuses writes here for want of replicas, as it does on a full disk."""
+
+    def refuse(replicas: int) -> None:
+        rq_queue.connection.config_set("min-replicas-to-write", replicas)
+
+    def stage(message: TaskMessage, context: TaskContext) -> Any:
+        refuse(1)
+        threading.Timer(1.0, refuse, [0]).start()
+        return fake_synthesize(message, context)
+
+    rq_queue.enqueue([message_for()], Lane.BULK)
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
+    try:
+        assert run_worker(settings, table={Stage.SYNTHESIZE: stage}, burst=True)
+    finally:
+        refuse(0)
+    assert rq_queue.leases() == []
+    kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
+    assert kinds[:2] == [EventKind.STARTED, EventKind.FINISHED]

@@ -1,0 +1,249 @@
+"""What becomes of a task, whatever its stage does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.model import names
+from service.model.domain import Stage, TaskMessage
+from service.model.errors import InputError, MeshError, QueueUnavailable, StoreUnavailable, TaskRefused
+from service.queue.port import Event, EventKind
+from service.store.manifests import load_manifest
+from service.store.records import task_attempts
+from service.store.shards import read_shard
+from service.store.store import Store, open_store
+from tests.damage import flip
+from tests.fakes import fake_synthesize, make_shard, message_for
+from worker.process.runner import Runner
+from worker.stages import scene
+from worker.stages.context import StopReason, TaskContext
+
+
+class Bench:
+    """A runner on a store in memory."""
+
+    def __init__(self) -> None:
+        self.store: Store = open_store("memory://")
+        self.told: list[Event] = []
+        self.calls = 0
+
+    def run(self, message: TaskMessage, stage: Any = fake_synthesize, **changes: Any) -> Event | None:
+        def counted(task: TaskMessage, context: TaskContext) -> Any:
+            self.calls += 1
+            return stage(task, context)
+
+        runner = Runner({Stage.SYNTHESIZE: counted}, worker="w", publish=self.told.append)
+        return runner.run(message.model_dump(mode="json", by_alias=True) | changes, TaskContext(self.store))
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def raising(error: Exception) -> Any:
+    def stage(message: TaskMessage, context: TaskContext) -> None:
+        raise error
+
+    return stage
+
+
+def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) -> None:
+    message = message_for()
+    outcome = bench.run(message)
+    assert outcome is not None
+    assert (outcome.kind, outcome.output) == (EventKind.FINISHED, message.output)
+    assert [event.kind for event in bench.told] == [EventKind.STARTED]
+    manifest = load_manifest(bench.store, Stage.SYNTHESIZE, message.output)
+    shard = read_shard(bench.store.get(manifest.key), kind="base")
+    assert manifest.counts["N"] == len(manifest.grasps) == 32
+    assert manifest.valid == shard["quality/valid"].sum()
+    assert manifest.index_threshold_m == 0.005
+    assert [g.epsilon for g in manifest.grasps] == list(shard["quality/epsilon"][:, 1])
+    assert all(g.stability_loss is None for g in manifest.grasps), "nan is no JSON number"
+    assert shard.attributes["hand"] == "gripper"
+
+
+def test_a_task_that_was_done_before_is_not_done_again(bench: Bench) -> None:
+    message = message_for()
+    bench.run(message)
+    outcome = bench.run(message, raising(AssertionError("it ran")))
+    assert outcome is not None
+    assert outcome.kind is EventKind.FINISHED
+    assert bench.calls == 1
+
+
+def test_a_shard_left_without_its_manifest_is_described_as_it_is(bench: Bench) -> None:
+    message = message_for()
+    first = make_shard(bench.store, message, worker="first")
+    other = open_store("memory://")
+    other.put(first.key, bench.store.get(first.key))
+    bench.store = other
+
+    def different(task: TaskMessage, context: TaskContext) -> Any:
+        return fake_synthesize(task.model_copy(update={"batch": 9}), context)
+
+    bench.run(message, different)
+    manifest = load_manifest(other, Stage.SYNTHESIZE, message.output)
+    assert (manifest.sha256, manifest.grasps, manifest.valid) == (first.sha256, first.grasps, first.valid)
+
+
+def test_an_error_is_recorded_with_its_trace_and_may_be_tried_again(bench: Bench) -> None:
+    message = message_for()
+    outcome = bench.run(message, raising(ValueError("no\nway")))
+    assert outcome is not None
+    assert (outcome.kind, outcome.last, outcome.message) == (EventKind.FAILED, False, "no way")
+    (attempt,) = task_attempts(bench.store, message.task_id)
+    assert (attempt.number, attempt.kind, attempt.reason, attempt.worker) == (1, "ValueError", "no way", "w")
+    assert attempt.trace is not None
+    assert "raise error" in attempt.trace
+
+
+def test_the_last_attempt_says_so(bench: Bench) -> None:
+    outcome = bench.run(message_for(attempt=3), raising(ValueError("no")))
+    assert outcome is not None
+    assert outcome.last
+
+
+@pytest.mark.parametrize("error", [InputError("bad"), MeshError("torn"), TaskRefused("unknown")])
+def test_bad_input_is_not_tried_again(bench: Bench, error: Exception) -> None:
+    outcome = bench.run(message_for(), raising(error))
+    assert outcome is not None
+    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
+
+
+@pytest.mark.parametrize("error", [StoreUnavailable("full"), QueueUnavailable("away")])
+def test_a_part_that_is_away_costs_no_attempt(bench: Bench, error: Exception) -> None:
+    message = message_for(attempt=3)
+    outcome = bench.run(message, raising(error))
+    assert outcome is not None
+    assert outcome.kind is EventKind.DEFERRED
+    assert task_attempts(bench.store, message.task_id) == []
+
+
+def test_a_disk_without_room_costs_no_attempt_wherever_it_is_found(bench: Bench) -> None:
+    def full(message: TaskMessage, context: TaskContext) -> None:
+        try:
+            Path("/dev/full").write_text("a kernel, a picture")
+        except OSError as error:
+            raise RuntimeError("no file could be written") from error
+
+    message = message_for(attempt=3)
+    outcome = bench.run(message, full)
+    assert outcome is not None
+    assert (outcome.kind, outcome.message) == (
+        EventKind.DEFERRED, "No space left on device: no file could be written",
+    )  # fmt: skip
+    assert task_attempts(bench.store, message.task_id) == []
+
+
+def test_a_failure_that_cannot_be_recorded_is_deferred(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(key: str, data: bytes) -> bool:
+        raise StoreUnavailable("the store is full")
+
+    monkeypatch.setattr(bench.store, "put", full)
+    outcome = bench.run(message_for(), raising(ValueError("no")))
+    assert outcome is not None
+    assert outcome.kind is EventKind.DEFERRED
+    assert "the store is full" in outcome.message
+
+
+@pytest.mark.parametrize(
+    ("reason", "kind"),
+    [
+        (StopReason.CANCELLED, EventKind.CANCELLED),
+        (StopReason.SHUTDOWN, EventKind.RETURNED),
+        (StopReason.LEASE_LOST, None),
+        (StopReason.TIMEOUT, EventKind.FAILED),
+    ],
+)
+def test_why_a_task_was_stopped_decides_what_is_told(bench: Bench, reason: StopReason, kind: EventKind | None) -> None:
+    def stopping(message: TaskMessage, context: TaskContext) -> Any:
+        context.stop(reason)
+        context.check()
+
+    message = message_for()
+    outcome = bench.run(message, stopping)
+    assert (outcome.kind if outcome else None) is kind
+    assert len(task_attempts(bench.store, message.task_id)) == (kind is EventKind.FAILED)
+
+
+def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> None:
+    def deaf(message: TaskMessage, context: TaskContext) -> Any:
+        context.stop(StopReason.CANCELLED)
+        return fake_synthesize(message, TaskContext(context.store))
+
+    message = message_for()
+    outcome = bench.run(message, deaf)
+    assert outcome is not None
+    assert outcome.kind is EventKind.CANCELLED
+    assert not bench.store.exists(names.shard_file(Stage.SYNTHESIZE, message.output))
+
+
+def test_a_task_of_another_schema_is_refused_with_the_mend(bench: Bench) -> None:
+    message = message_for()
+    outcome = bench.run(message, schema=99, something_new=True)
+    assert outcome is not None
+    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
+    assert "schema 99" in outcome.message
+    assert "one version" in outcome.message
+    assert bench.calls == 0
+
+
+def test_a_job_planned_for_another_revision_is_refused_with_the_mend(bench: Bench) -> None:
+    message = message_for()
+    outcome = bench.run(message, revision=message.revision + 1)
+    assert outcome is not None
+    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
+    assert "submit the job again" in outcome.message
+
+
+def test_what_is_no_message_is_refused(bench: Bench) -> None:
+    with pytest.raises(TaskRefused, match="no task of graspd"):
+        bench.run(message_for(), count="many")
+
+
+def test_a_forged_output_cannot_leave_the_store(bench: Bench) -> None:
+    with pytest.raises(TaskRefused, match="no task of graspd"):
+        bench.run(message_for(), output="../../etc/passwd")
+    assert bench.calls == 0
+
+
+def test_a_stage_that_is_not_served_here_is_refused(bench: Bench) -> None:
+    outcome = bench.run(message_for(Stage.SCENE, scenes=1))
+    assert outcome is not None
+    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
+
+
+def test_progress_is_told_a_few_times_a_second_however_often_it_is_made() -> None:
+    told: list[tuple[float, float, str]] = []
+    context = TaskContext(open_store("memory://"), tell=lambda *args: told.append(args))
+    for step in range(10_000):
+        context.progress(step, 10_000, "descending")
+    context.progress(10_000, 10_000, "done")
+    assert 2 <= len(told) <= 4
+    assert told[-1] == (10_000, 10_000, "done")
+
+
+def test_a_part_of_a_task_moves_its_share_of_the_bar() -> None:
+    told: list[tuple[float, float, str]] = []
+    context = TaskContext(open_store("memory://"), tell=lambda *args: told.append(args))
+    context.part(0.8, 1.0)(1, 2, "quality")
+    assert told == [(pytest.approx(0.9), 1.0, "quality")]
+
+
+def test_a_stage_refuses_a_damaged_shard_and_is_not_tried_again(bench: Bench) -> None:
+    base = make_shard(bench.store, message_for(scenes=1))
+    message = message_for(Stage.SCENE, scenes=1)
+    assert message.inputs == (base.shard_id,)
+    flip(bench.store, base.key)
+    runner = Runner({Stage.SCENE: scene.run}, worker="w", publish=bench.told.append)
+    outcome = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(bench.store))
+    assert outcome is not None
+    assert outcome.kind is EventKind.FAILED
+    attempt = task_attempts(bench.store, message.task_id)[0]
+    assert (attempt.kind, attempt.last) == ("DamagedShard", True)
+    assert base.shard_id in attempt.reason

@@ -1,0 +1,102 @@
+"""Obstacles against closed forms, and against MuJoCo's distances."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from service.model.errors import InputError
+from service.model.transforms import apply, quat_rotate
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.load import hand_from_path
+from worker.simulation.obstacles import obstacle_distances
+from worker.simulation.surroundings import Obstacle, Placed, Surroundings
+
+TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
+TILTED[3:] /= np.linalg.norm(TILTED[3:])
+
+
+def test_the_distance_from_a_half_space_is_the_height_above_it() -> None:
+    plane = Obstacle.half_space([0, 0, 2], 0.5)
+    np.testing.assert_allclose(plane.distance(np.array([[1, 2, 3], [0, 0, 0.1]])), [2.75, -0.15], atol=1e-12)
+
+
+def test_the_distance_from_a_box_is_exact_inside_and_over_its_faces() -> None:
+    box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.4, 0.6])
+    points = np.array([[0.15, 0, 0], [0, -0.3, 0.1], [0, 0, 0.25], [0.09, 0, 0]])
+    np.testing.assert_allclose(box.distance(points), [0.05, 0.1, -0.05, -0.01], atol=1e-12)
+
+
+def test_beyond_an_edge_the_distance_is_never_more_than_the_true_one() -> None:
+    box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.2, 0.2])
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
+    outside = np.maximum(np.abs(points) - 0.1, 0.0)
+    true = np.linalg.norm(outside, axis=1)
+    assert (box.distance(points)[true > 0] <= true[true > 0] + 1e-12).all()
+
+
+def test_an_obstacle_seen_from_a_frame_has_the_same_distances_there() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    for obstacle in (Obstacle.half_space([1, 2, 3], 0.4), Obstacle.box(TILTED, [0.3, 0.5, 0.7])):
+        np.testing.assert_allclose(
+            obstacle.seen_from(TILTED).distance(points), obstacle.distance(apply(TILTED, points)), atol=1e-12
+        )
+
+
+def test_up_is_against_gravity_in_the_object_frame() -> None:
+    placed = Placed((Obstacle.half_space([0, 0, 1], 0),), TILTED[None], np.zeros(1, int))
+    np.testing.assert_allclose(quat_rotate(TILTED[3:], placed.scenes[0].up), [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Obstacle.half_space([0, 0, 0], 1.0),
+        lambda: Obstacle.half_space([0, 0, float("nan")], 1.0),
+        lambda: Obstacle.box([0, 0, 0, 1, 0, 0, 0], [1, 0, 1]),
+        lambda: Obstacle.box([0, 0, 0, 0, 0, 0, 0], [1, 1, 1]),
+        lambda: Obstacle.box([0, 0, 0], [1, 1, 1]),
+    ],
+)
+def test_nonsense_is_refused(make) -> None:
+    with pytest.raises(InputError):
+        make()
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
+    """1e-5 m: MuJoCo keeps meshes in float32 and its distances converge to 1e-6."""
+    hand, rng = hand_from_path(name), np.random.default_rng(3)
+    q = hand.lower + rng.random((8, hand.dofs)) * (hand.upper - hand.lower)
+    rotation = rng.normal(size=(8, 4))
+    pose = np.concatenate(
+        [rng.normal(size=(8, 3)) * 0.1, rotation / np.linalg.norm(rotation, axis=1, keepdims=True)], 1
+    )
+    postures = Posture(pose, hand.expand(q))
+    plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
+    found = obstacle_distances(hand, postures, Surroundings((plane,), plane.planes[0, :3]))
+    np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
+
+
+def mujoco_distances(hand, postures: Posture, plane: Obstacle) -> np.ndarray:
+    from worker.scenes.neighbours import _add_piece
+
+    spec = mujoco.MjSpec()
+    geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
+    normal, offset = plane.planes[0, :3], plane.planes[0, 3]
+    geom.pos = offset * normal
+    mujoco.mju_quatZ2Vec(geom.quat, normal)
+    for k, one in enumerate(hand.pieces):
+        _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", one)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
+    least = []
+    for row in bodies:
+        placed = row[[one.body for one in hand.pieces]]
+        data.mocap_pos[:], data.mocap_quat[:] = placed[:, :3], placed[:, 3:]
+        mujoco.mj_kinematics(model, data)
+        least.append(min(mujoco.mj_geomDistance(model, data, 0, k + 1, 10.0, None) for k in range(len(hand.pieces))))
+    return np.array(least)

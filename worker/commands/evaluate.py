@@ -1,0 +1,124 @@
+"""Command line: `graspd evaluate`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Final, get_args
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from service.cli import JsonFlag, emit, reporting_errors
+from service.model.errors import InputError
+from worker.files.cases import expand, load_case
+from worker.files.evaluate import Protocol, combine, evaluate
+from worker.quality.referee.key import Level
+from worker.quality.referee.lifting import LiftLevel
+
+app = typer.Typer(add_completion=False)
+
+#: Columns of the printed table: key, heading, digits.
+_COLUMNS: Final = (
+    ("n", "n", 0), ("gsr", "GSR", 2), ("sgs", "SGS", 2), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2), ("ca_cm2", "CA", 1),
+    ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2), ("sd_cm", "SD", 2), ("diversity", "D", 2),
+)  # fmt: skip
+
+
+@app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level letter")
+@reporting_errors
+def evaluate_command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="Base shards, reference-grasp JSON files, folders of either, DexGraspBench folders."),
+    ],
+    protocol: Annotated[
+        str,
+        typer.Option(
+            help="dexgraspbench: six pushes; lift: out of the scene the grasps were planned in; displacement: only the "
+            "slip in 0.15 s."
+        ),
+    ] = "dexgraspbench",
+    level: Annotated[
+        str, typer.Option(help="What a verdict costs: letter, certificate or screen; of a lift: letter or lift.")
+    ] = "",
+    hard: Annotated[bool, typer.Option("--hard", help="Half the friction, a tenth of the torsional.")] = False,
+    hand: Annotated[
+        str | None, typer.Option(help="The hand's file; default: what the file says, found by its digest.")
+    ] = None,
+    object: Annotated[
+        str | None, typer.Option(help="The object's file; default: what the file says, found by its digest.")
+    ] = None,
+    friction: Annotated[
+        float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """Measure grasps and let an independent engine judge them. Numbers are medians, ε and areas at 5 mm."""
+    if protocol not in get_args(Protocol):
+        raise InputError(f"unknown protocol {protocol!r}; choose {', '.join(get_args(Protocol))}")
+    levels = get_args(LiftLevel if protocol == "lift" else Level)
+    level = level or ("lift" if protocol == "lift" else "certificate")
+    if level not in levels:
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
+    rows: list[dict[str, Any]] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
+        task = bar.add_task("reading", total=1)
+        for file in (one for path in files for one in expand(path)):
+            case = load_case(file, hand=hand, obj=object)
+            row = evaluate(
+                case,
+                protocol=protocol,  # type: ignore[arg-type]
+                level=level,  # type: ignore[arg-type]
+                hard=hard,
+                friction=friction,
+                threads=threads,
+                progress=partial(_show, bar, task, case.name),
+            )
+            rows.append({"file": str(file), **row})
+    whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
+    if json:
+        verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
+        emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
+    else:
+        Console().print(_table(rows, whole))
+        for row in rows:
+            if "note" in row:
+                typer.echo(row["note"], err=True)
+
+
+def _show(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
+    bar.update(task, completed=done, total=total, description=f"{name}: {what}")
+
+
+def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
+    stated = f"{whole['protocol']}, {whole['level'] or 'not judged'}{', hard' if whole['hard'] else ''}"
+    friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
+    table = Table(
+        title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
+        caption="GSR share held; SGS held per s; PD, SPD mm; CA cm²; IV cm³; SD cm; D share of the first component",
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    table.add_column("grasps", max_width=16, no_wrap=True)
+    for _, heading, _ in _COLUMNS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(Path(row["file"]).stem, *(_cell(row[key], digits) for key, _, digits in _COLUMNS))
+    if len(rows) > 1:
+        table.add_section()
+        table.add_row("all", *(_cell(whole[key], digits) for key, _, digits in _COLUMNS))
+    return table
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

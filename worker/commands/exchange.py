@@ -1,0 +1,170 @@
+"""Command line: `graspd export` and `graspd import`."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+
+from service.cli import JsonFlag, emit, reporting_errors
+from service.model.errors import InputError
+from service.store import standing
+from service.store.shards import read_shard
+from worker.files.choice import EveryOption, UnjudgedOption, choose
+
+app = typer.Typer(no_args_is_help=True)
+
+EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench")
+IMPORTS: Final = ("dexgraspbench", "dexgraspnet", "multidex", "ddgc", "reference")
+
+
+@app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
+@reporting_errors
+def export(
+    source: Annotated[Path, typer.Argument(help="A shard, or for webdataset a folder of shards.")],
+    format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
+    hand: Annotated[str | None, typer.Option(help="The shard's hand; default: found by its digest.")] = None,
+    object_: Annotated[
+        str | None, typer.Option("--object", help="The shard's object; default: found by its digest.")
+    ] = None,
+    unjudged: UnjudgedOption = False,
+    every: EveryOption = False,
+    depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
+    json: JsonFlag = False,
+) -> None:
+    """Write grasps or pictures as others read them."""
+    if format_ not in EXPORTS:
+        raise InputError(f"there is no export format {format_!r}; choose one of {', '.join(EXPORTS)}")
+    if depth not in ("exr", "png"):
+        raise InputError(f"there is no depth format {depth!r}; use exr or png")
+    if format_ == "webdataset":
+        written = _webdataset(source, output, unjudged=unjudged, every=every)
+    elif format_ == "dexgraspbench":
+        written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
+    else:
+        written = _pictures(source, format_, depth, output)
+    if json:
+        emit({"folder": str(output), "format": format_, **written})
+    else:
+        typer.echo(f"{output}: " + ", ".join(f"{number} {what}" for what, number in written.items()))
+
+
+@app.command(
+    "import", epilog="graspd import grasps.npy --format dexgraspnet --hand shadow --object mug.obj -o imported"
+)
+@reporting_errors
+def import_(
+    source: Annotated[Path, typer.Argument(help="The file or folder of grasps.")],
+    format_: Annotated[str, typer.Option("--format", help=", ".join(IMPORTS) + ".")],
+    licence: Annotated[str, typer.Option(help="On which terms the grasps may be used; goes into every file.")],
+    origin: Annotated[str, typer.Option("--source", help="Where they come from: an address or a citation.")],
+    hand: Annotated[str | None, typer.Option(help="The hand: a URDF or a built-in.")] = None,
+    object_: Annotated[str | None, typer.Option("--object", help="The object's mesh, at the source's scale 1.")] = None,
+    robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
+    name: Annotated[str, typer.Option(help="multidex: name of the object in the file.")] = "",
+    number: Annotated[int, typer.Option(help="ddgc: which object of the scene.")] = 0,
+    referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
+    friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("imported"),
+    json: JsonFlag = False,
+) -> None:
+    """Read grasps of others, let the referee judge them, measure them, and write base shards.
+
+    Nothing in the files is executed. The meshes go beside the shards, at the scale the grasps were made for.
+    """
+    from worker.engines import backend
+
+    backend.start()
+    from worker.files.exchange.imported import Origin
+    from worker.files.exchange.scoring import write_scored
+
+    options: dict[str, Any] = {"robot": robot, "object_name": name, "number": number}
+    sets = read_sets(format_, source, hand, object_, options)
+    said = Origin(format_, origin, licence)
+    files = [
+        write_scored(one, said, output, referee=referee, friction=friction, threads=threads, ordinal=k)
+        for k, one in enumerate(sets)
+    ]
+    (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")
+    found = [_summary(file) for file in files]
+    if json:
+        emit({"folder": str(output), "shards": found})
+        return
+    for one in found:
+        judged = "nobody judged them" if referee == "none" else f"{one['valid']} valid at level {referee}"
+        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['sound']} sound, {judged}")
+
+
+def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
+    """The sets of grasps in a file of that format.
+
+    Raises:
+        InputError: unknown format, something that it needs is not given, or not such a file.
+    """
+    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, multidex, reference
+
+    if format_ not in IMPORTS:
+        raise InputError(f"there is no import format {format_!r}; choose one of {', '.join(IMPORTS)}")
+    if not source.exists():
+        raise InputError(f"{source} does not exist")
+    if format_ == "reference":
+        return reference.read(source, hand=hand, obj=obj)
+    if hand is None or obj is None:
+        raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
+    if format_ == "dexgraspbench":
+        return dexgraspbench.read(source, hand=hand, obj=obj)
+    if format_ == "dexgraspnet":
+        return dexgraspnet.read(source, hand=hand, obj=obj)
+    if format_ == "ddgc":
+        return ddgc.read(source, hand=hand, obj=obj, number=int(options["number"]))
+    if not options["robot"] or not options["object_name"]:
+        raise InputError("a multidex file holds many robots and objects; name one of each: --robot and --name")
+    return multidex.read(source, hand=hand, obj=obj, robot=options["robot"], object_name=options["object_name"])
+
+
+def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str, int]:
+    from worker.files.exchange import replicator
+    from worker.rendering.export import export_images
+
+    views = read_shard(source, kind="views")
+    if format_ == "replicator":
+        written = replicator.write(views, output)
+    else:
+        written = export_images(views, output, depth="exr" if depth == "exr" else "png")
+    return {"pictures": len(views["camera/eye"]), "files": len(written)}
+
+
+def _webdataset(source: Path, output: Path, *, unjudged: bool, every: bool) -> dict[str, int]:
+    from service.readers import Pictures, open_shards
+    from worker.files.exchange import webdataset
+
+    shards = open_shards(source)
+    written = webdataset.write(shards, output, valid=not every, unjudged=unjudged)
+    return {"pictures": len(Pictures(shards)), "files": len(written)}
+
+
+def _bench(
+    source: Path, hand: str | None, obj: str | None, output: Path, *, unjudged: bool, every: bool
+) -> dict[str, int]:
+    from worker.files.cases import load_case
+    from worker.files.exchange import dexgraspbench
+
+    case = load_case(source, hand=hand, obj=obj)
+    mask, _ = choose(read_shard(source, kind="base"), unjudged=unjudged, every=every)
+    rows = np.flatnonzero(mask)
+    written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output)
+    return {"grasps": len(written), "files": len(written)}
+
+
+def _summary(file: Path) -> dict[str, Any]:
+    shard = read_shard(file, kind="base")
+    valid, sound = standing.valid(shard.arrays), standing.sound(shard.arrays)
+    return {
+        "file": str(file), "object": shard.attributes["object"], "grasps": len(valid), "valid": int(valid.sum()),
+        "sound": int(sound.sum()),
+    }  # fmt: skip

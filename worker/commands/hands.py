@@ -1,0 +1,65 @@
+"""Command line: `graspd hands check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.cli import JsonFlag, emit, reporting_errors
+from service.model.domain import AssetKind
+from service.model.errors import GraspdError, InputError
+from service.store.asset_options import (
+    ApproachOption,
+    DropOption,
+    FixOption,
+    PalmOption,
+    PreShapeOption,
+    RootOption,
+    hand_options,
+)
+from service.store.asset_summary import say_check
+from worker.hands.check import check_hand
+from worker.hands.load import files_from_path, hand_from_path
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
+@reporting_errors
+def check(
+    file: Annotated[str, typer.Argument(help="A URDF, its folder, a ZIP of that, or the name of a built-in hand.")],
+    palm: PalmOption = None,
+    approach: ApproachOption = None,
+    root: RootOption = None,
+    pre_shape: PreShapeOption = None,
+    fix: FixOption = None,
+    drop: DropOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the hand open, on approach and closing, with its palm's arrow: a PNG.")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Say whether a hand can be used, and what was guessed about it. Needs no server."""
+    options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    report = report_hand(file, options)
+    if picture and report["verdict"] != "refuse":
+        from worker.rendering.pages.portraits import hand_portrait, write_png
+
+        write_png(hand_portrait(hand_from_path(file, options)), picture)
+    if json:
+        emit(report)
+    else:
+        say_check(AssetKind.HAND, report)
+    if report["verdict"] == "refuse":
+        raise typer.Exit(InputError.exit_code)
+
+
+def report_hand(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    """`check_hand` of a path; what cannot even be read is refused in the same form."""
+    try:
+        name, files, stated = files_from_path(file)
+    except GraspdError as error:
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+    return check_hand(files, name, {**stated, **(options or {})})

@@ -1,0 +1,166 @@
+"""Command line: `graspd render` and `graspd pictures`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Final
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from service.cli import JsonFlag, emit, reporting_errors
+from service.model.errors import InputError
+from service.store.shards import Shard, read_shard, write_shard
+from worker.engines.devices import Device
+from worker.files.choice import EveryOption, UnjudgedOption, choose
+from worker.files.of_shard import INHERITED, hand_of_shard, neighbours_of_shard, object_of_shard
+from worker.rendering.camera_file import SAMPLED, read_cameras
+from worker.rendering.cameras import BASELINE_M
+from worker.rendering.channels import parse_channels
+from worker.rendering.hands import DrawnHand
+from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
+from worker.rendering.pages.sheets import best, best_kept, contact_sheet, figures, three_sides_sheet, views_page
+from worker.rendering.views import Extras
+from worker.rendering.views import render as render_views
+
+app = typer.Typer(add_completion=False)
+
+#: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
+ALONE: Final = (300, SAMPLES)
+OF_THREE: Final = (160, 8)
+
+_Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
+_Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
+
+
+@app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
+@reporting_errors
+def render(
+    scenes: Annotated[Path, typer.Argument(help="A scene shard, as `graspd scene` writes it.")],
+    views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
+    stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
+    baseline: Annotated[float, typer.Option(help="Distance of the eyes [m].")] = BASELINE_M,
+    width: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture width [px]; 320.")] = None,
+    height: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture height [px]; 240.")] = None,
+    channels: Annotated[
+        str, typer.Option(help="Besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
+    ] = "",
+    cameras: Annotated[
+        Path | None, typer.Option(help="JSON with intrinsics, places, or both, instead of sampled cameras.")
+    ] = None,
+    with_hand: Annotated[
+        Path | None, typer.Option(help="The base shard: also pictures with each scene's best grasp.")
+    ] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    with_: Annotated[
+        list[str] | None, typer.Option("--with", help="A neighbour's file; default: the built-in of that name.")
+    ] = None,
+    object: _Object = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Default: the seed of the scenes.")] = None,
+    device: _Device = "auto",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The views shard to write.")] = Path("views.h5"),
+    page: Annotated[Path | None, typer.Option(help="Also write a page that shows the views (PNG).")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Take pictures of scenes: colour, depth, segmentation, boxes, and what `--channels` asks for."""
+    started = perf_counter()
+    scene = read_shard(scenes, kind="scene")
+    obj = object_of_shard(scene, object)
+    number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
+    used = Device(device).resolve()
+    given = read_cameras(cameras) if cameras is not None else SAMPLED
+    size = (width or given.width or 320, height or given.height or 240)
+    extras = Extras(
+        channels=parse_channels(channels.split(",")),
+        cameras=given,
+        neighbours=neighbours_of_shard(scene, with_ or []),
+        drawn=None if with_hand is None else _drawn(scene, with_hand, hand),
+    )
+    with _progress(json) as bar:
+        task = bar.add_task("rendering", total=None)
+        result = render_views(
+            obj, np.asarray(scene["scene/object_pose"], float), views=views, stereo=stereo, width=size[0],
+            height=size[1], seed=number, device=used, baseline_m=baseline, extras=extras,
+            progress=lambda done, total, message: bar.update(task, completed=done, total=total, description=message),
+        )  # fmt: skip
+    seconds = perf_counter() - started
+    inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
+    kept = {key: scene.attributes[key] for key in inherited if key in scene.attributes}
+    output.write_bytes(
+        write_shard("views", result, {**kept, "seed": number, "device": used, "seconds": round(seconds, 4)})
+    )
+    count = len(result["image/rgb"])
+    if page is not None:
+        title = f"Views of {scene.attributes.get('object', 'the object')}"
+        page.write_bytes(views_page(result, title=title, subtitle=f"{count} pictures, {size[0]} x {size[1]} pixels"))
+    if json:
+        emit({"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used})
+    else:
+        typer.echo(f"{output}: {count} pictures, {seconds:.1f} s on {used}")
+
+
+@app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
+@reporting_errors
+def pictures(
+    grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
+    count: Annotated[int, typer.Option("--count", "-n", min=1, max=400, help="How many of the best grasps.")] = 12,
+    three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
+    size: Annotated[
+        int | None, typer.Option(min=32, max=2048, help="Edge of one picture [px]; 300, with --three-sides 160.")
+    ] = None,
+    hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
+    object: _Object = None,
+    unjudged: UnjudgedOption = False,
+    every: EveryOption = False,
+    device: _Device = "auto",
+    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("grasps.png"),
+    json: JsonFlag = False,
+) -> None:
+    """Draw the best valid grasps by epsilon with their figures on one sheet."""
+    base = read_shard(grasps, kind="base")
+    chosen, word = choose(base, unjudged=unjudged, every=every)
+    model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
+    rows = best(base.arrays, count, chosen)
+    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    sides = THREE_SIDES if three else THREE_SIDES[:1]
+    edge, samples = OF_THREE if three else ALONE
+    edge = size or edge
+    drawn = grasp_pictures(
+        model, obj, poses, joints, (edge, edge), sides, device=Device(device).resolve(), samples=samples
+    )
+    title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
+    subtitle = f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm"
+    captions = figures(base.arrays, rows)
+    if three:
+        output.write_bytes(three_sides_sheet(drawn, captions, title=title, subtitle=subtitle))
+    else:
+        output.write_bytes(contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle))
+    if json:
+        emit({"file": str(output), "grasps": len(rows), "of": int(chosen.sum()), "kind": word, "rows": rows.tolist()})
+    else:
+        typer.echo(f"{output}: the best {len(rows)} of {int(chosen.sum())} {word}")
+
+
+def _drawn(scene: Shard, base_file: Path, hand: str | None) -> DrawnHand:
+    """The best grasp that each scene kept, by epsilon, for `--with-hand`."""
+    base = read_shard(base_file, kind="base")
+    model = hand_of_shard(scene, hand)
+    hand_of_shard(base, hand)
+    rows = best_kept(scene.arrays, base.arrays)
+    source = np.asarray(scene["grasp/base_index"])[rows]
+    if len(source) and source.max() >= len(base["grasp/joint_positions"]):
+        raise InputError(
+            f"{base_file} has fewer grasps than the scenes were made of; give the base shard they come from"
+        )
+    joints = np.asarray(base["grasp/joint_positions"], float)[source]
+    return DrawnHand(model, rows, np.asarray(scene["grasp/hand_pose"], float)[rows], joints)
+
+
+def _progress(quiet: bool) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=Console(stderr=True), disable=quiet, transient=True,
+    )  # fmt: skip

@@ -1,0 +1,249 @@
+"""`graspd synth`: the grasps of a job in one process, without a queue or a server."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from service.cli import JsonFlag, emit, reporting_errors
+from service.model.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
+from service.model.errors import InputError
+from service.model.scene_spec import parse_scene
+from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
+from service.store.shards import Attribute, json_attribute, write_shard
+from worker.certified import Certified, certified_grasps, joined_columns
+from worker.engines.devices import Device
+from worker.files.columns import postures, verdict_attributes
+from worker.files.origin import remembered
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.planners import PLANNERS, planner, scene_planner
+from worker.planners import Progress as Report
+from worker.planners.registry import parsed_options
+from worker.quality.referee.key import Level
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.simulation.surroundings import Scenes
+
+Arrays = dict[str, NDArray[Any]]
+
+app = typer.Typer()
+
+
+@app.command(epilog="graspd synth --hand allegro --object mug -n 32 -o grasps.h5")
+@reporting_errors
+def synth(
+    hand: Annotated[str, typer.Option(help="a URDF, a ZIP with one, or the name of a built-in hand")],
+    object_: Annotated[str, typer.Option("--object", help="a mesh (STL, OBJ, PLY, GLB, OFF) or a built-in object")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="HDF5 file to write")],
+    grasps: Annotated[int, typer.Option("-n", "--grasps", help="number of grasps", min=1, max=100_000)] = 32,
+    want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
+    budget: Annotated[float, typer.Option(help="Grasps tried for each one wanted, at most.", min=1.0, max=100.0)] = 4.0,
+    referee: Annotated[
+        str, typer.Option(help="letter, certificate, screen; none: nobody judges, grasps are sound, never valid.")
+    ] = "certificate",
+    method: Annotated[
+        str, typer.Option(help=f"planner: {', '.join(PLANNERS)}, or one that another package offers")
+    ] = "fast_graspd",
+    option: Annotated[
+        list[str] | None, typer.Option(help="An option of the method, such as steps=20000; several times.")
+    ] = None,
+    fidelity: Annotated[str, typer.Option(help=f"one of {', '.join(FIDELITIES)}")] = "standard",
+    contact_solver: Annotated[str, typer.Option(help="direct, jacobi or gauss_seidel; empty: the fidelity's")] = "",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    friction: Annotated[
+        float, typer.Option(help="Coulomb coefficient of the quality metrics", min=0.01, max=3.0)
+    ] = 1.0,
+    units: UnitsOption = None,
+    scale_to: ScaleToOption = None,
+    keep_largest: KeepLargestOption = False,
+    allow_open: AllowOpenOption = False,
+    device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto")] = "auto",
+    threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core", min=0)] = 0,
+    scene: Annotated[
+        str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
+    ] = "free",
+    scenes: Annotated[int, typer.Option(help="Scenes that the grasps are shared out to.", min=1, max=4096)] = 4,
+    faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
+    json: JsonFlag = False,
+) -> None:
+    """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file.
+
+    In a scene a grasp is valid if it comes, closes and lifts without touching anything else and holds what it lifts.
+    """
+    if not out.parent.is_dir():
+        raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
+    request = _request(want, budget, referee).model_copy(
+        update={
+            "grasps": grasps, "method": method, "options": parsed_options(option or []), "seed": seed,
+            "friction": friction, "fidelity": chosen_fidelity(fidelity, contact_solver),
+        }
+    )  # fmt: skip
+    planner(method, request.options)  # a wrong name or option is told before the files are read
+    mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
+    model = hand_from_path(hand)
+    obj = object_from_path(object_, face_error_m=request.knobs.face_error_m, options=mesh)
+    place = parse_scene(scene, faces=faces)
+    if place.kind != "free":
+        scene_planner(method, request.options)
+    device = Device(device).resolve()
+    began = time.perf_counter()
+    poses = rest_poses(place, obj, count=scenes, seed=seed) if place.kind != "free" else {}
+    where = Scenes(supports_of(place), poses["scene/object_pose"]) if poses else None
+    with _bar(grasps, quiet=json) as report:
+        batches = [
+            certified_grasps(
+                model, obj, request, count=min(BATCH_SIZE, grasps - first), batch=first // BATCH_SIZE,
+                threads=threads, device=device, scenes=where,
+                progress=report(first, min(BATCH_SIZE, grasps - first)),
+            )
+            for first in range(0, grasps, BATCH_SIZE)
+        ]  # fmt: skip
+    seconds = time.perf_counter() - began
+    arrays = joined_columns([{**postures(batch.grasps), **batch.columns} for batch in batches])
+    arrays |= {name: poses[name] for name in ("scene/object_pose", "scene/rest_probability") if name in poses}
+    attributes = _attributes(model, obj, request, batches, device, seconds)
+    if poses:
+        attributes["scene"] = json_attribute(place.model_dump(mode="json"))
+    out.write_bytes(write_shard("base", arrays, attributes | remembered(hand, object_, mesh)))
+    found = summary(arrays, request, batches, out, seconds)
+    if poses:
+        found |= {"scene": place.kind, "scenes": len(poses["scene/object_pose"])} | _shares(batches)
+    if json:
+        emit(found)
+    else:
+        typer.echo(_said(found))
+
+
+def _request(want: str, budget: float, referee: str) -> JobOptions:
+    """Options of a job with these; InputError for a word that is none."""
+    if want not in ("valid", "raw"):
+        raise InputError(f"unknown --want {want!r}; choose valid or raw")
+    if referee not in (*get_args(Level), "none"):
+        raise InputError(f"unknown referee {referee!r}; choose one of {', '.join(get_args(Level))} or none")
+    # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
+    return JobOptions(want=want, budget=budget, referee=referee, audits=0)
+
+
+@contextmanager
+def _bar(grasps: int, *, quiet: bool) -> Iterator[Any]:
+    """A progress bar; gives a function that makes the reporter of a batch from its first grasp and their number."""
+    began = time.perf_counter()
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
+        task = bar.add_task("starting", total=grasps, rate="")
+
+        def report(first: int, count: int) -> Report:
+            def tell(done: float, total: float, message: str) -> None:
+                ready = first + count * done / total
+                rate = f"{ready / max(time.perf_counter() - began, 1e-3):.1f} grasps/s"
+                bar.update(task, completed=ready, description=message, rate=rate)
+
+            return tell
+
+        yield report
+
+
+def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
+    """The knobs of a named fidelity, with another contact solver where one is given.
+
+    Raises:
+        InputError: unknown fidelity or solver.
+    """
+    if name not in FIDELITIES:
+        raise InputError(f"unknown fidelity {name!r}; choose one of {', '.join(FIDELITIES)}")
+    knobs = FIDELITIES[name].model_dump()
+    if contact_solver:
+        knobs |= {"contact_solver": contact_solver, "name": f"{name}+{contact_solver}"}
+    try:
+        return Fidelity(**knobs)
+    except ValueError:
+        raise InputError(f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel") from None
+
+
+def _attributes(
+    hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[Certified], device: str, seconds: float
+) -> dict[str, Attribute]:
+    attributes: dict[str, Attribute] = {
+        "hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest,
+        "method": request.method, "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4), "mu": request.friction,
+        "root_link": hand.root_link, "joint_names": list(hand.joint_names), "want": request.want,
+        "tried": sum(batch.tried for batch in batches),
+    }  # fmt: skip
+    return attributes | verdict_attributes(request.referee, batches[0].verdict_key)
+
+
+def summary(arrays: Arrays, request: JobOptions, batches: list[Certified], out: Path, seconds: float) -> dict[str, Any]:
+    """What a user wants to know first of a base shard."""
+    column = int(np.argmin(np.abs(arrays["quality/thresholds_m"] - 0.005)))
+    count = len(arrays["quality/valid"])
+
+    def mean(name: str, digits: int) -> float | None:
+        values = arrays[f"quality/{name}"]
+        values = values[:, column] if values.ndim == 2 else values
+        known = values[np.isfinite(values)]
+        return round(float(known.mean()), digits) if len(known) else None
+
+    return {
+        "file": str(out),
+        "grasps": count,
+        "tried": sum(batch.tried for batch in batches),
+        "valid": int(arrays["quality/valid"].sum()),
+        "sound": int(arrays["quality/sound"].sum()),
+        "referee": request.referee,
+        "want": request.want,
+        "wanted": request.grasps,
+        "seconds": round(seconds, 3),
+        "grasps_per_second": round(count / seconds, 2),
+        "mean": {
+            "epsilon": mean("epsilon", 4),
+            "contact_area_cm2": mean("contact_area_cm2", 2),
+            "intersection_volume_cm3": mean("intersection_volume_cm3", 4),
+            "penetration_depth_mm": mean("penetration_depth_mm", 3),
+        },
+    }
+
+
+def _shares(batches: list[Certified]) -> dict[str, float]:
+    """Of all grasps that were planned: clear, lifted, lifted at half the friction."""
+    planned = sum(batch.planned for batch in batches)
+    return {
+        name: round(sum(batch.shares[name] * batch.planned for batch in batches) / max(1, planned), 4)
+        for name in batches[0].shares
+    }
+
+
+def _said(found: dict[str, Any]) -> str:
+    """The summary as a line; the second one tells what is missing."""
+    judged, mean = found["referee"] != "none", found["mean"]
+    word = "valid" if judged else "sound"
+    lines = [
+        f"{found['file']}: {found[word]} {word} of {found['tried']} grasps tried"
+        f"{', judged at level ' + found['referee'] if judged else '; nobody judged them (--referee none)'}, "
+        f"{found['grasps_per_second']:.1f} grasps/s"
+    ]
+    if found["grasps"]:
+        lines[0] += (
+            f"; mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "
+            f"penetration {mean['penetration_depth_mm']:.2f} mm"
+        )
+    if "scene" in found:
+        lines.append(
+            f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "
+            f"stands there, {found['lift_share']:.0%} lift, {found['lift_hard_share']:.0%} at half the friction"
+        )
+    if found["want"] == "valid" and found["grasps"] < found["wanted"]:
+        lines.append(f"{found['wanted']} {word} ones were wanted: the budget of tries ended first; see --budget")
+    return "\n".join(lines)

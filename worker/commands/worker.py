@@ -1,0 +1,80 @@
+"""Commands of the engine room."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import socket
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service import tracing
+from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from service.model.domain import Stage
+from service.model.errors import InputError, UnavailableError
+from service.settings import Settings
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.command(epilog="graspd worker --device cuda:0 --stages synthesize,render")
+@reporting_errors
+def worker(
+    device: Annotated[str | None, typer.Option(help="cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
+    stages: Annotated[str | None, typer.Option(help="Stages to serve, with commas between; default: all.")] = None,
+    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
+    burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
+    max_tasks: Annotated[int | None, typer.Option(min=1, help="End after this many tasks.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Start none; exit code 1 says that none lives on this host.")
+    ] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
+) -> None:
+    """One worker on one device: takes tasks from the queue until it is told to stop."""
+    settings = load_settings(device=device, threads=threads, data_dir=data_dir)
+    log_to_stderr(settings, "worker")
+    keep_private(settings)
+    if check:
+        check_worker(settings)
+        return
+    from worker.process.main import run_worker
+
+    tracing.set_up("worker")
+    ended_well = run_worker(
+        settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
+    )
+    _end(0 if ended_well else 1)
+
+
+def _end(code: int) -> None:
+    """End at once: taking Warp and its kernels apart takes the interpreter seconds, and nothing is left to be saved."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def check_worker(settings: Settings) -> None:
+    """UnavailableError if no worker of this host gave a sign of life within its lease."""
+    from service.queue.rq_queue import open_queue
+
+    host = socket.gethostname()
+    queue = open_queue(settings, patience=0)
+    try:
+        if not any(beat.host == host for beat in queue.workers()):
+            raise UnavailableError(f"no worker on {host} gave a sign of life lately; start `graspd worker`")
+    finally:
+        queue.close()
+
+
+def _parse_stages(text: str | None) -> tuple[Stage, ...]:
+    if text is None:
+        return tuple(Stage)
+    try:
+        return tuple(Stage(part.strip()) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"unknown stages {text!r}; choose from {', '.join(Stage)}") from None

@@ -1,0 +1,1 @@
+"""Warp and MuJoCo, started quietly, on the wanted device."""

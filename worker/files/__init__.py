@@ -1,0 +1,1 @@
+"""Everything that reads or writes files of grasps: ours and those of others."""

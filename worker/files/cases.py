@@ -1,0 +1,125 @@
+"""Grasps to evaluate from files: our base shards, published reference grasps, DexGraspBench folders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError, NotFoundError
+from service.store.shards import read_shard
+from worker.files.exchange import dexgraspbench, reference
+from worker.files.of_shard import hand_of_shard, object_of_shard, placed_of_shard
+from worker.grasps import GraspSet, Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.simulation.surroundings import Placed
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Grasps of one hand on one object."""
+
+    name: str
+    hand: HandModel
+    obj: ObjectModel
+    grasps: GraspSet
+    friction: float | None = None
+    """Coulomb coefficient the file states for its metrics."""
+    seconds: float | None = None
+    """What making the grasps took, where it is known."""
+    judged: bool = False
+    """Whether those seconds hold the referee's work on them already."""
+    published: NDArray[np.int8] | None = None
+    """(N,) success as published: 1, 0, -1 unknown."""
+    placed: Placed | None = None
+    """The scenes that the grasps were planned in, if any."""
+
+
+def expand(path: Path) -> list[Path]:
+    """What a path stands for: itself; or, for a folder without `.npy` files, all shards and reference grasps below it.
+
+    Raises:
+        InputError: a folder without any grasps.
+    """
+    if not path.is_dir() or any(path.rglob("*.npy")):
+        return [path]
+    found = sorted(file for suffix in ("*.h5", "*.json") for file in path.rglob(suffix))
+    if not found:
+        raise InputError(f"{path} has no shards (.h5), reference grasps (.json) or DexGraspBench files (.npy)")
+    return found
+
+
+def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
+    """Read a file or folder of grasps.
+
+    Args:
+        path: a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
+        hand: URDF or built-in hand, over what the file says.
+        obj: mesh or built-in object, over what the file says.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: not one of these formats, or it does not fit the hand.
+    """
+    if path.is_dir():
+        return _bench_folder(path, hand, obj)
+    if not path.is_file():
+        raise NotFoundError(f"{path} does not exist")
+    return _reference(path, hand, obj) if path.suffix == ".json" else _shard(path, hand, obj)
+
+
+def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
+    shard = read_shard(path, kind="base")
+    model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
+    parts = {
+        name: Posture(
+            np.asarray(shard[f"{name}/hand_pose"], float), np.asarray(shard[f"{name}/joint_positions"], float)
+        )
+        for name in ("grasp", "pregrasp", "squeeze")
+    }
+    _check_joints(path, model, parts["grasp"])
+    loss = np.asarray(shard["quality/stability_loss"], float)
+    placed = placed_of_shard(shard)
+    grasps = GraspSet(
+        parts["grasp"], parts["pregrasp"], parts["squeeze"], loss,
+        approach=np.asarray(shard["grasp/approach"], float) if placed is not None else None,
+        coming=np.asarray(shard["grasp/approach_joint_positions"], float) if placed is not None else None,
+        scene=placed.index if placed is not None else None,
+    )  # fmt: skip
+    said = shard.attributes
+    return Case(
+        path.name, model, thing, grasps,
+        friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
+        seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
+        judged=said.get("verdict_level", "none") != "none",
+        placed=placed,
+    )  # fmt: skip
+
+
+def _reference(path: Path, hand: str | None, obj: str | None) -> Case:
+    (found,) = reference.read(path, hand=hand, obj=obj)
+    return Case(
+        path.name, found.hand, found.obj, found.grasps, friction=reference.friction(path), published=found.published
+    )
+
+
+def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
+    if hand is None or obj is None:
+        raise InputError("a DexGraspBench folder does not hold the hand and the object; name both: --hand and --object")
+    sets = dexgraspbench.read(path, hand=hand, obj=obj)
+    if len(sets) > 1:
+        scales = ", ".join(f"{one.scale:g}" for one in sets)
+        raise InputError(f"{path} holds grasps for the object at {len(sets)} scales ({scales}); give the folder of one")
+    return Case(path.name, sets[0].hand, sets[0].obj, sets[0].grasps, published=sets[0].published)
+
+
+def _check_joints(path: Path, hand: HandModel, grasp: Posture) -> None:
+    if grasp.joint_positions.shape[1] != len(hand.joint_names):
+        raise InputError(
+            f"{path} has {grasp.joint_positions.shape[1]} joints, {hand.name} {len(hand.joint_names)}; give --hand"
+        )

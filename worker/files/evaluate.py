@@ -1,0 +1,218 @@
+"""The numbers of a set of grasps in one row: success by the referee, and medians of every metric."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError, MeshError
+from worker.files.cases import Case
+from worker.quality.contact import contact_distance_consistency_mm
+from worker.quality.diversity import explained_variance
+from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.judge import Verdicts, judge
+from worker.quality.referee.key import Level
+from worker.quality.referee.lift import LiftOutcome
+from worker.quality.referee.lifting import LiftLevel, judge_lifts
+from worker.quality.referee.protocol import Outcome
+from worker.quality.table import DEFAULT_FRICTION, measure
+from worker.scenes.way import plan_way
+from worker.simulation.surroundings import Placed
+
+Protocol = Literal["dexgraspbench", "displacement", "lift"]
+Progress = Callable[[float, float, str], None]
+
+#: Contact threshold of the row's area, epsilon and volume: the paper's [m].
+THRESHOLD_M: Final = 0.005
+
+
+def evaluate(
+    case: Case,
+    *,
+    protocol: Protocol = "dexgraspbench",
+    level: Level | LiftLevel = "certificate",
+    hard: bool = False,
+    friction: float | None = None,
+    threads: int = 0,
+    cache: Path | None = None,
+    progress: Progress = lambda done, total, message: None,
+) -> dict[str, Any]:
+    """One row of numbers, None where a number does not exist: too thin an object has no verdict.
+
+    Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
+    making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
+    self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
+    the first principal component. verdicts, where somebody judged: see `told`. With protocol lift also clear_share
+    (free of what stands in the scene, coming, closing and lifting).
+
+    Raises:
+        InputError: protocol lift on grasps that were planned around a free object, or a level that it does not have.
+    """
+    if protocol == "lift" and case.placed is None:
+        raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
+    mu = friction or case.friction or DEFAULT_FRICTION
+    table = measure(
+        case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], threads=threads, progress=progress
+    )
+    row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}
+    row |= _success(case, None, 0.0)
+    try:
+        pieces = decompose(case.obj, cache=cache)
+    except MeshError as error:
+        row["note"] = str(error)
+        sd = None
+    else:
+        if protocol == "dexgraspbench":
+            verdicts = judge(
+                case.hand, case.obj, case.grasps, level=cast(Level, level), hard=hard, threads=threads, pieces=pieces,
+                progress=progress,
+            )  # fmt: skip
+            row |= _success(case, verdicts, verdicts.seconds)
+        if protocol == "lift" and case.placed is not None:
+            row |= _lifted(case, case.placed, level, hard, threads, pieces, progress)
+        sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, threads=threads)
+        row |= pieces.facts
+    return row | _medians(case, table, sd)
+
+
+def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:
+    if verdicts is None or not len(case.grasps):
+        return dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_referee", "agreement_published"))
+    held = int(verdicts.success.sum())
+    made = case.seconds
+    whole = None if made is None else made + (0.0 if case.judged else seconds)
+    row: dict[str, Any] = {
+        "level": verdicts.level,
+        "gsr": _plain(held / len(case.grasps)),
+        "osr": float(held > 0),
+        "sgs": _plain(held / whole) if whole else None,
+        "sgs_without_referee": _plain(held / made) if made and not case.judged else None,
+        "referee_seconds": _plain(seconds),
+        "published": 0,
+        "reasons": dict(Counter(verdicts.reasons).most_common()),
+        "verdict_key": verdicts.terms,
+        "verdicts": told(verdicts),
+        "agreement_published": None,
+    }
+    if case.published is not None and (known := case.published >= 0).any():
+        row["published"] = int(known.sum())
+        row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
+    return row
+
+
+def _lifted(
+    case: Case, placed: Placed, level: str, hard: bool, threads: int, pieces: ConvexPieces, progress: Progress
+) -> dict[str, Any]:
+    chosen: Any = "lift" if level == "certificate" else level
+    verdicts = judge_lifts(
+        case.hand, case.obj, case.grasps, placed, level=chosen, hard=hard, threads=threads, pieces=pieces,
+        progress=progress,
+    )  # fmt: skip
+    clear = plan_way(case.hand, case.obj, case.grasps, placed).clear
+    held = int(verdicts.success.sum())
+    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, clear, strict=True)
+    return {
+        "level": verdicts.level,
+        "gsr": _plain(held / max(1, len(case.grasps))),
+        "osr": float(held > 0),
+        "clear_share": _plain(float(clear.mean())) if len(clear) else None,
+        "referee_seconds": _plain(verdicts.seconds),
+        "reasons": dict(Counter(verdicts.reasons).most_common()),
+        "verdict_key": verdicts.terms,
+        "verdicts": [
+            {
+                "row": row, "held": bool(one), "outcomes": [LiftOutcome(int(what)).name.lower()],
+                "margin": _plain(margin) if math.isfinite(margin) else None, "reason": reason, "clear": bool(free),
+            }
+            for row, (one, what, margin, reason, free) in enumerate(rows)
+        ],
+    }  # fmt: skip
+
+
+def told(verdicts: Verdicts) -> list[dict[str, Any]]:
+    """Of each grasp: row, held, outcomes of the six pushes, margin (None: it blew up), reason."""
+    rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, strict=True)
+    return [
+        {
+            "row": row,
+            "held": bool(held),
+            "outcomes": [Outcome(int(one)).name.lower() for one in outcomes],
+            "margin": _plain(margin) if math.isfinite(margin) else None,
+            "reason": reason,
+        }
+        for row, (held, outcomes, margin, reason) in enumerate(rows)
+    ]
+
+
+def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64] | None) -> dict[str, Any]:
+    probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+    cdc = contact_distance_consistency_mm(case.hand, probe.body_distance(probe.measure(case.grasps.grasp)))
+    columns = {
+        "pd_mm": "penetration_depth_mm",
+        "spd_mm": "self_penetration_depth_mm",
+        "ca_cm2": "contact_area_cm2",
+        "iv_cm3": "intersection_volume_cm3",
+        "epsilon": "epsilon",
+        "wrench_volume": "wrench_volume",
+    }
+    row = {key: _median(table[f"quality/{name}"]) for key, name in columns.items()}
+    shares = explained_variance(case.grasps.grasp)
+    return row | {
+        "cdc_mm": _median(cdc),
+        "sd_cm": None if sd is None else _median(sd),
+        "diversity": _plain(float(shares[0])) if len(shares) else None,
+    }
+
+
+def _median(values: NDArray[Any]) -> float | None:
+    return _plain(float(np.median(values))) if values.size else None
+
+
+def _plain(value: float) -> float:
+    return round(float(value), 6)
+
+
+#: Numbers of a row that several rows have a median of.
+_MEDIANS: Final = (
+    "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "cdc_mm", "sd_cm", "diversity",
+)  # fmt: skip
+
+
+def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """One row for several objects: rates over all grasps, osr over objects, medians of the objects' medians."""
+    if len(rows) == 1:
+        return dict(rows[0])
+    out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
+    for key in ("protocol", "level", "hard", "mu"):
+        # What the rows do not agree on has no one value.
+        out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
+    judged = [row for row in rows if row["gsr"] is not None]
+    out["gsr"] = _rate(judged, "gsr", "n")
+    if any("clear_share" in row for row in rows):
+        out["clear_share"] = _rate([row for row in rows if row.get("clear_share") is not None], "clear_share", "n")
+    out["osr"] = _plain(float(np.mean([row["osr"] for row in judged]))) if judged else None
+    out["agreement_published"] = _rate(judged, "agreement_published", "published")
+    for key in ("sgs", "sgs_without_referee"):
+        # Held grasps over the seconds of all rows together.
+        timed = [row for row in judged if row[key]]
+        seconds = sum(row["gsr"] * row["n"] / row[key] for row in timed)
+        out[key] = _plain(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
+    for key in _MEDIANS:
+        known = [row[key] for row in rows if row[key] is not None]
+        out[key] = _plain(float(np.median(known))) if known else None
+    return out
+
+
+def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
+    """Mean of the rows that have the key, weighed by the number of grasps it is a rate of."""
+    known = [row for row in rows if row[key] is not None]
+    total = sum(row[weight] for row in known)
+    return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None

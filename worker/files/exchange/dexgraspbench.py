@@ -1,0 +1,144 @@
+"""DexGraspBench's layout: one pickled dictionary a grasp, and the files that its evaluator needs to judge it.
+
+Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
+position, root quaternion w x y z, joints. Root and object stand in one world frame. Root and order of the joints are
+those of the model that a benchmark's configuration names; a mapping beside the grasps says how ours lie in it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.transforms import IDENTITY_POSE, compose, invert
+from worker.files.exchange.bench_hand import joint_order, write_hand
+from worker.files.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
+from worker.files.exchange.bench_object import SCALE, write_object
+from worker.files.exchange.imported import Imported, plain_name
+from worker.files.exchange.objects import scaled_object
+from worker.files.exchange.pickles import load_npy
+from worker.grasps import GraspSet, Posture
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+
+Floats = NDArray[np.float64]
+
+POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+#: Prefix of the configurations of our hands, and name of the experiment that the grasps are.
+NAME: Final = "graspd"
+
+
+def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
+    """Grasps of one hand on one object, a set for each scale of the object.
+
+    Args:
+        path: a file, or a folder searched whole.
+        hand: URDF or built-in hand; without a mapping beside the grasps, the one whose root and joints they have.
+        obj: mesh or built-in object at scale 1.
+
+    Raises:
+        InputError: no such files, grasps for several models of a hand, or they do not fit the hand.
+    """
+    # Descriptions of scenes are pickled dictionaries too.
+    files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
+    if not files:
+        raise InputError(f"{path} has no .npy files; DexGraspBench has one for each grasp")
+    mappings = {mapping_of(file) for file in files}
+    if len(mappings) > 1:
+        names = ", ".join(sorted(one.config if one else "another" for one in mappings))
+        raise InputError(f"{path} holds grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
+    by_scale: dict[float, list[dict[str, Any]]] = defaultdict(list)
+    for file in files:
+        row = _row(file)
+        by_scale[_scale(row)].append(row)
+    model, mapping = hand_from_path(hand), mappings.pop()
+    return [
+        _set(path, model, scaled_object(obj, scale), rows, scale, mapping) for scale, rows in sorted(by_scale.items())
+    ]
+
+
+def write(hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path) -> list[Path]:
+    """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
+
+    The object stands at scale 1 in the origin. The hand goes with it as a model of our own; where the benchmark has a
+    model of the same hand, the grasps are written for that one as well.
+
+    Returns:
+        the files of the grasps, one each, for our model of the hand.
+
+    Raises:
+        MeshError: the object's convex pieces are no picture of it.
+    """
+    name, config = plain_name(obj.name), f"{NAME}_{plain_name(hand.name)}"
+    obj_path, scene = write_object(obj, name, folder)
+    model = write_hand(hand, config, folder)
+    order = joint_order(folder / model)
+    ours = HandMapping(
+        hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), tuple((j, j) for j in order),
+        link_names(hand),
+    )  # fmt: skip
+    paths: list[Path] = []
+    for mapping in filter(None, (ours, of_the_benchmark(hand))):
+        out = folder / "output" / f"{NAME}_{mapping.config}"
+        place = out / GRASPS / name / f"{SCALE}_pose000"
+        place.mkdir(parents=True, exist_ok=True)
+        mapping.write(out)
+        written = [place / f"{row}.npy" for row in rows]
+        for row, file in zip(rows, written, strict=True):
+            record: dict[str, Any] = {
+                "obj_path": obj_path.as_posix(), "obj_scale": 1.0, "obj_pose": IDENTITY_POSE.copy(),
+                "scene_path": scene.as_posix(),
+            }  # fmt: skip
+            for posture in POSTURES:
+                found: Posture = getattr(grasps, posture)
+                record[f"{posture}_qpos"] = mapping.qpos(hand, found.hand_pose[row], found.joint_positions[row])
+            np.save(file, np.array(record, dtype=object), allow_pickle=True)
+        paths = paths or written
+    return paths
+
+
+def _row(file: Path) -> dict[str, Any]:
+    found = load_npy(file)
+    if not isinstance(found, dict):
+        raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
+    if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
+        raise InputError(f"{file} has no {missing[0]}")
+    return found
+
+
+def _scale(row: dict[str, Any]) -> float:
+    return float(np.ravel(row.get("obj_scale", 1.0))[0])
+
+
+def _set(
+    path: Path, hand: HandModel, obj: ObjectModel, rows: list[dict[str, Any]], scale: float, mapping: HandMapping | None
+) -> Imported:
+    pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
+    parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
+    grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
+    published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
+    name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
+    return Imported(hand, obj, grasps, name, scale, published)
+
+
+def _posture(
+    path: Path, hand: HandModel, name: str, rows: list[dict[str, Any]], obj_pose: Floats, mapping: HandMapping | None
+) -> Posture:
+    try:
+        qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)
+    except ValueError as error:
+        raise InputError(f"{path}: {name}_qpos has not one length in all files: {error}") from None
+    if qpos.shape[1] != 7 + len(hand.joint_names):
+        raise InputError(
+            f"{path}: {name}_qpos has {qpos.shape[1]} numbers, {hand.name} needs 7 + {len(hand.joint_names)}; "
+            "is --hand the right hand?"
+        )
+    root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
+    return Posture(compose(invert(obj_pose), root), joints)

@@ -1,0 +1,70 @@
+"""Grasps of others through our quality stage, as base shards that say where they come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from service.model.digests import digest_files, digest_json
+from service.model.domain import AssetKind, JobRequest
+from service.model.errors import InputError
+from service.store.shards import Attribute, json_attribute, write_shard
+from worker.certified import scored
+from worker.files.columns import postures, verdict_attributes
+from worker.files.exchange.imported import Imported, Origin, plain_name
+from worker.files.exchange.objects import mesh_file
+from worker.objects.prepare import files_from_path
+
+
+def write_scored(
+    found: Imported, origin: Origin, folder: Path, *, referee: str, friction: float, threads: int = 0, ordinal: int = 0
+) -> Path:
+    """Judge and measure a set of grasps and write it as a base shard, its object's mesh beside it.
+
+    Args:
+        found: the grasps.
+        origin: goes into the shard's attributes.
+        folder: where to; made if absent.
+        referee: level of the verdicts, or none.
+        friction: Coulomb coefficient of the metrics.
+        threads: 0: all cores.
+        ordinal: number of the set, part of the file's name.
+
+    Returns:
+        the shard's path.
+
+    Raises:
+        InputError: unknown level, or the file is there already.
+        MeshError: the object has no convex pieces that the referee could use.
+    """
+    name = plain_name(found.name)
+    path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
+    if path.exists():
+        raise InputError(f"{path} exists already; give another folder as --output")
+    try:
+        request = JobRequest(
+            hand=plain_name(found.hand.name), object=name, grasps=max(1, len(found.grasps)), want="raw",
+            referee=referee, friction=friction, audits=0,
+        )  # fmt: skip
+    except ValueError:
+        raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
+    made = scored(found.hand, found.obj, found.grasps, request, threads=threads)
+    folder.mkdir(parents=True, exist_ok=True)
+    mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
+    attributes: dict[str, Attribute] = {
+        "hand": found.hand.name, "hand_digest": found.hand.digest,
+        "object": name, "object_digest": _digest(mesh), "object_scale": found.scale,
+        "root_link": found.hand.root_link, "joint_names": list(found.hand.joint_names),
+        "method": f"imported:{origin.format}", "source": origin.source, "licence": origin.licence,
+        "fidelity": json_attribute({"face_error_m": 0.0}), "mu": friction, "tried": made.tried, "want": "raw",
+        "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
+        "batch": ordinal,
+    }  # fmt: skip
+    attributes |= verdict_attributes(referee, made.verdict_key)
+    columns: dict[str, Any] = {**postures(made.grasps), **made.columns}
+    path.write_bytes(write_shard("base", columns, attributes))
+    return path
+
+
+def _digest(mesh: Path) -> str:
+    return digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])

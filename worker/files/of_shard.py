@@ -1,0 +1,142 @@
+"""The hand and the object that a shard was made with, for commands that work on files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from service.model.domain import AssetKind
+from service.model.errors import ConflictError, InputError
+from service.model.scene_spec import SceneSpec
+from service.store.shards import Shard
+from worker.files.origin import Found, Wanted, at, find, options_of
+from worker.hands.load import hand_from_path, load_hand
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import load_object, object_from_path
+from worker.scenes.kinds import supports_of
+from worker.scenes.neighbours import Neighbours
+from worker.simulation.surroundings import Placed, Scenes
+
+#: Neighbours are looked at and kept clear of, not grasped.
+NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
+
+
+def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
+    """The hand named by `given` (a file or a built-in); by default the one the shard was made with, see `origin.find`.
+
+    Raises:
+        NotFoundError: there is no such file or built-in, or it is in none of the places where it may be.
+        ConflictError: it is not the hand the shard was made with.
+    """
+    if given:
+        hand = hand_from_path(given)
+        _check(shard, "hand", hand.digest, given)
+        return hand
+    wanted = _wanted(shard, AssetKind.HAND)
+    found = find(wanted)
+    return load_hand(found.files, name=wanted.name, digest=wanted.digest, options=found.options)
+
+
+def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
+    """The object named by `given`, simplified as in the shard; see `hand_of_shard`."""
+    knobs = json.loads(str(shard.attributes.get("fidelity") or "{}"))
+    error = float(knobs["face_error_m"]) if isinstance(knobs, dict) and "face_error_m" in knobs else 3e-4
+    wanted = _wanted(shard, AssetKind.OBJECT)
+    if not given:
+        return _loaded(wanted, find(wanted), error)
+    if (found := at(wanted, Path(given))) is not None:
+        return _loaded(wanted, found, error)
+    obj = object_from_path(given, face_error_m=error)
+    _check(shard, "object", obj.digest, given)
+    return obj
+
+
+def _loaded(wanted: Wanted, found: Found, face_error_m: float) -> ObjectModel:
+    return load_object(
+        found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
+    )
+
+
+def _wanted(shard: Shard, kind: AssetKind) -> Wanted:
+    said = shard.attributes
+    return Wanted(
+        kind,
+        str(said.get(kind.value, "")),
+        str(said.get(f"{kind.value}_digest", "")),
+        str(said.get(f"{kind.value}_source", "")),
+        options_of(said.get(f"{kind.value}_options")),
+        None if shard.path is None else shard.path.resolve().parent,
+    )
+
+
+def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
+    """The other objects of a scene shard with their poses; None if the object is alone.
+
+    Raises:
+        NotFoundError: one is in none of the places where it may be.
+        ConflictError: they are not the objects the shard was made with.
+    """
+    names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
+    if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
+        return None
+    if given and len(given) != len(names):
+        raise ConflictError(f"the scene shard has {len(names)} neighbours; give each of them as --with, in their order")
+    said = shard.attributes.get("neighbour_sources", [])
+    sources = said if isinstance(said, list) else []
+    objects = (
+        [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in given]
+        if given
+        else [_neighbour(shard, *one) for one in zip_longest(names, digests, sources, fillvalue="")]
+    )
+    for obj, name, digest in zip(objects, names, digests, strict=True):
+        if obj.digest != digest:
+            raise ConflictError(
+                f"the scene shard's neighbour {name!r} has digest {digest[:12]}, but {obj.name!r} has "
+                f"{obj.digest[:12]}; give the files it was made with as --with"
+            )
+    return Neighbours(objects, np.asarray(shard["scene/neighbour_pose"], float))
+
+
+def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
+    folder = None if shard.path is None else shard.path.resolve().parent
+    wanted = Wanted(AssetKind.OBJECT, name, digest, source, folder=folder)
+    return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
+
+
+def placed_of_shard(shard: Shard) -> Placed | None:
+    """The scenes that the grasps of a base shard were planned in; None: they were planned around a free object.
+
+    Raises:
+        InputError: what the shard says of its scene is no scene.
+    """
+    if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
+        return None
+    try:
+        spec = SceneSpec(**json.loads(str(shard.attributes.get("scene", ""))))
+    except (ValueError, TypeError):
+        raise InputError("the shard has grasps in scenes, but its attribute scene does not say which") from None
+    poses = np.asarray(shard["scene/object_pose"], float)
+    return Scenes(supports_of(spec), poses).placed(np.asarray(shard["grasp/scene_index"], np.intp))
+
+
+def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:
+    expected = str(shard.attributes.get(f"{kind}_digest", ""))
+    if expected != digest:
+        name = given or str(shard.attributes.get(kind, ""))
+        raise ConflictError(
+            f"the {shard.kind} shard was made with the {kind} of digest {expected[:12]}, but {name!r} has "
+            f"{digest[:12]}; give the file it was made with as --{kind}"
+        )
+
+
+#: What every later shard says about the job it comes from.
+INHERITED: Final = (
+    "hand", "hand_digest", "hand_source", "object", "object_digest", "object_source", "object_options", "method",
+    "fidelity", "batch", "root_link",
+)  # fmt: skip

@@ -1,0 +1,49 @@
+"""Which of several hands makes the better grasp: how well its contacts balance, and how little the object moved."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.transforms import quat_rotate
+from worker.grasps import Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.postures import hold_forces
+from worker.simulation.simulation import HandState
+
+Floats = NDArray[np.float64]
+
+#: Coulomb coefficient with which contacts must balance: less than any test uses, so that what balances has a reserve.
+FRICTION: Final = 0.3
+#: Weight of L_stable against the residual of the balance.
+STABILITY: Final = 0.05
+#: Weight of penetration [1/m] above the tolerated [m]: a millimetre too deep outweighs most of an unbalanced grasp.
+DEPTH: Final = 200.0
+TOLERATED_M: Final = 5e-4
+
+
+def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
+    """The hands of a state in the object frame."""
+    root = state.pivot + obj.centre_of_mass - quat_rotate(state.rotation, hand.palm.centre)
+    return Posture(np.concatenate([root, state.rotation], axis=1), hand.expand(state.q))
+
+
+def merits(hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
+    """(n,) the smaller the better: residual of balanced contact forces, a little of L_stable (n,), and what the
+    penetration `depths` (n,) [m] have above the tolerated."""
+    holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=FRICTION)
+    merit = np.array([hold.residual for hold in holds]) + STABILITY * losses
+    if depths is not None:
+        merit += DEPTH * np.maximum(depths - TOLERATED_M, 0.0)
+    return merit
+
+
+def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
+    """Rows of the `keep` best hands of each grasp; the hands of a grasp lie side by side."""
+    each = merit.reshape(grasps, -1)
+    # A stable sort: hands of equal merit are taken in the order in which they set out.
+    order = np.sort(np.argsort(each, axis=1, kind="stable")[:, :keep], axis=1)
+    return (order + np.arange(grasps)[:, None] * each.shape[1]).ravel()

@@ -1,0 +1,92 @@
+"""What the peers of `fast_graspd` share: hand and object on a device, free starts, the way from hands to grasps.
+
+Peers see the object as flat triangles (no Phong smoothing) and take their starts, postures around the grasp and
+quality from the same code as `fast_graspd`, so that what is compared is the search alone.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import ModuleType
+from typing import Final, Generic, TypeVar
+
+import numpy as np
+import warp as wp
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.domain import Fidelity
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.quality.postures import pregrasp, squeeze
+from worker.simulation.simulation import HandState
+
+Floats = NDArray[np.float64]
+T = TypeVar("T")
+
+#: How finely peers see hand and object where their source does not say.
+GROUND: Final = Fidelity(name="peers", coarse_points=400, fine_points=1000, object_points=4000, phong_alpha=0.0)
+
+_lock = threading.Lock()
+
+
+class Kept(Generic[T]):
+    """What a method makes once of a pair and its options, kept for the pairs used last."""
+
+    def __init__(self, make: Callable[..., T], size: int = 4) -> None:
+        self._make = make
+        self._found: LRUCache[tuple[object, ...], tuple[Pair, T]] = LRUCache(size)
+        self._lock = threading.Lock()
+
+    def __call__(self, pair: Pair, *options: object) -> T:
+        """`make(pair, *options)`, from memory where it was used lately."""
+        key = (id(pair), *options)
+        with self._lock:
+            if key not in self._found:
+                # The pair is kept beside it: its id is not given to another one meanwhile.
+                self._found[key] = (pair, self._make(pair, *options))
+            return self._found[key][1]
+
+
+def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
+    """The pair on a device, with the kernel modules that the caller will launch: only one thread may load a module."""
+    pair = pair_of(hand, obj, GROUND, device)
+    with _lock:
+        for module in kernels:
+            wp.load_module(module=module, device=device)
+    return pair
+
+
+def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
+    """A start for each grasp whose palm looks at a random place of the surface, touching nothing (Grasp'D, 2022)."""
+    probe = pair.simulation(pair.coarse, len(indices) * len(RETREATS))
+    model, obj = pair.hand.model, pair.fine.obj.model
+    return sample_starts(model, obj, probe, seed=seed, batch=batch, indices=indices, each=1)
+
+
+def joined(states: list[HandState]) -> HandState:
+    """The hands of all parts of a batch, in order."""
+    return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
+
+
+def grasp_set(
+    pair: Pair, state: HandState, began: float, info: dict[str, object], loss: Floats | None = None
+) -> GraspSet:
+    """Hands as grasps with the postures around them; `began` is the planner's start by `time.perf_counter`."""
+    hand, obj = pair.hand.model, pair.fine.obj.model
+    seconds = time.perf_counter() - began
+    grasp = posture_of(hand, obj, state)
+    return GraspSet(
+        grasp=grasp,
+        pregrasp=pregrasp(hand, obj, grasp),
+        squeeze=squeeze(hand, obj, grasp),
+        stability_loss=np.full(len(grasp), np.nan) if loss is None else loss,
+        seconds=seconds,
+        info=info,
+    )

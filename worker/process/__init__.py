@@ -1,0 +1,1 @@
+"""One worker: takes tasks, renews leases, ends as it should."""

@@ -1,0 +1,349 @@
+"""The worker process: RQ's loop with graspd's leases, stop reasons and outcomes.
+
+Everything runs in this one process: a CUDA context does not survive a fork, and a new process for each task would load
+kernels and meshes anew each time.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import signal
+import socket
+import time
+from collections.abc import Collection, Mapping
+from typing import Any, Final
+
+from redis.exceptions import ResponseError
+from rq import SimpleWorker
+from rq.exceptions import InvalidJobOperation
+from rq.serializers import JSONSerializer
+from rq.timeouts import BaseDeathPenalty
+
+from service.model.clock import timestamp
+from service.model.domain import Stage
+from service.model.errors import QueueUnavailable
+from service.model.version import PACKAGE_VERSION
+from service.model.worker_beat import WorkerBeat
+from service.queue.address import redis_url
+from service.queue.allowed import AllowedJob, AllowedQueue
+from service.queue.port import Event, EventKind
+from service.queue.rq_queue import RqQueue, open_queue, queue_names, worker_key
+from service.settings import Settings
+from service.store.store import Store, open_store
+from worker.engines.devices import Device
+from worker.process.fitness import Check, Fitness
+from worker.process.heartbeat import Heartbeat, Hold
+from worker.process.memory import limit_mb, resident_mb
+from worker.process.pulse import LEASE_KEPT_S
+from worker.process.runner import Runner
+from worker.process.selfcheck import check_engine
+from worker.stages import stage_table
+from worker.stages.context import StopReason, TaskContext
+from worker.stages.output import StageFunction
+
+log = logging.getLogger(__name__)
+#: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.
+_PATIENCE: Final = 60
+#: RQ waits this long for a task before it looks after itself [s]: its `worker_ttl` less 15.
+_WORKER_TTL_S: Final = 20
+_REFUSED_PAUSE_S: Final = 0.5
+
+
+class _NoAlarm(BaseDeathPenalty):  # type: ignore[misc]
+    """RQ's alarm signal comes only when a launch returns, and may come inside RQ's own bookkeeping."""
+
+    def setup_death_penalty(self) -> None:
+        """The heartbeat watches the time instead."""
+
+    def cancel_death_penalty(self) -> None:
+        """Nothing was set up."""
+
+
+class GraspWorker(SimpleWorker):  # type: ignore[misc]
+    """RQ's in-process worker without RQ's maintenance, command channel, alarm and retries: the keeper does all that."""
+
+    death_penalty_class = _NoAlarm
+    queue_class = AllowedQueue
+    job_class = AllowedJob
+    max_connection_wait_time = 2.0
+    log_result_lifespan = False
+
+    def __init__(
+        self,
+        queue: RqQueue,
+        runner: Runner,
+        heart: Heartbeat,
+        surroundings: Surroundings,
+        fitness: Fitness,
+        *,
+        stages: Collection[Stage],
+        name: str,
+    ) -> None:
+        super().__init__(
+            queues=queue_names(stages),
+            name=name,
+            connection=queue.connection,
+            serializer=JSONSerializer,
+            worker_ttl=_WORKER_TTL_S,
+        )
+        self.log_job_description = False
+        self._queue = queue
+        self._runner = runner
+        self._heart = heart
+        self._surroundings = surroundings
+        self._fitness = fitness
+        self._stages, self._taken = stages, 0
+        self.gave_up = False
+        """Whether it ended because it is unfit for tasks."""
+        self._stop_requested: bool = False
+        self.makes_room = False
+        """Whether it ended so that its supervisor starts a fresh one."""
+        self._context: TaskContext | None = None
+        self._outcome: Event | None = None
+        self._was_late = False
+        AllowedJob.function = self._run_task
+
+    def get_heartbeat_ttl(self, job: Any) -> int:
+        return LEASE_KEPT_S
+
+    def execute_job(self, job: Any, queue: Any) -> None:
+        """One task under a lease; its outcome is told after RQ has closed its books on it."""
+        self._outcome = None
+        self.prepare_execution(job)
+        self._context = self._surroundings.context(_raw(job), self._queue, self.name)
+        self._heart.hold(
+            Hold.of(
+                job.id.rpartition("-")[0],
+                self._context,
+                self.execution,
+                job.started_job_registry,
+                self._surroundings.settings.task_timeout_s,
+            )
+        )
+        try:
+            self.perform_job(job, queue)
+        finally:
+            self._heart.hold(None, state="stopping" if self._stop_requested else "idle")
+            self._context = None
+        self._tell_outcome()
+        self._surroundings.tasks_done += 1
+        if self._fitness.reason and not self._stop_requested:
+            fit = self._fitness.sit_out(self._stages, self._heart, lambda: self._stop_requested)
+            self.gave_up = not fit and not self._stop_requested
+            self._stop_requested = self._stop_requested or self.gave_up
+        if why := self._surroundings.outgrown():
+            log.info("this worker ends for a fresh one to start: %s", why)
+            self._heart.stopping()
+            self.makes_room = True
+            self._stop_requested = True
+        self.set_state("idle")
+
+    def handle_exception(self, job: Any, *exc_info: Any) -> None:
+        """An error that the runner did not sort. Where RQ finds no books to close, the keeper has closed them."""
+        self._was_late = isinstance(exc_info[1], InvalidJobOperation)
+        if self._was_late:
+            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
+        else:
+            super().handle_exception(job, *exc_info)
+
+    def handle_job_failure(self, job: Any, *args: Any, **options: Any) -> None:
+        """Forget what ending a task that was taken away wrote about it again."""
+        if self._was_late:
+            self.connection.delete(job.key)
+        else:
+            super().handle_job_failure(job, *args, **options)
+
+    def _tell_outcome(self) -> None:
+        if self._outcome is not None:
+            try:
+                self._queue.publish(self._outcome)
+            except QueueUnavailable as error:
+                log.warning("the end of task %s is for the keeper to find: %s", self._outcome.task_id, error)
+
+    def _run_task(self, message: dict[str, Any]) -> None:
+        assert self._context is not None
+        self._outcome = self._runner.run(message, self._context)
+        self._wait_for_writes()
+
+    def _wait_for_writes(self) -> None:
+        """Until Redis takes writes: on a full disk it refuses them, RQ could not close its books, and would end."""
+        told = False
+        while not self._stop_requested:
+            try:
+                self.connection.expire(worker_key(self.name), max(2, round(self._surroundings.settings.lease_s)))
+                return
+            except ResponseError as error:
+                if not told:
+                    log.warning("Redis takes no writes, and the end of a task waits for it: %s", error)
+                told = True
+                time.sleep(_REFUSED_PAUSE_S)
+
+    def reorder_queues(self, reference_queue: Any) -> None:
+        """RQ calls this after each task it took: which lane comes first for the next one."""
+        self._taken += 1
+        queues = {queue.name: queue for queue in self.queues}
+        self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken)]
+
+    def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
+        """RQ's way to stop a task: there is no child to kill, so the task is asked."""
+        if self._context is not None:
+            self._context.stop(StopReason.CANCELLED)
+
+    def handle_warm_shutdown_request(self) -> None:
+        """SIGTERM: the task at hand stops at its next launch and goes back to the queue."""
+        self._heart.stopping()
+        if self._context is not None:
+            self._context.stop(StopReason.SHUTDOWN)
+
+    @property
+    def should_run_maintenance_tasks(self) -> bool:
+        """Never: the keeper reaps, and RQ's own maintenance would fail tasks that the keeper queues again."""
+        return False
+
+    @property
+    def was_told_to_stop(self) -> bool:
+        """Whether a signal ended the loop."""
+        return self._shutdown_requested_date is not None
+
+    def subscribe(self) -> None:
+        """No command channel: it is deaf after a reconnect, and lets anybody in Redis stop workers."""
+
+    def unsubscribe(self) -> None:
+        """There is no channel."""
+
+    def procline(self, message: str) -> None:
+        """The process keeps its name."""
+
+
+def _raw(job: Any) -> Mapping[str, Any]:
+    try:
+        return job.args[0] if isinstance(job.args[0], dict) else {}
+    except Exception:  # forged data may fail anywhere; running the job then says what is wrong with it
+        return {}
+
+
+class Surroundings:
+    """What a task gets besides its message."""
+
+    def __init__(self, settings: Settings, store: Store, device: Device) -> None:
+        self.settings = settings
+        self.store = store
+        self._device = device
+        self._memory_mb = limit_mb(settings.worker_max_memory_mb)
+        self.tasks_done = 0
+
+    def outgrown(self) -> str:
+        """Why this process should make room for a fresh one, "" if it need not."""
+        most = self.settings.worker_max_tasks
+        if most and self.tasks_done >= most:
+            return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
+        if (held := resident_mb()) > self._memory_mb:
+            return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
+        return ""
+
+    def context(self, raw: Mapping[str, Any], queue: RqQueue, worker: str) -> TaskContext:
+        """The context of a task, which tells its progress to the queue."""
+
+        def tell(done: float, total: float, message: str) -> None:
+            event = Event(
+                kind=EventKind.PROGRESS,
+                at=timestamp(),
+                task_id=raw["task_id"],
+                job_id=raw.get("job_id", ""),
+                stage=raw["stage"],
+                batch=raw.get("batch", 0),
+                attempt=raw["attempt"],
+                worker=worker,
+                done=done,
+                total=total,
+                message=message[:200],
+            )
+            try:
+                queue.publish(event)
+            except QueueUnavailable:
+                log.debug("nobody could be told about the progress of %s", raw["task_id"])
+
+        device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
+        return TaskContext(self.store, device=device, threads=self.settings.threads, tell=tell)
+
+
+def run_worker(
+    settings: Settings,
+    *,
+    stages: Collection[Stage] = tuple(Stage),
+    table: Mapping[Stage, StageFunction] | None = None,
+    check: Check | None = None,
+    burst: bool = False,
+    max_tasks: int | None = None,
+) -> bool:
+    """Do tasks until told to stop; with `burst` until none waits, with `max_tasks` that many.
+
+    Args:
+        table: what each stage does; the real ones by default.
+        check: of what they run on, before the first task and in doubt; that of the real engine if the stages are.
+
+    Returns:
+        False if the worker ended because something broke.
+
+    Raises:
+        InputError: there is no such device.
+        QueueUnavailable, StoreUnavailable: at the start.
+    """
+    queue = open_queue(settings, patience=_PATIENCE)
+    name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+    device = Device(settings.device)
+    store = open_store(settings.resolved_store_url)
+    queue.ping()
+    heart = Heartbeat(redis_url(settings), _first_beat(name, device, stages), lease_s=settings.lease_s)
+    if table is None:
+        table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
+    fitness = Fitness(store, check)
+    runner = Runner(table, worker=name, publish=queue.publish, fitness=fitness)
+    surroundings = Surroundings(settings, store, device)
+    worker = GraspWorker(queue, runner, heart, surroundings, fitness, stages=stages, name=name)
+    does_all = not burst and max_tasks is None
+    heart.start()
+    try:
+        device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
+        if not _admitted(fitness, heart, stages, limit_s=settings.task_timeout_s, patient=does_all):
+            return False
+        worker.work(burst=burst, max_jobs=max_tasks, logging_level="WARNING")
+    finally:
+        heart.stop()
+        queue.close()
+    return not worker.gave_up and (not does_all or worker.was_told_to_stop or worker.makes_room)
+
+
+def _admitted(fitness: Fitness, heart: Heartbeat, stages: Collection[Stage], *, limit_s: float, patient: bool) -> bool:
+    """Check the engine before the first task; a worker that is patient waits in quarantine until it passes.
+
+    A signal to stop ends the process at once here: it holds no task.
+    """
+    heart.update(state="checking")
+    heart.limit("the check of the engine", limit_s)
+    # The dearest part of the engine; what the other stages add is loaded by their first task, and checked in doubt.
+    first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else tuple(stages)
+    fit = fitness.try_engine(first) or (patient and fitness.sit_out(first, heart, lambda: False))
+    heart.limit("", 0.0)
+    if fit:
+        heart.update(state="idle")
+    return fit
+
+
+def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerBeat:
+    now = timestamp()
+    return WorkerBeat(
+        name=name,
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        device=device.wanted,
+        device_name=device.name,
+        stages=tuple(stages),
+        version=PACKAGE_VERSION,
+        state="checking",
+        task_id="",
+        started=now,
+        seen=now,
+    )

@@ -1,0 +1,33 @@
+"""How much memory this process holds. Engines and drivers leak: a worker that grew makes room for a new one."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Final
+
+from service.model.cores import ROOT, memory_limits
+
+_STATUS: Final = Path("/proc/self/statm")
+
+
+def resident_mb() -> float:
+    """Resident memory of this process [MiB]; where the system does not tell, the most it ever was."""
+    try:
+        pages = int(_STATUS.read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def limit_mb(wanted: int, root: Path = ROOT) -> float:
+    """The limit of a worker [MiB]: as given; for 0 half of the machine's memory, or of its control group's if less.
+
+    Args:
+        root: the folder that holds `proc` and `sys`.
+    """
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return wanted or min([machine, *memory_limits(root)]) / 2**20 / 2

@@ -1,0 +1,237 @@
+"""From a message to an outcome: runs a task's stage and sorts what may go wrong."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from service import logs, tracing
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import IngestMessage, Origin, Stage, TaskMessage
+from service.model.errors import DamagedError, DamagedShard, InputError, TaskCancelled, TaskRefused, UnavailableError
+from service.model.records import AttemptRecord
+from service.model.version import STAGE_REVISIONS, TASK_SCHEMA
+from service.queue.port import Event, EventKind, Message
+from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
+from service.store.records import put_record
+from worker.process.fitness import Fitness
+from worker.stages.context import StopReason, TaskContext
+from worker.stages.output import StageFunction, shard_of
+
+log = logging.getLogger(__name__)
+
+
+Publish = Callable[[Event], None]
+_TRACE_CHARACTERS: Final = 8000
+
+_STOPPED: Final = {
+    StopReason.CANCELLED: EventKind.CANCELLED,
+    StopReason.SHUTDOWN: EventKind.RETURNED,
+}
+
+
+class Runner:
+    """Does tasks one after the other with a table of stages."""
+
+    def __init__(
+        self, stages: Mapping[Stage, StageFunction], *, worker: str, publish: Publish, fitness: Fitness | None = None
+    ) -> None:
+        self._stages = stages
+        self._worker = worker
+        self._publish = publish
+        self._fitness = fitness
+
+    def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
+        """Do a task.
+
+        Returns:
+            what to tell the keeper; None if the task is no longer this worker's.
+
+        Raises:
+            TaskRefused: the message cannot be read, so there is no task to fail.
+        """
+        message = parse_message(raw)
+        subjects = _subjects(message)
+        parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
+        with logs.bind(**subjects), tracing.span(f"task {message.stage}", parent=parent, **subjects) as facts:
+            event = self._run(message, raw, context)
+            facts["graspd.outcome"] = event.kind.value if event is not None else "lost"
+            return event
+
+    def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
+        started, clock = timestamp(), time.monotonic()
+        try:
+            if raw.get("schema") != TASK_SCHEMA:
+                raise TaskRefused(
+                    f"the task has schema {raw.get('schema')} and this worker knows {TASK_SCHEMA}; "
+                    "run workers and API of one version"
+                )
+            if isinstance(message, TaskMessage) and message.revision != STAGE_REVISIONS[message.stage]:
+                raise TaskRefused(
+                    f"the job was planned for revision {message.revision} of {message.stage} and this worker makes "
+                    f"revision {STAGE_REVISIONS[message.stage]}; submit the job again"
+                )
+            return self._do(message, context)
+        except TaskCancelled:
+            return self._stopped(message, context, started)
+        except UnavailableError as error:
+            return self._event(EventKind.DEFERRED, message, message=str(error))
+        except Exception as error:
+            if is_disk_full(error):
+                return self._event(
+                    EventKind.DEFERRED, message, message=f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
+                )
+            if self._fitness is not None and (why := self._fitness.doubt(message, error)):
+                log.warning("the task is handed back; it failed because of this worker", exc_info=True)
+                return self._event(EventKind.RETURNED, message, message=why)
+            return self._failed(message, error, context, started)
+        finally:
+            log.info("%s took %.2f s", message.stage, time.monotonic() - clock)
+
+    def _do(self, message: Message, context: TaskContext) -> Event:
+        context.check()
+        output = output_of(message)
+        if self._is_done(message, context):
+            return self._event(EventKind.FINISHED, message, output=output, message="was there already")
+        if message.stage not in self._stages:
+            raise TaskRefused(f"this worker does no {message.stage} tasks")
+        self._publish(self._event(EventKind.STARTED, message))
+        clock = time.perf_counter()
+        lost = self._lost(message, context)
+        made = self._stages[message.stage](message, context)
+        seconds = time.perf_counter() - clock
+        if made is not None and isinstance(message, TaskMessage):
+            context.check()
+            manifest, data = shard_of(
+                message, made, device=context.device, seconds=seconds, worker=self._worker, lost=lost
+            )
+            if lost is not None and manifest.sha256 != lost.sha256:
+                raise DamagedShard(
+                    f"{lost.key} was made again and is not what it was: made on {lost.device} by graspd "
+                    f"{lost.code_version}, again on {context.device}; put a copy in its place"
+                )
+            publish_shard(context.store, manifest, data)
+        if self._fitness is not None:
+            self._fitness.passed()
+        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
+
+    def _is_done(self, message: Message, context: TaskContext) -> bool:
+        if isinstance(message, IngestMessage):
+            return context.store.exists(names.asset_check(message.kind, message.digest))
+        done = shard_exists(context.store, message.stage, message.output)
+        return done and context.store.exists(names.shard_file(message.stage, message.output))
+
+    def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
+        """The manifest of a shard that was made before and whose file is gone."""
+        if isinstance(message, IngestMessage) or not shard_exists(context.store, message.stage, message.output):
+            return None
+        return load_manifest(context.store, message.stage, message.output)
+
+    def _stopped(self, message: Message, context: TaskContext, started: str) -> Event | None:
+        reason = context.stop_reason
+        if reason is StopReason.TIMEOUT:
+            error = TimeoutError("the task took longer than GRASPD_TASK_TIMEOUT_S allows")
+            return self._failed(message, error, context, started)
+        kind = _STOPPED.get(reason) if reason is not None else EventKind.CANCELLED
+        return None if kind is None else self._event(kind, message, output=output_of(message))
+
+    def _failed(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
+        log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
+        # Bad input and a damaged store do not get better by trying again.
+        last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
+        attempt = AttemptRecord(
+            task_id=message.task_id,
+            job_id=message.job_id if isinstance(message, TaskMessage) else "",
+            stage=message.stage,
+            number=message.attempt,
+            kind=type(error).__name__,
+            reason=_one_line(error),
+            trace="".join(traceback.format_exception(error))[-_TRACE_CHARACTERS:],
+            worker=self._worker,
+            started=started,
+            ended=timestamp(),
+            last=last,
+        )
+        return self._recorded(message, attempt, context)
+
+    def _recorded(self, message: Message, attempt: AttemptRecord, context: TaskContext) -> Event:
+        try:
+            if isinstance(message, TaskMessage) and _has_manifest(message, context):
+                # The task has succeeded already: another worker was faster, or a lost file could not be made again.
+                return self._event(EventKind.CANCELLED, message, message=attempt.reason)
+            put_record(context.store, names.attempt(attempt.task_id, attempt.number), attempt)
+        except UnavailableError as error:
+            return self._event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")
+        return self._event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
+
+    def _event(self, kind: EventKind, task: Message, **more: Any) -> Event:
+        facts: dict[str, Any] = {"output": output_of(task)}
+        if isinstance(task, TaskMessage):
+            facts |= {"job_id": task.job_id, "batch": task.batch}
+        return Event(
+            kind=kind,
+            at=timestamp(),
+            task_id=task.task_id,
+            stage=task.stage,
+            attempt=task.attempt,
+            worker=self._worker,
+            **facts | more,
+        )
+
+
+def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
+    """Whether a readable manifest says that the task has succeeded; a damaged one says nothing."""
+    try:
+        return (
+            shard_exists(context.store, message.stage, message.output)
+            and load_manifest(context.store, message.stage, message.output).shard_id == message.output
+        )
+    except DamagedError:
+        return False
+
+
+def parse_message(raw: Mapping[str, Any]) -> Message:
+    """The message in a queue entry; TaskRefused if it is none."""
+    try:
+        model = IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage
+        # A newer schema may have more fields; what names the task must still be there, so that it can be refused.
+        known = {field.alias or name for name, field in model.model_fields.items()}
+        return model.model_validate({key: value for key, value in raw.items() if key in known})
+    except (ValidationError, AttributeError) as error:
+        raise TaskRefused(f"the queue holds something that is no task of graspd: {_one_line(error)}") from None
+
+
+def _subjects(message: Message) -> dict[str, Any]:
+    """What every log line of a task says it is about."""
+    found: dict[str, Any] = {"task": message.task_id, "attempt": message.attempt}
+    if isinstance(message, TaskMessage):
+        origin = message.origin or Origin()
+        found |= {"job": message.job_id, "request": origin.request, "key": origin.key}
+    return found
+
+
+def output_of(message: Message) -> str:
+    """What the task makes: a shard id, or kind and digest of the asset it checks."""
+    return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
+
+
+def is_disk_full(error: BaseException | None) -> bool:
+    """Whether an error, or what it came from, is a disk (or a quota) without room."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text[:500] if text else type(error).__name__

@@ -1,0 +1,105 @@
+"""A worker's check of itself: can it load its engine, and does that give a result that makes sense?
+
+What a stage runs on is made to work on a ball: a grasp that is judged and measured, a drop, a picture. This loads or
+compiles the kernels too, so the first task does not wait for them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from service.model.domain import JobRequest, Stage
+from service.model.errors import GraspdError
+
+if TYPE_CHECKING:
+    from worker.objects.model import ObjectModel
+
+log = logging.getLogger(__name__)
+_RADIUS_M: Final = 0.03
+_HAND: Final = "barrett"
+
+
+class EngineError(GraspdError):
+    """The engine of this worker does not work; its tasks are for others."""
+
+    slug, title = "engine-broken", "The engine of a worker does not work"
+
+
+def check_engine(device: Callable[[], str], stages: Collection[Stage], *, threads: int = 0) -> None:
+    """Try what these stages run on.
+
+    Args:
+        device: gives the name of the Warp device.
+        threads: of a task; 0: all cores.
+
+    Raises:
+        EngineError: something does not load, compile, run, or gives nonsense; one line says what.
+    """
+    started, name = time.monotonic(), "device"
+    try:
+        of_device = device()
+        for stage in stages:
+            name = stage.value
+            importlib.import_module(f"worker.stages.{name}")
+            if stage in _CHECKS:
+                _CHECKS[stage](of_device, threads)
+    except Exception as error:
+        raise EngineError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+    log.info("the engine works; the check took %.1f s", time.monotonic() - started)
+
+
+def _check_synthesis(device: str, threads: int) -> None:
+    from worker.certified import certified_grasps
+    from worker.hands.load import hand_from_path
+
+    request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="raw")
+    found = certified_grasps(hand_from_path(_HAND), _ball(), request, count=1, threads=threads, device=device)
+    _expect(
+        len(found.grasps) == 1 and np.isfinite(found.grasps.grasp.hand_pose).all(), "a grasp of a ball is no number"
+    )
+
+
+def _check_scene(device: str, threads: int) -> None:
+    from worker.scenes import drop
+
+    height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
+    # The pose is that of the ball's frame, whose origin is its centre: it lies on the table, facets aside.
+    _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
+
+
+def _check_pictures(device: str, threads: int) -> None:
+    from worker.rendering import render
+
+    pose = np.array([[0.0, 0.0, _RADIUS_M, 1.0, 0.0, 0.0, 0.0]])
+    made = render(_ball(), pose, views=1, stereo=False, width=32, height=24, seed=0, device=device, threads=threads)
+    _expect(int(np.ptp(made["image/rgb"])) > 0, "a picture of a ball shows nothing")
+
+
+_CHECKS: Final[Mapping[Stage, Callable[[str, int], None]]] = {
+    Stage.SYNTHESIZE: _check_synthesis,
+    Stage.SCENE: _check_scene,
+    Stage.RENDER: _check_pictures,
+}
+
+
+def _ball() -> ObjectModel:
+    """Of flat faces, so that it comes to rest."""
+    from manifold3d import Manifold
+
+    from worker.objects.builtin import stl_bytes
+    from worker.objects.prepare import load_object
+    from worker.objects.solid import from_manifold
+
+    mesh = stl_bytes(*from_manifold(Manifold.sphere(_RADIUS_M, 12)))
+    return load_object({"ball.stl": mesh}, name="ball", digest="", face_error_m=0.0)
+
+
+def _expect(sensible: object, otherwise: str) -> None:
+    if not sensible:
+        raise ArithmeticError(otherwise)

@@ -1,0 +1,1 @@
+"""Pictures for people: grasps, portraits, and the sheets that show them."""

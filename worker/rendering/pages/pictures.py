@@ -1,0 +1,165 @@
+"""Pictures of grasps for people: hand and object alone before a quiet backdrop, from wanted sides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.objects.model import Floats, ObjectModel
+from worker.rendering.cameras import Cameras, intrinsics, look_at
+from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.kernels import CATCHER
+from worker.rendering.palette import hexadecimal
+from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from worker.rendering.tracer import Tracer
+
+#: Sides 120 degrees apart, measured from the side view of the hand [rad].
+THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
+ELEVATION: Final = np.radians(20.0)
+FIELD_OF_VIEW: Final = np.radians(24.0)
+SAMPLES: Final = 12
+#: Hand parts farther than this from the object's hull do not draw the camera back: a forearm may leave the picture [m].
+_NEAR_M: Final = 0.14
+#: Grasps traced together: bounds the memory.
+_TOGETHER: Final = 16
+
+#: Share of the picture's width or height that hand and object take up.
+_FILL: Final = 0.86
+#: Left of the camera, above it, in front of the object: camera looks along -x of the turned world.
+TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
+FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
+FLOOR: Final = Look((1.0, 1.0, 1.0), pattern=CATCHER)
+OBJECT_LOOK: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
+STUDIO: Final = Lamp(
+    key=(1.85, 1.8, 1.7), sky=(0.76, 0.79, 0.84), ground=(0.3, 0.29, 0.28),
+    backdrop_low=(1.15, 1.17, 1.19), backdrop_high=(1.4, 1.42, 1.44),
+)  # fmt: skip
+
+
+def grasp_pictures(
+    hand: HandModel,
+    obj: ObjectModel,
+    hand_pose: Floats,
+    joint_positions: Floats,
+    size: tuple[int, int] = (320, 320),
+    azimuths: Sequence[float] = THREE_SIDES[:1],
+    *,
+    device: str = "cpu",
+    samples: int = SAMPLES,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> NDArray[np.uint8]:
+    """Pictures of N grasps from A sides.
+
+    Args:
+        hand: the hand; its convex pieces are drawn.
+        obj: the object, its z axis up.
+        hand_pose: (N, 7) pose of the root link in the object frame.
+        joint_positions: (N, J).
+        size: width and height [px].
+        azimuths: A sides [rad] about the vertical; 0 looks across the direction in which the palm approaches.
+        device: Warp device.
+        samples: rays per pixel.
+        cancelled: asked between passes.
+
+    Returns:
+        (N, A, H, W, 3) sRGB.
+
+    Raises:
+        TaskCancelled: `cancelled()` answered True.
+    """
+    hand_pose = np.atleast_2d(np.asarray(hand_pose, float))
+    joints = np.atleast_2d(np.asarray(joint_positions, float))
+    stages: dict[int, Tracer] = {}
+    solids: list[Solid | Box] = [
+        Box(FLOOR_SIZE),
+        Solid(obj.vertices, obj.faces, obj.corner_normals),
+        *hand_solids(hand),
+    ]
+    shots = []
+    for start in range(0, len(hand_pose), _TOGETHER):
+        part = slice(start, start + _TOGETHER)
+        bodies = body_poses(hand, hand_pose[part], joints[part])
+        worlds = len(bodies)
+        if worlds not in stages:
+            stages[worlds] = Tracer(solids, worlds, device)
+        shots.append(_shoot(stages[worlds], hand, obj, bodies, size, azimuths, samples, cancelled))
+    empty = np.zeros((0, len(azimuths), size[1], size[0], 3), np.uint8)
+    return np.concatenate([empty, *shots])
+
+
+def _shoot(
+    stage: Tracer,
+    hand: HandModel,
+    obj: ObjectModel,
+    bodies: Floats,
+    size: tuple[int, int],
+    azimuths: Sequence[float],
+    samples: int,
+    cancelled: Callable[[], bool],
+) -> NDArray[np.uint8]:
+    worlds, (width, height) = len(bodies), size
+    points = np.concatenate(
+        [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), _hand_points(hand, bodies)], axis=1
+    )
+    floor = np.tile(IDENTITY_POSE, (worlds, 1))
+    floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * FLOOR_SIZE[2]
+    shown = drawn_bodies(hand)
+    poses = np.concatenate([floor[:, None], np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, shown]], axis=1)
+    stage.place(poses, [[FLOOR, OBJECT_LOOK, *(look_of(hand, body) for body in shown)]] * worlds)
+    k = intrinsics(width, height, FIELD_OF_VIEW)
+    sides = []
+    for azimuth in azimuths:
+        angles = np.array([_side(hand, world) + azimuth for world in bodies])
+        shot = Shot(
+            world=np.arange(worlds, dtype=np.int32),
+            extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
+            intrinsics=k, width=width, height=height, samples=samples, toward_lamp=TOWARD_LAMP,
+            # The lamp goes round with the camera, so no side lies in the dark.
+            turn=-angles, lamps=[STUDIO] * worlds,
+        )  # fmt: skip
+        sides.append(stage.shoot(shot, cancelled=cancelled).rgb)
+    return np.stack(sides, axis=1)
+
+
+def _side(hand: HandModel, bodies: Floats) -> float:
+    """Azimuth of a camera that looks across the direction in which the palm approaches [rad]."""
+    towards = quat_rotate(bodies[0, 3:], hand.palm.approach)
+    # Where the palm comes from straight above or below, its own x axis serves.
+    flat = towards[:2] if np.hypot(*towards[:2]) > 0.2 else quat_rotate(bodies[0, 3:], np.array([1.0, 0, 0]))[:2]
+    return float(np.arctan2(flat[1], flat[0]) + 0.5 * np.pi)
+
+
+def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
+    """Extrinsics of a camera from whose picture the near parts stand out by the share `_FILL`."""
+    middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
+    reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
+    return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)
+
+
+def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
+    """Extrinsics (4, 4) of a camera at azimuth `angle` [rad] from whose picture the points (P, 3) stand out."""
+    centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
+    direction = np.array([np.cos(angle) * np.cos(ELEVATION), np.sin(angle) * np.cos(ELEVATION), np.sin(ELEVATION)])
+    distance = 4.0 * float(np.linalg.norm(near - centre, axis=1).max())
+    # Perspective changes with the distance; three rounds settle it to a per cent.
+    for _ in range(3):
+        camera = Cameras(*size, k, look_at(centre + distance * direction, centre)[None])
+        (pixels,), _ = camera.project(near)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        depth_ray = np.linalg.inv(k) @ np.append(0.5 * (low + high), 1.0) * distance
+        centre = centre + camera.extrinsics[0, :3, :3].T @ (depth_ray * [1, 1, 0])
+        distance *= float(np.max((high - low) / np.asarray(size))) / _FILL
+    return look_at(centre + distance * direction, centre)
+
+
+def _hand_points(hand: HandModel, bodies: Floats) -> Floats:
+    """(N, P, 3) corners of all pieces in the object frame."""
+    body = np.concatenate([np.full(len(piece.vertices), piece.body) for piece in hand.pieces])
+    corners = np.concatenate([piece.vertices for piece in hand.pieces])
+    return apply(bodies[:, body], corners)

@@ -1,0 +1,145 @@
+"""Pictures of a hand or an object alone: what the check understood, for a user to agree with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from service.model.errors import InputError
+from service.model.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
+from worker.hands.guess import posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.normals import corner_normals
+from worker.objects.solid import from_manifold
+from worker.rendering.cameras import intrinsics
+from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.pages import typography
+from worker.rendering.pages.pictures import (
+    FIELD_OF_VIEW,
+    FLOOR,
+    FLOOR_SIZE,
+    OBJECT_LOOK,
+    STUDIO,
+    TOWARD_LAMP,
+    fit_camera,
+)
+from worker.rendering.palette import hexadecimal
+from worker.rendering.scenery import Box, Look, Shot, Solid
+from worker.rendering.tracer import Tracer
+
+#: Size of one picture of a portrait [px].
+SIZE: Final = (340, 360)
+_SAMPLES: Final = 16
+_CAPTION: Final = 30
+#: Share of the way from open to closed at which a hand is shown closing.
+_CLOSING_SHARE: Final = 0.6
+_ARROW: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
+#: Length of the arrow over the largest extent of the hand.
+_ARROW_SHARE: Final = 0.4
+#: Toward the palm from the side on which the approach points right [rad].
+_HAND_AZIMUTH: Final = np.radians(32.0)
+_OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
+
+
+def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
+    """The hand open, in its pre-shape and closing; an arrow stands on the palm's centre along the approach."""
+    shown = drawn_bodies(hand)
+    upright = _upright(hand)
+    named = {"open": posture(hand, 0.0), "pre-shape": hand.preshape, "closing": posture(hand, _CLOSING_SHARE)}
+    joints = hand.expand(np.array(list(named.values())))
+    bodies = np.array(body_poses(hand, np.tile(upright, (len(named), 1)), joints))
+    corners = [apply(bodies[:, piece.body, None], piece.vertices) for piece in hand.pieces]
+    extent = float(np.ptp(np.concatenate(corners, axis=1), axis=(0, 1)).max())
+    arrow = _arrow(_ARROW_SHARE * extent)
+    palm = compose(upright, np.concatenate([hand.palm.centre, _quat_of_z(hand.palm.approach)]))
+    points = np.concatenate([*(c.reshape(-1, 3) for c in corners), apply(palm, arrow.vertices)])
+    poses = np.concatenate([bodies[:, shown], np.tile(palm, (len(named), 1, 1))], axis=1)
+    looks = [*(look_of(hand, body) for body in shown), _ARROW]
+    solids = [*hand_solids(hand), arrow]
+    return _row(_shoot(solids, poses, looks, points, [_HAND_AZIMUTH] * len(named), device), list(named))
+
+
+def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
+    """The prepared mesh from three sides, z up."""
+    solid = Solid(obj.vertices, obj.faces, obj.corner_normals)
+    extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
+    captions = [f"{obj.name}, {extents} mm", f"{len(obj.faces)} faces", f"within {1e3 * obj.deviation_m:.2f} mm"]
+    poses = np.tile(IDENTITY_POSE, (len(captions), 1, 1))
+    return _row(_shoot([solid], poses, [OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS, device), captions)
+
+
+def write_png(image: Image.Image, path: Path) -> None:
+    """InputError if the file cannot be written."""
+    try:
+        path.write_bytes(typography.png(image))
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def _shoot(
+    solids: Sequence[Solid], poses: Floats, looks: list[Look], points: Floats, azimuths: Sequence[float], device: str
+) -> NDArray[np.uint8]:
+    """(W, H, W, 3) pictures of W worlds, each from its azimuth; every camera takes in the same points."""
+    worlds, (width, height) = len(poses), SIZE
+    floor = IDENTITY_POSE.copy()
+    floor[2] = points[:, 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
+    stage = Tracer([Box(FLOOR_SIZE), *solids], worlds, device)
+    stage.place(np.concatenate([np.tile(floor, (worlds, 1, 1)), poses], axis=1), [[FLOOR, *looks]] * worlds)
+    k = intrinsics(width, height, FIELD_OF_VIEW)
+    shot = Shot(
+        world=np.arange(worlds, dtype=np.int32),
+        extrinsics=np.stack([fit_camera(points, angle, k, SIZE) for angle in azimuths]),
+        intrinsics=k, width=width, height=height, samples=_SAMPLES, toward_lamp=TOWARD_LAMP,
+        turn=-np.asarray(azimuths), lamps=[STUDIO] * worlds,
+    )  # fmt: skip
+    return stage.shoot(shot, cancelled=lambda: False).rgb
+
+
+def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
+    """Pictures side by side with a word under each."""
+    width, height = SIZE
+    page = Image.new("RGB", (width * len(pictures), height + _CAPTION), typography.PAPER)
+    draw = ImageDraw.Draw(page)
+    for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+        page.paste(Image.fromarray(picture), (number * width, 0))
+        typography.text(draw, (number * width + 12, height + 21), caption, 15, typography.INK)
+    return page.quantize(192, dither=Image.Dither.NONE)
+
+
+def _upright(hand: HandModel) -> Floats:
+    """Pose of the root that turns the approach to +y, right of a camera on +x, and the open fingertips up."""
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.0)))[0]
+    centres = {piece.body: apply(poses[piece.body], piece.vertices).mean(axis=0) for piece in hand.pieces}
+    tips = np.mean([centres.get(body, poses[body, :3]) for body in hand.fingertips], axis=0)
+    forward, up = hand.palm.approach, tips - hand.palm.centre
+    up = up - (up @ forward) * forward
+    if np.linalg.norm(up) < 0.35 * np.linalg.norm(tips - hand.palm.centre):
+        # A gripper's fingers point along its approach: it hangs, as it would over a table.
+        up, forward = -forward, np.eye(3)[int(np.argmin(np.abs(forward)))]
+        forward = forward - (forward @ up) * up / (up @ up)
+    rows = [np.cross(forward, up), forward, up]
+    rotation = np.array([row / np.linalg.norm(row) for row in rows])
+    return np.concatenate([np.zeros(3), quat_from_matrix(rotation)])
+
+
+def _quat_of_z(direction: Floats) -> Floats:
+    """Quaternion w x y z of a rotation that takes z to `direction`."""
+    side = np.cross(np.eye(3)[int(np.argmin(np.abs(direction)))], direction)
+    side /= np.linalg.norm(side)
+    return quat_from_matrix(np.stack([side, np.cross(direction, side), direction], axis=1))
+
+
+def _arrow(length: float) -> Solid:
+    """An arrow from the origin along z."""
+    shaft = manifold3d.Manifold.cylinder(0.72 * length, 0.03 * length, 0.03 * length, 32)
+    head = manifold3d.Manifold.cylinder(0.28 * length, 0.09 * length, 0.0, 32).translate((0, 0, 0.72 * length))
+    vertices, faces = from_manifold(shaft + head)
+    return Solid(vertices, faces.astype(np.int32), corner_normals(vertices, faces.astype(np.int32)))

@@ -1,0 +1,241 @@
+"""Pages of pictures: the best grasps with their figures, grasps from three sides, the views of a shard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from worker.rendering.annotate import OBJECT, TABLE
+from worker.rendering.cameras import Floats
+from worker.rendering.pages import typography as type_
+
+MARGIN: Final = 40
+GAP: Final = 18
+_HEAD: Final = 74
+_CAPTION: Final = 44
+_NAME: Final = 22
+#: Contact threshold at which a sheet quotes epsilon and contact area [m].
+_QUOTED_THRESHOLD_M: Final = 0.005
+_SEGMENT: Final = np.array(
+    [[214, 216, 219], [150, 168, 178], [224, 129, 63], [96, 122, 158], [122, 158, 112], [168, 118, 150]], np.uint8
+)
+_TIGHT: Final = (0, 214, 190)
+_LOOSE: Final = (255, 255, 255)
+_BOX_3D: Final = (255, 205, 60)
+_EDGES: Final = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+
+Arrays = Mapping[str, NDArray[np.generic]]
+
+
+def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Rows of the `count` best grasps by epsilon among those of a mask (N,)."""
+    rows = np.flatnonzero(among)
+    return rows[np.argsort(-_quoted(quality, "quality/epsilon")[rows], kind="stable")][:count]
+
+
+def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
+    """(S,) for each scene the row of its kept grasp with the largest epsilon; -1 where none was kept."""
+    epsilon = _quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
+    score = np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf)
+    rows = np.full(len(scene["scene/object_pose"]), -1, np.int32)
+    for s in range(len(rows)):
+        mine = np.flatnonzero(np.asarray(scene["grasp/scene_index"]) == s)
+        if len(mine) and np.isfinite(score[mine]).any():
+            rows[s] = mine[np.argmax(score[mine])]
+    return rows
+
+
+def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
+    """For each row what a caption says: label and value, from the datasets of a base shard."""
+    epsilon, area = _quoted(quality, "quality/epsilon"), _quoted(quality, "quality/contact_area_cm2")
+    depth = np.asarray(quality["quality/penetration_depth_mm"], float)
+    return [
+        [("epsilon", f"{epsilon[r]:.3f}"), ("contact", f"{area[r]:.1f} cm^2"), ("depth", f"{depth[r]:.2f} mm")]
+        for r in rows
+    ]
+
+
+def _quoted(quality: Arrays, path: str) -> Floats:
+    thresholds = np.asarray(quality["quality/thresholds_m"], float)
+    column = int(np.argmin(np.abs(thresholds - _QUOTED_THRESHOLD_M)))
+    return np.asarray(quality[path], float)[:, column]
+
+
+def contact_sheet(
+    pictures: NDArray[np.uint8],
+    captions: Sequence[Sequence[tuple[str, str]]] = (),
+    *,
+    title: str,
+    subtitle: str = "",
+    columns: int = 4,
+) -> bytes:
+    """PNG of N pictures (N, H, W, 3) in a grid, ranked 1..N, with label and value pairs below each."""
+    rows = -(-max(1, len(pictures)) // columns)
+    height, width = pictures.shape[1:3]
+    page, draw, top = _page(columns, rows, width, height + _CAPTION, title, subtitle)
+    for k, picture in enumerate(pictures):
+        x = MARGIN + (k % columns) * (width + GAP)
+        y = top + (k // columns) * (height + _CAPTION + GAP)
+        page.paste(Image.fromarray(picture), (x, y))
+        _caption(draw, (x, y + height), width, k + 1, captions[k] if k < len(captions) else ())
+    return type_.png(page)
+
+
+def three_sides_sheet(
+    pictures: NDArray[np.uint8],
+    captions: Sequence[Sequence[tuple[str, str]]] = (),
+    *,
+    title: str,
+    subtitle: str = "",
+    columns: int = 2,
+) -> bytes:
+    """PNG of N grasps from three sides (N, 3, H, W, 3): a strip of three per grasp, `columns` strips in a row."""
+    seam = np.full((*pictures.shape[:1], pictures.shape[2], 4, 3), type_.PAPER, np.uint8)
+    strips = np.concatenate([part for side in np.moveaxis(pictures, 1, 0) for part in (seam, side)][1:], axis=2)
+    return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=columns)
+
+
+def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
+    """PNG of a views shard: per placement left and right picture, depth, segmentation, boxes and, if there, hand."""
+    eye = np.asarray(views["camera/eye"])
+    stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
+    columns: dict[str, Callable[[int], Image.Image]] = {
+        "left" if stereo else "colour": lambda view: _colours(views, "image/rgb", view),
+        "right": lambda view: _colours(views, "image/rgb", view + 1),
+        "depth": lambda view: _depth(views, view),
+        "segmentation": lambda view: _segments(views, view),
+        "boxes": lambda view: _boxes(views, view),
+        "hand": lambda view: _colours(views, "image/rgb_hand", view),
+    }
+    heads = [head for head in columns if (stereo or head != "right") and (head != "hand" or "image/rgb_hand" in views)]
+    height, width = np.asarray(views["image/rgb"]).shape[1:3]
+    page, draw, top = _page(len(heads), len(first), width, height, title, subtitle, head=_HEAD + 24)
+    for column, head in enumerate(heads):
+        x = MARGIN + column * (width + GAP)
+        type_.text(draw, (x, top - 10), head, 15, type_.QUIET)
+        for row, view in enumerate(first.tolist()):
+            page.paste(columns[head](view), (x, top + row * (height + GAP)))
+    return type_.png(page)
+
+
+def scene_cells(views: Arrays) -> list[Image.Image]:
+    """Pictures of a shard's first stereo pair: left, right, depth, normals, segmentation, boxes."""
+    left, right = np.asarray(views["image/rgb"][:2], np.uint8)
+    normals = np.asarray(views["image/normals"][0], float)
+    coloured = np.where(normals.any(axis=-1, keepdims=True), 127.5 + 127.5 * normals, 214).round().astype(np.uint8)
+    cells = [Image.fromarray(left), Image.fromarray(right), _depth(views, 0), Image.fromarray(coloured)]
+    return [*cells, _segments(views, 0), _boxes(views, 0)]
+
+
+def label_page(
+    rows: Sequence[Sequence[Image.Image]],
+    heads: Sequence[str],
+    names: Sequence[Sequence[str]],
+    *,
+    title: str,
+    subtitle: str = "",
+) -> bytes:
+    """PNG of a table of pictures: a head above each column, names below the first pictures of each row."""
+    width, height = rows[0][0].size
+    page, draw, top = _page(len(heads), len(rows), width, height + _NAME, title, subtitle, head=_HEAD + 24)
+    for column, head in enumerate(heads):
+        type_.text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, type_.QUIET)
+    for row, (cells, below) in enumerate(zip(rows, names, strict=True)):
+        y = top + row * (height + _NAME + GAP)
+        for column, cell in enumerate(cells):
+            page.paste(cell, (MARGIN + column * (width + GAP), y))
+        for column, name in enumerate(below):
+            type_.text(draw, (MARGIN + column * (width + GAP), y + height + _NAME - 4), name, 14, type_.INK)
+    return type_.png(page)
+
+
+def _page(
+    columns: int, rows: int, width: int, height: int, title: str, subtitle: str, head: int = _HEAD
+) -> tuple[Image.Image, ImageDraw.ImageDraw, int]:
+    """Empty page with its title, and the y at which the cells begin."""
+    size = (2 * MARGIN + columns * (width + GAP) - GAP, MARGIN + head + rows * (height + GAP) - GAP + MARGIN)
+    page = Image.new("RGB", size, type_.PAPER)
+    draw = ImageDraw.Draw(page)
+    type_.text(draw, (MARGIN, MARGIN + 20), title, 26, type_.INK)
+    type_.text(draw, (MARGIN, MARGIN + 46), subtitle, 15, type_.QUIET)
+    return page, draw, MARGIN + head
+
+
+def _caption(
+    draw: ImageDraw.ImageDraw, at: tuple[int, int], width: int, rank: int, pairs: Sequence[tuple[str, str]]
+) -> None:
+    x, y = at
+    draw.line([(x, y + 1), (x + width - 1, y + 1)], fill=type_.RULE)
+    type_.text(draw, (x, y + 26), str(rank), 17, type_.ACCENT)
+    # Ranks of up to three digits, then equal columns.
+    left, step = x + 34, (width - 34) / max(1, len(pairs))
+    for k, (label, value) in enumerate(pairs):
+        type_.text(draw, (left + k * step, y + 18), label, 11, type_.QUIET)
+        type_.text(draw, (left + k * step, y + 35), value, 14, type_.INK)
+
+
+def _colours(views: Arrays, path: str, view: int) -> Image.Image:
+    return Image.fromarray(np.asarray(views[path][view], np.uint8))
+
+
+def _depth(views: Arrays, view: int) -> Image.Image:
+    depth = np.asarray(views["image/depth"][view], np.float32)
+    solid = np.asarray(views["image/segmentation"][view]) == OBJECT
+    finite = depth[np.isfinite(depth)]
+    if finite.size == 0:
+        return Image.fromarray(type_.depth_colours(depth, 0.0, 1.0))
+    # The far table would eat the range; what matters is around the object.
+    near, far = float(finite.min()), float(np.percentile(finite, 90))
+    if solid.any():
+        far = max(float(depth[solid].max()), min(far, float(depth[solid].max()) * 1.4))
+    image = Image.fromarray(type_.depth_colours(depth, near, far))
+    _scale_bar(image, near, far)
+    return image
+
+
+def _scale_bar(image: Image.Image, near: float, far: float) -> None:
+    ramp, before, after, thick = 64, 34, 46, 6
+    if image.width < 2 * (before + ramp + after):
+        return
+    x, y = image.width - ramp - after, image.height - 13
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([x - before, y - 7, image.width, image.height], fill=type_.PAPER)
+    colours = type_.depth_colours(np.linspace(near, far, ramp, dtype=np.float32)[None].repeat(thick, 0), near, far)
+    image.paste(Image.fromarray(colours), (x, y))
+    type_.text(draw, (x - before + 6, y + thick + 1), f"{near:.2f}", 11, type_.INK)
+    type_.text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, type_.INK)
+
+
+def _segments(views: Arrays, view: int) -> Image.Image:
+    return Image.fromarray(_SEGMENT[_segment_rows(views, view)])
+
+
+def _segment_rows(views: Arrays, view: int) -> NDArray[np.intp]:
+    """Rows of `_SEGMENT`: neighbours take turns with the colours after the object's."""
+    labels = np.asarray(views["image/segmentation"][view], np.intp)
+    return np.where(labels > OBJECT, OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1), labels)
+
+
+def _boxes(views: Arrays, view: int) -> Image.Image:
+    rgb = np.asarray(views["image/rgb"][view], float)
+    # Dimmed, so that the lines stand out on any material.
+    table = np.asarray(views["image/segmentation"][view])[..., None] <= TABLE
+    image = Image.fromarray(np.where(table, 0.55 * rgb, 0.9 * rgb).astype(np.uint8))
+    scale = 3
+    overlay = Image.new("RGBA", (image.width * scale, image.height * scale), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(overlay)
+    corners = np.asarray(views["box/bounding_box_3d"][view], float) @ np.asarray(views["camera/intrinsics"][view]).T
+    pixels = scale * corners[:, :2] / corners[:, 2:]
+    for a, b in _EDGES:
+        draw.line([tuple(pixels[a]), tuple(pixels[b])], fill=(*_BOX_3D, 255), width=4)
+    for name, colour in (("loose", _LOOSE), ("tight", _TIGHT)):
+        box = scale * np.asarray(views[f"box/bounding_box_2d_{name}"][view], float)
+        if np.isfinite(box).all():
+            draw.rectangle(tuple(box), outline=(*colour, 255), width=6 if name == "loose" else 3)
+    small = overlay.resize(image.size, Image.Resampling.LANCZOS)
+    image.paste(small, (0, 0), small)
+    return image

@@ -1,0 +1,129 @@
+"""What stands around an object: the convex obstacles of a scene that a hand must stay clear of.
+
+An obstacle is an intersection of half-spaces: a table top is one, a board or a wall six, a neighbour's convex pieces as
+many as their hulls have faces. Frames: the object's, as everywhere in planning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.transforms import invert, quat_conjugate, quat_rotate, quat_to_matrix
+
+Floats = NDArray[np.float64]
+
+#: Direction against gravity in the scene frame.
+UP: Final = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A convex body: the points x with n.x <= d for each of its planes (n, d)."""
+
+    planes: Floats
+    """(K, 4) outward unit normal and offset [m]."""
+    corners: Floats
+    """(V, 3) corners [m]; none where the body has no end, as a half-space."""
+
+    def __post_init__(self) -> None:
+        if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
+            raise InputError(f"an obstacle needs planes of shape (K, 4); got {self.planes.shape}")
+
+    @classmethod
+    def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
+        """Everything below the plane n.x = offset; the normal need not have unit length.
+
+        Raises:
+            InputError: the normal is zero or no number.
+        """
+        n = np.asarray(normal, float)
+        length = float(np.linalg.norm(n))
+        if n.shape != (3,) or not np.isfinite(n).all() or not np.isfinite(offset) or length < 1e-9:
+            raise InputError(f"a support's normal must be three finite numbers, not all zero; got {normal}")
+        return cls(np.array([[*(n / length), offset / length]]), np.zeros((0, 3)))
+
+    @classmethod
+    def box(cls, pose: Sequence[float] | Floats, size: Sequence[float] | Floats) -> Obstacle:
+        """A box of full extents `size` (3,) [m] about the origin of `pose` (7,).
+
+        Raises:
+            InputError: an extent is not positive, or a number is none.
+        """
+        pose, half = np.asarray(pose, float), np.asarray(size, float) / 2
+        if half.shape != (3,) or not np.isfinite(half).all() or (half <= 0).any():
+            raise InputError(f"a box needs three extents above 0; got {size}")
+        if pose.shape != (7,) or not np.isfinite(pose).all() or np.linalg.norm(pose[3:]) < 1e-9:
+            raise InputError(f"a box needs a pose of seven numbers, x y z and a quaternion w x y z; got {pose}")
+        R = quat_to_matrix(pose[3:] / np.linalg.norm(pose[3:]))
+        normals = np.concatenate([R.T, -R.T])
+        planes = np.column_stack([normals, normals @ pose[:3] + np.concatenate([half, half])])
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), float).reshape(3, -1).T
+        return cls(planes, pose[:3] + (signs * half) @ R.T)
+
+    def moved(self, pose: Floats) -> Obstacle:
+        """The obstacle carried along by `pose` (7,): its frame's coordinates in the outer frame."""
+        normals = quat_rotate(pose[3:], self.planes[:, :3])
+        planes = np.column_stack([normals, self.planes[:, 3] + normals @ pose[:3]])
+        return Obstacle(planes, quat_rotate(pose[3:], self.corners) + pose[:3])
+
+    def seen_from(self, pose: Floats) -> Obstacle:
+        """The obstacle, given in an outer frame, in the frame that stands at `pose` (7,) in it."""
+        return self.moved(invert(pose))
+
+    def distance(self, points: Floats) -> Floats:
+        """(...) signed distance of points (..., 3): exact inside and over faces, beyond edges a lower bound [m]."""
+        return np.asarray((points @ self.planes[:, :3].T - self.planes[:, 3]).max(axis=-1))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """One scene as a hand that reaches for the object sees it, in the object frame."""
+
+    obstacles: tuple[Obstacle, ...]
+    up: Floats
+    """(3,) unit vector against gravity."""
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """S scenes of one object that have the same supports."""
+
+    supports: tuple[Obstacle, ...]
+    """Tables, boards and walls in the scene frame, z up."""
+    object_pose: Floats
+    """(S, 7) of the object in the scene frame."""
+
+    def placed(self, index: NDArray[np.intp]) -> Placed:
+        """Grasps in these scenes, by the number of the scene (N,)."""
+        return Placed(self.supports, self.object_pose, np.asarray(index, np.intp))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """N grasps, each in one of S scenes that have the same supports."""
+
+    supports: tuple[Obstacle, ...]
+    """Tables, boards and walls in the scene frame, z up."""
+    object_pose: Floats
+    """(S, 7) of the object in the scene frame."""
+    index: NDArray[np.intp]
+    """(N,) scene of each grasp."""
+
+    @cached_property
+    def scenes(self) -> tuple[Surroundings, ...]:
+        """The S scenes, seen from the object."""
+        return tuple(
+            Surroundings(tuple(o.seen_from(pose) for o in self.supports), quat_rotate(quat_conjugate(pose[3:]), UP))
+            for pose in np.asarray(self.object_pose, float)
+        )
+
+    def take(self, rows: NDArray[np.intp] | slice) -> Placed:
+        """Some of the grasps, in the order of `rows`."""
+        return Placed(self.supports, self.object_pose, self.index[rows])

@@ -1,0 +1,78 @@
+"""What a stage knows of the task it does: where to read, where to say how far it is, and whether to stop."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Final
+
+from service.model.errors import TaskCancelled
+from service.store.store import Store
+
+#: Progress told per second at most: enough for a smooth bar, little for Redis.
+_PROGRESS_RATE: Final = 4.0
+
+
+class StopReason(StrEnum):
+    """Why a running task should stop."""
+
+    CANCELLED = "cancelled"
+    LEASE_LOST = "lease lost"
+    SHUTDOWN = "shutdown"
+    TIMEOUT = "timeout"
+
+
+class TaskContext:
+    """One task's surroundings. `progress` and `cancelled` may be called from any thread and are cheap."""
+
+    def __init__(
+        self,
+        store: Store,
+        *,
+        device: str = "cpu",
+        threads: int = 0,
+        tell: Callable[[float, float, str], None] | None = None,
+    ) -> None:
+        self.store = store
+        self.device = device
+        self.threads = threads
+        self._tell = tell
+        self._told = 0.0
+        self._stop = threading.Event()
+        self._reason: StopReason | None = None
+
+    def progress(self, done: float, total: float, message: str) -> None:
+        """Say how far the task is; most calls are dropped so that few are sent."""
+        now = time.monotonic()
+        if self._tell is not None and (now - self._told >= 1.0 / _PROGRESS_RATE or (done >= total > 0)):
+            self._told = now
+            self._tell(done, total, message)
+
+    def part(self, start: float, end: float) -> Callable[[float, float, str], None]:
+        """Progress of a part of the task that goes from share `start` to share `end` of the whole."""
+
+        def progress(done: float, total: float, message: str) -> None:
+            self.progress(start + (end - start) * (done / total if total > 0 else 0.0), 1.0, message)
+
+        return progress
+
+    def cancelled(self) -> bool:
+        """Whether to stop at the next launch."""
+        return self._stop.is_set()
+
+    def check(self) -> None:
+        """Raises TaskCancelled if the task should stop."""
+        if self._stop.is_set():
+            raise TaskCancelled(f"stopped: {self._reason}")
+
+    def stop(self, reason: StopReason) -> None:
+        """Ask the task to stop; the first reason stands."""
+        if self._reason is None:
+            self._reason = reason
+        self._stop.set()
+
+    @property
+    def stop_reason(self) -> StopReason | None:
+        return self._reason

@@ -1,0 +1,151 @@
+"""One cell of the chart: a method at a fidelity on a hand and an object, run several times and judged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.domain import Fidelity
+from worker.grasps import GraspSet, Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners import synthesize
+from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.judge import judge
+from worker.quality.table import measure
+
+Floats = NDArray[np.float64]
+
+#: Contact threshold and Coulomb coefficient of area, epsilon and wrench volume: the paper's.
+THRESHOLD_M: Final = 0.005
+FRICTION: Final = 1.0
+#: A seed no setting was chosen with; repeats take the next ones.
+SEED: Final = 4711
+WARM_SEED: Final = 1
+#: Grasps per object in the paper's table 2: the best by epsilon.
+BEST: Final = 10
+#: Columns kept of every grasp.
+COLUMNS: Final = {
+    "epsilon": "epsilon",
+    "pd_mm": "penetration_depth_mm",
+    "spd_mm": "self_penetration_depth_mm",
+    "ca_cm2": "contact_area_cm2",
+    "iv_cm3": "intersection_volume_cm3",
+    "wrench_volume": "wrench_volume",
+}
+
+
+Run = Callable[[HandModel, ObjectModel, int, int], GraspSet]
+"""From hand, object, grasps and seed to grasps."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is compared: a method with its options at a fidelity."""
+
+    method: str
+    fidelity: str
+    """Its label."""
+    knobs: Fidelity
+    options: Mapping[str, Any] = field(default_factory=dict)
+    batch: int = 32
+    """Grasps per call, and per repeat."""
+    warm: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the call before the first timed one."""
+    threads: int = 0
+    device: str = "cpu"
+    run: Run | None = None
+    """Another way to run it than by method and fidelity: for sweeps of what no fidelity names."""
+
+    def grasps(self, hand: HandModel, obj: ObjectModel, count: int, seed: int, *, warm: bool = False) -> GraspSet:
+        """Make grasps."""
+        if self.run is not None:
+            return self.run(hand, obj, count, seed)
+        return synthesize(
+            hand, obj, count=count, method=self.method, fidelity=self.knobs, seed=seed, threads=self.threads,
+            options={**self.options, **(self.warm if warm else {})}, device=self.device,
+        )  # fmt: skip
+
+
+@dataclass
+class Trial:
+    """Repeats of a setting on a pair, as they come in."""
+
+    setting: Setting
+    hand: HandModel
+    obj: ObjectModel
+    """As the planner sees it."""
+    true: ObjectModel
+    """As metrics and referee see it: the same for all settings."""
+    pieces: ConvexPieces
+    """Of `true`."""
+    seconds: list[float] = field(default_factory=list)
+    processor_seconds: list[float] = field(default_factory=list)
+    """Of all threads: what a call costs whatever else the machine does; without meaning for a GPU."""
+    success: list[NDArray[np.int8]] = field(default_factory=list)
+    columns: list[dict[str, Floats]] = field(default_factory=list)
+    postures: list[Posture] = field(default_factory=list)
+    first_calls: list[float] = field(default_factory=list)
+    """Seconds of calls of `first_grasps` grasps."""
+    first_grasps: int = 1
+
+    def warm_up(self) -> None:
+        """One call that is not counted: kernels, grids and samples are there afterwards."""
+        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, warm=True)
+
+    def repeat(self) -> None:
+        """One timed call, then quality and verdict of its grasps."""
+        batch, threads = self.setting.batch, self.setting.threads
+        began, used = time.perf_counter(), time.process_time()
+        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds))
+        self.seconds.append(time.perf_counter() - began)
+        self.processor_seconds.append(time.process_time() - used)
+        table = measure(
+            self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], threads=threads
+        )  # fmt: skip
+        verdicts = judge(self.hand, self.true, found, pieces=self.pieces, threads=threads)
+        self.success.append(verdicts.success)
+        self.columns.append({key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()})
+        self.postures.append(found.grasp)
+
+    def time_first(self, grasps: int) -> None:
+        """Time a call of few grasps, as somebody would make who waits for the first valid one.
+
+        Where a grasp takes longer than a second the time follows from the batch: threads work on one grasp each.
+        """
+        self.first_grasps = grasps
+        each = self.seconds[-1] / self.setting.batch
+        if each > 1.0:
+            self.first_calls.append(each * grasps)
+            return
+        began = time.perf_counter()
+        self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds))
+        self.first_calls.append(time.perf_counter() - began)
+
+    def values(self, key: str) -> Floats:
+        """A column of all repeats."""
+        return np.concatenate([columns[key] for columns in self.columns])
+
+    def best(self) -> dict[str, float]:
+        """Means over the `BEST` grasps by epsilon, with their simulated displacement: a row of the paper's table 2."""
+        order = np.argsort(-self.values("epsilon"), kind="stable")[:BEST]
+        pose, joints = (
+            np.concatenate([getattr(p, name) for p in self.postures])[order]
+            for name in ("hand_pose", "joint_positions")
+        )
+        slip = simulated_displacement_cm(
+            self.hand, self.true, Posture(pose, joints), pieces=self.pieces, threads=self.setting.threads
+        )
+        names = ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume")
+        row = {name: float(np.nanmean(self.values(name)[order])) for name in names}
+        return row | {"sd_cm": float(slip.mean()), "n": float(len(order))}
+
+
+def _flat(values: NDArray[Any]) -> Floats:
+    return np.asarray(values, float).reshape(len(values))
