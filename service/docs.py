@@ -13,6 +13,7 @@ from typing import Final
 
 from service.pipeline.series import series_table
 from service.settings import Settings
+from service.store.attributes import ATTRIBUTES
 from service.store.shards import SCHEMAS, ShardKind
 
 
@@ -29,6 +30,14 @@ def schema_table(kind: ShardKind) -> str:
     return "\n".join(lines)
 
 
+def attributes_table() -> str:
+    """Markdown table of the root attributes of shards."""
+    lines = ["| attribute | of | type | meaning |", "| --- | --- | --- | --- |"]
+    for name, one in ATTRIBUTES.items():
+        lines.append(f"| `{name}` | {', '.join(one.kinds)} | {one.type} | {one.description} |")
+    return "\n".join(lines)
+
+
 def settings_table() -> str:
     """Markdown table of the environment variables."""
     lines = ["| variable | default | meaning |", "| --- | --- | --- |"]
@@ -39,6 +48,7 @@ def settings_table() -> str:
 
 
 PARTS: Final[dict[str, Callable[[], str]]] = {
+    "attributes": attributes_table,
     "base": lambda: schema_table("base"),
     "scene": lambda: schema_table("scene"),
     "views": lambda: schema_table("views"),

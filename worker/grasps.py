@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Columns = Mapping[str, NDArray[Any]]
+#: Columns of grasps in scenes; there are all of them or none.
+_IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
 
 
 @dataclass
@@ -26,6 +30,12 @@ class Posture:
     def take(self, rows: NDArray[np.intp] | slice) -> Posture:
         """Some of the postures, in the order of `rows`."""
         return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
+
+    @classmethod
+    def from_columns(cls, columns: Columns, name: str = "grasp") -> Posture:
+        """The postures `name` (grasp, pregrasp or squeeze) of a base shard."""
+        pose, joints = (np.asarray(columns[f"{name}/{what}"], float) for what in ("hand_pose", "joint_positions"))
+        return cls(pose, joints)
 
 
 @dataclass
@@ -61,6 +71,31 @@ class GraspSet:
         scene = None if self.scene is None else self.scene[rows]
         coming = None if self.coming is None else np.asarray(self.coming, float)[rows]
         return GraspSet(grasp, pregrasp, squeeze, loss, self.seconds, self.info, approach, coming, scene, lift)
+
+    def to_columns(self) -> dict[str, NDArray[Any]]:
+        """The posture columns of a base shard; the planner's loss is a column of the quality table."""
+        parts = {"grasp": self.grasp, "pregrasp": self.pregrasp, "squeeze": self.squeeze}
+        columns: dict[str, NDArray[Any]] = {f"{name}/hand_pose": part.hand_pose for name, part in parts.items()}
+        columns |= {f"{name}/joint_positions": part.joint_positions for name, part in parts.items()}
+        if self.scene is None or self.approach is None or self.coming is None or self.lift is None:
+            return columns
+        return columns | {
+            "grasp/scene_index": self.scene, "grasp/approach": self.approach,
+            "grasp/approach_joint_positions": self.coming, "grasp/lift": self.lift.hand_pose,
+        }  # fmt: skip
+
+    @classmethod
+    def from_columns(cls, columns: Columns) -> GraspSet:
+        """The grasps of a base shard, from its columns."""
+        grasp, pregrasp, squeeze = (Posture.from_columns(columns, name) for name in ("grasp", "pregrasp", "squeeze"))
+        found = cls(grasp, pregrasp, squeeze, np.asarray(columns["quality/stability_loss"], float))
+        if all(f"grasp/{name}" in columns for name in _IN_SCENES):
+            found.scene = np.asarray(columns["grasp/scene_index"], np.intp)
+            found.approach = np.asarray(columns["grasp/approach"], float)
+            found.coming = np.asarray(columns["grasp/approach_joint_positions"], float)
+            raised = np.asarray(columns["grasp/lift"], float)
+            found.lift = Posture(raised, np.array(found.squeeze.joint_positions))
+        return found
 
 
 def joined(sets: Sequence[GraspSet]) -> GraspSet:

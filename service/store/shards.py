@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from service.model.clock import timestamp
 from service.model.errors import DamagedShard, InputError
 from service.model.version import PACKAGE_VERSION
+from service.store.attributes import Attribute, check_attributes
 from service.store.integrity import check_file
 
 ShardKind = Literal["base", "scene", "views"]
 Arrays = Mapping[str, NDArray[np.generic]]
-Attribute = str | int | float | list[str]
 #: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.
 _DIGEST: Final = "sha256"
 #: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
@@ -278,9 +278,10 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             `joint_names` also goes to the joint datasets.
 
     Raises:
-        InputError: a column is missing, unknown, of the wrong rank, or lengths clash.
+        InputError: a column is missing, unknown, of the wrong rank, or lengths clash; or an attribute is unknown.
     """
     check_columns(kind, arrays)
+    check_attributes(kind, attributes)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
         # Each is written once: HDF5 keeps the bytes of a text that was written over.

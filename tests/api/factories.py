@@ -14,10 +14,11 @@ from service.model.records import AttemptRecord, JobRecord
 from service.model.transforms import pose_to_matrix
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
+from service.store.attributes import Attribute
 from service.store.library import publish_builtins
 from service.store.manifests import ShardManifest, manifest_of, publish_shard
 from service.store.records import put_record
-from service.store.shards import Attribute, check_columns, write_shard
+from service.store.shards import check_columns, write_shard
 
 JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]

@@ -17,6 +17,7 @@ from service.store.shards import Shard, read_shard, write_shard
 from worker.engines.devices import Device
 from worker.files.choice import EveryOption, UnjudgedOption, choose
 from worker.files.of_shard import INHERITED, hand_of_shard, neighbours_of_shard, object_of_shard
+from worker.grasps import Posture
 from worker.rendering.camera_file import SAMPLED, read_cameras
 from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
@@ -124,12 +125,19 @@ def pictures(
     chosen, word = choose(base, unjudged=unjudged, every=every)
     model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
     rows = best(base.arrays, count, chosen)
-    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    shown = Posture.from_columns(base.arrays).take(rows)
     sides = THREE_SIDES if three else THREE_SIDES[:1]
     edge, samples = OF_THREE if three else ALONE
     edge = size or edge
     drawn = grasp_pictures(
-        model, obj, poses, joints, (edge, edge), sides, device=Device(device).resolve(), samples=samples
+        model,
+        obj,
+        shown.hand_pose,
+        shown.joint_positions,
+        (edge, edge),
+        sides,
+        device=Device(device).resolve(),
+        samples=samples,
     )
     title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
     subtitle = f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm"

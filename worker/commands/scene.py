@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.store.shards import Attribute, Shard, read_shard, write_shard
+from service.store.attributes import Attribute
+from service.store.shards import read_shard, write_shard
 from worker.files.of_shard import INHERITED, NEIGHBOUR_FACE_ERROR_M, hand_of_shard, object_of_shard
 from worker.grasps import Posture
 from worker.objects.prepare import object_from_path
@@ -45,7 +46,8 @@ def scene(
     )
     poses = result["scene/object_pose"]
     beside = Neighbours(others, result["scene/neighbour_pose"]) if others else None
-    result |= transfer(model, _posture(base, "grasp"), _posture(base, "pregrasp"), poses, beside)
+    grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
+    result |= transfer(model, grasp, pregrasp, poses, beside)
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
@@ -64,7 +66,3 @@ def scene(
     typer.echo(f"{output}: {scenes} scenes, {valid} of {total} grasps stay clear, {seconds:.1f} s")
     if any(reasons.values()):
         typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
-
-
-def _posture(base: Shard, name: str) -> Posture:
-    return Posture(base.arrays[f"{name}/hand_pose"], base.arrays[f"{name}/joint_positions"])  # type: ignore[arg-type]

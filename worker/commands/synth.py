@@ -19,10 +19,11 @@ from service.model.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import parse_scene
 from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
-from service.store.shards import Attribute, json_attribute, write_shard
+from service.store.attributes import Attribute
+from service.store.shards import json_attribute, write_shard
 from worker.certified import Certified, certified_grasps, joined_columns
 from worker.engines.devices import Device
-from worker.files.columns import postures, verdict_attributes
+from worker.files.base_attributes import base_attributes
 from worker.files.origin import remembered
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -110,7 +111,7 @@ def synth(
             for first in range(0, grasps, BATCH_SIZE)
         ]  # fmt: skip
     seconds = time.perf_counter() - began
-    arrays = joined_columns([{**postures(batch.grasps), **batch.columns} for batch in batches])
+    arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in ("scene/object_pose", "scene/rest_probability") if name in poses}
     attributes = _attributes(model, obj, request, batches, device, seconds)
     if poses:
@@ -178,11 +179,10 @@ def _attributes(
     attributes: dict[str, Attribute] = {
         "hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest,
         "method": request.method, "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
-        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4), "mu": request.friction,
-        "root_link": hand.root_link, "joint_names": list(hand.joint_names), "want": request.want,
-        "tried": sum(batch.tried for batch in batches),
+        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4),
     }  # fmt: skip
-    return attributes | verdict_attributes(request.referee, batches[0].verdict_key)
+    tried = sum(batch.tried for batch in batches)
+    return attributes | base_attributes(hand, request, tried=tried, verdict_key=batches[0].verdict_key)
 
 
 def summary(arrays: Arrays, request: JobOptions, batches: list[Certified], out: Path, seconds: float) -> dict[str, Any]:

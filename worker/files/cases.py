@@ -76,28 +76,15 @@ def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) ->
 def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     shard = read_shard(path, kind="base")
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
-    parts = {
-        name: Posture(
-            np.asarray(shard[f"{name}/hand_pose"], float), np.asarray(shard[f"{name}/joint_positions"], float)
-        )
-        for name in ("grasp", "pregrasp", "squeeze")
-    }
-    _check_joints(path, model, parts["grasp"])
-    loss = np.asarray(shard["quality/stability_loss"], float)
-    placed = placed_of_shard(shard)
-    grasps = GraspSet(
-        parts["grasp"], parts["pregrasp"], parts["squeeze"], loss,
-        approach=np.asarray(shard["grasp/approach"], float) if placed is not None else None,
-        coming=np.asarray(shard["grasp/approach_joint_positions"], float) if placed is not None else None,
-        scene=placed.index if placed is not None else None,
-    )  # fmt: skip
+    grasps = GraspSet.from_columns(shard.arrays)
+    _check_joints(path, model, grasps.grasp)
     said = shard.attributes
     return Case(
         path.name, model, thing, grasps,
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
         judged=said.get("verdict_level", "none") != "none",
-        placed=placed,
+        placed=placed_of_shard(shard),
     )  # fmt: skip
 
 

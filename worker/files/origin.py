@@ -17,8 +17,9 @@ from service.model.domain import AssetKind
 from service.model.errors import GraspdError, NotFoundError
 from service.settings import Settings
 from service.store.assets import builtin_files, builtin_names
+from service.store.attributes import Attribute
 from service.store.library import load_asset_files
-from service.store.shards import Attribute, json_attribute
+from service.store.shards import json_attribute
 from service.store.store import open_store
 from worker.hands.load import files_from_path as hand_files
 from worker.objects.formats import READERS

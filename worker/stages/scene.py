@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from service.model.domain import Stage, TaskMessage
+from service.store.attributes import Attribute
 from service.store.manifests import load_shard
-from service.store.shards import Attribute
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
 from worker.scenes.clearance import count_rejections
@@ -24,10 +24,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     scenes = drop(obj, count=message.request.scenes, seed=batch_seed(message))
     context.check()
     context.progress(0.7, 1.0, "table clearance")
-    grasp, pregrasp = (
-        Posture(np.asarray(base[f"{name}/hand_pose"], float), np.asarray(base[f"{name}/joint_positions"], float))
-        for name in ("grasp", "pregrasp")
-    )
+    grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
     placed = transfer(hand, grasp, pregrasp, scenes["scene/object_pose"])
     attributes: dict[str, Attribute] = {"base_shard": message.inputs[0], "root_link": hand.root_link}
     rejected = count_rejections(np.asarray(placed["grasp/rejection"], np.uint8))

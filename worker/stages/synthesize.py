@@ -6,10 +6,8 @@ import math
 from typing import Any
 
 from service.model.domain import TaskMessage
-from service.store.shards import Attribute
-from worker.certified import Certified, certified_grasps
-from worker.files.columns import postures, verdict_attributes
-from worker.hands.model import HandModel
+from worker.certified import certified_grasps
+from worker.files.base_attributes import base_attributes
 from worker.stages.assets import hand_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output
@@ -34,20 +32,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     )
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     info = {**seconds, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}
-    return Output({**postures(found.grasps), **found.columns}, attributes_of(hand, message, found), info)
-
-
-def attributes_of(hand: HandModel, message: TaskMessage, found: Certified) -> dict[str, Attribute]:
-    """Root attributes of the base shard of a batch."""
-    request = message.request
-    attributes: dict[str, Attribute] = {
-        "joint_names": list(hand.joint_names),
-        "mu": request.friction,
-        "root_link": hand.root_link,
-        "want": request.want,
-        "tried": found.tried,
-    }
-    return attributes | verdict_attributes(request.referee, found.verdict_key)
+    said = base_attributes(hand, message.request, tried=found.tried, verdict_key=found.verdict_key)
+    return Output({**found.grasps.to_columns(), **found.columns}, said, info)
 
 
 def _json(info: dict[str, object]) -> dict[str, object]:

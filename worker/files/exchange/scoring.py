@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from service.model.digests import digest_files, digest_json
 from service.model.domain import AssetKind, JobRequest
 from service.model.errors import InputError
-from service.store.shards import Attribute, json_attribute, write_shard
+from service.store.attributes import Attribute
+from service.store.shards import json_attribute, write_shard
 from worker.certified import scored
-from worker.files.columns import postures, verdict_attributes
+from worker.files.base_attributes import base_attributes
 from worker.files.exchange.imported import Imported, Origin, plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
@@ -54,15 +54,13 @@ def write_scored(
     attributes: dict[str, Attribute] = {
         "hand": found.hand.name, "hand_digest": found.hand.digest,
         "object": name, "object_digest": _digest(mesh), "object_scale": found.scale,
-        "root_link": found.hand.root_link, "joint_names": list(found.hand.joint_names),
         "method": f"imported:{origin.format}", "source": origin.source, "licence": origin.licence,
-        "fidelity": json_attribute({"face_error_m": 0.0}), "mu": friction, "tried": made.tried, "want": "raw",
+        "fidelity": json_attribute({"face_error_m": 0.0}),
         "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
         "batch": ordinal,
     }  # fmt: skip
-    attributes |= verdict_attributes(referee, made.verdict_key)
-    columns: dict[str, Any] = {**postures(made.grasps), **made.columns}
-    path.write_bytes(write_shard("base", columns, attributes))
+    attributes |= base_attributes(found.hand, request, tried=made.tried, verdict_key=made.verdict_key)
+    path.write_bytes(write_shard("base", {**made.grasps.to_columns(), **made.columns}, attributes))
     return path
 
 

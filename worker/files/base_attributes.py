@@ -1,0 +1,30 @@
+"""What a base shard says at its root of the grasps in it; `service.store.attributes` has the schema."""
+
+from __future__ import annotations
+
+from service.model.domain import JobOptions
+from service.store.attributes import Attribute
+from worker.hands.model import HandModel
+
+
+def base_attributes(
+    hand: HandModel, request: JobOptions, *, tried: int, verdict_key: str | None
+) -> dict[str, Attribute]:
+    """The hand's joints, what was asked for, how many grasps were tried, and who judged them.
+
+    Args:
+        hand: the hand.
+        request: friction, want and referee.
+        tried: grasps tried until the last one kept.
+        verdict_key: digest of the terms of the verdicts; None: nobody judged.
+    """
+    said: dict[str, Attribute] = {
+        "joint_names": list(hand.joint_names),
+        "mu": request.friction,
+        "root_link": hand.root_link,
+        "want": request.want,
+        "tried": tried,
+    }
+    if verdict_key is None:
+        return said | {"verdict_level": "none"}
+    return said | {"verdict_level": request.referee, "verdict_key": verdict_key}
