@@ -82,9 +82,9 @@ def radius_and_volume(points: Floats) -> tuple[float, float] | None:
     with wp.ScopedDevice("cpu"):
         given = [
             wp.array(points, dtype=kernels.vec6), wp.array(order, dtype=wp.int32), space.marks,
-            _TABLE - 1, space.stamps(len(order)), space.hull,
+            _TABLE - 1, space.stamps(len(order)),
         ]  # fmt: skip
-        wp.launch(kernels.grow_hull, 1, inputs=given, outputs=[space.result], device="cpu")
+        wp.launch(kernels.grow_hull, 1, inputs=given, outputs=[space.hull, space.result], device="cpu")
     least, volume, sound = space.result.numpy()
     if not (sound and np.isfinite(least) and np.isfinite(volume)):
         return None

@@ -172,8 +172,8 @@ class Probe:
         with wp.ScopedDevice("cpu"):
             own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)
-            inputs = [*self._posed_pieces(bodies), self._body, own, depth]
-            wp.launch(kernels.self_distance, points.shape[:2], inputs=inputs, device="cpu")
+            inputs = [*self._posed_pieces(bodies), self._body, own]
+            wp.launch(kernels.self_distance, points.shape[:2], inputs=inputs, outputs=[depth], device="cpu")
         return depth.numpy().astype(float)
 
     def _piece_distances(self, bodies: Floats) -> Floats:

@@ -89,19 +89,22 @@ def surroundings(light: Light, direction: wp.vec3f, roughness: wp.float32):
 
 @wp.kernel(enable_backward=False)
 def accumulate(
+    # Model:
+    shape_pose_in: wp.array[wp.transformf],
+    material_in: wp.array[Material],
+    # In:
     rays_in: wp.array4d[wp.vec3f],
     camera_in: wp.array[wp.transformf],
     irradiance_in: wp.array3d[wp.vec3f],
     depth_in: wp.array3d[wp.float32],
     normal_in: wp.array3d[wp.vec3f],
     shape_in: wp.array3d[wp.uint32],
-    shape_pose_in: wp.array[wp.transformf],
-    material_in: wp.array[Material],
     light_in: wp.array[Light],
     toward_light_in: wp.vec3f,
     key_weight: wp.float32,
     sky_weight: wp.float32,
     first_pass: wp.bool,
+    # Out:
     seen_out: wp.array3d[wp.uint32],
     albedo_out: wp.array3d[wp.vec3f],
     sum_out: wp.array3d[wp.vec3f],
@@ -166,7 +169,13 @@ def encode(c: wp.float32):
 
 
 @wp.kernel(enable_backward=False)
-def develop(sum_in: wp.array3d[wp.vec3f], scale: wp.float32, rgb_out: wp.array4d[wp.uint8]):
+def develop(
+    # In:
+    sum_in: wp.array3d[wp.vec3f],
+    scale: wp.float32,
+    # Out:
+    rgb_out: wp.array4d[wp.uint8],
+):
     view, row, column = wp.tid()
     c = sum_in[view, row, column] * scale
     for k in range(3):

@@ -197,9 +197,9 @@ class _Exposure:
                 kernels.accumulate,
                 dim=self._total.shape,
                 inputs=[
-                    rays, self._cameras, self._irradiance, self._depth, self._normal, self._shape,
-                    stage._model.shape_transform, stage._materials, self._lights, wp.vec3f(*one.toward),
-                    one.lamp_weight, one.sky_weight, first,
+                    stage._model.shape_transform, stage._materials,
+                    rays, self._cameras, self._irradiance, self._depth, self._normal, self._shape, self._lights,
+                    wp.vec3f(*one.toward), one.lamp_weight, one.sky_weight, first,
                 ],
                 outputs=[self._seen, self._albedo, self._total],
                 device=stage.device,

@@ -119,32 +119,32 @@ class Projection:
         r.count.zero_()
         wp.launch(
             kernels.point_residuals, (B, sim.count),
-            [sim.active, o.near, o.target, o.hold, o.hold_target, o.hold_weight, sim.contacts, sim.contact_body,
-             sim.contact_point, sim.contact_normal, sim.contact_distance, r],
-            device=sim.device,
+            inputs=[sim.active, sim.contacts, sim.contact_body, sim.contact_point, sim.contact_normal,
+                    sim.contact_distance, o.near, o.target, o.hold, o.hold_target, o.hold_weight],
+            outputs=[r], device=sim.device,
         )  # fmt: skip
         wp.launch(
             kernels.sample_residuals, (B, len(sim.hand.model.pieces)),
-            [sim.active, o.sample_near, o.target, sim.hand.pieces, sim.obj.bvh.id, sim.obj.samples, sim.body_p,
-             sim.body_q, r],
-            device=sim.device,
+            inputs=[sim.hand.pieces, sim.obj.bvh.id, sim.obj.samples, sim.active, sim.body_p, sim.body_q,
+                    o.sample_near, o.target],
+            outputs=[r], device=sim.device,
         )  # fmt: skip
         wp.launch(
             kernels.self_residuals, (B, len(sim.hand.model.pieces)),
-            [sim.active, o.self_near, o.self_target, sim.hand.pieces, sim.body_points, sim.body_p, sim.body_q, r],
-            device=sim.device,
+            inputs=[sim.hand.pieces, sim.body_points, sim.active, sim.body_p, sim.body_q, o.self_near, o.self_target],
+            outputs=[r], device=sim.device,
         )  # fmt: skip
         if sim.obstacles is not None:
             wp.launch(
                 obstacles.residuals, (B, sim.obstacles.count),
-                [sim.obstacles.features, sim.obstacles.solids, sim.active, sim.scene, o.obstacle_near,
-                 o.obstacle_target, sim.body_p, sim.body_q, r],
-                device=sim.device,
+                inputs=[sim.obstacles.features, sim.obstacles.solids, sim.active, sim.scene, sim.body_p, sim.body_q,
+                        o.obstacle_near, o.obstacle_target],
+                outputs=[r], device=sim.device,
             )  # fmt: skip
         wp.launch(
             kernels.normal_equations, B,
-            [sim.hand.tree, sim.active, sim.pivot, sim.body_p, sim.axis, r, self.row, self.matrix, self.vector],
-            device=sim.device,
+            inputs=[sim.hand.tree, sim.active, sim.pivot, sim.body_p, sim.axis, r],
+            outputs=[self.row, self.matrix, self.vector], device=sim.device,
         )  # fmt: skip
 
     def _moved(self, state: HandState, step: Floats) -> HandState:

@@ -18,6 +18,7 @@ from worker.hands.model import SurfacePoints
 from worker.simulation.device import DeviceHand, DeviceObject, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact, kinematics, optimizers, penalties, pieces, surface
 from worker.simulation.kernels import obstacles as obstacle_kernels
+from worker.simulation.launches import Launches
 from worker.simulation.obstacles import DeviceObstacles
 
 Floats = NDArray[np.float64]
@@ -140,8 +141,7 @@ class Simulation:
         """What the hands must stay clear of; None: nothing."""
         self.room = 0.0
         """Distance to keep besides each feature's margin [m]."""
-        self._graph: Any = None
-        self._commands: list[tuple[str, Any]] = []
+        self.launches = Launches(self.device)
         with wp.ScopedDevice(self.device):
             self._upload_points(points, self_points)
             self._allocate()
@@ -275,31 +275,30 @@ class Simulation:
             self.object_weight = wp.array(schedule.object_penetration, dtype=wp.float32)
             self.self_weight = wp.array(schedule.self_penetration, dtype=wp.float32)
             self.rates = wp.array(schedule.rates, dtype=wp.float32)
-        self._commands = []
-        self._graph = None
-
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
-        command = wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
-        self._commands.append((kernel.key.rpartition(".")[2], command))
+        self.launches = Launches(self.device)
 
     def commands(self) -> list[tuple[str, Any]]:
         """Name and launch of each kernel of what was recorded, in order."""
-        return list(self._commands)
+        return self.launches.named()
 
     def _record_kinematics(self) -> None:
         B = self.capacity
-        self._launch(
+        self.launches.add(
             kinematics.forward, B,
-            [self.hand.tree, self.active, self.pivot, self.rotation, self.q, self.body_p, self.body_q, self.axis,
-             self.force, self.torque, self.contacts, self.point_depth, self.object_depth, self.self_depth],
+            inputs=[self.hand.tree, self.active, self.pivot, self.rotation, self.q],
+            outputs=[self.body_p, self.body_q, self.axis, self.force, self.torque, self.contacts, self.point_depth,
+                     self.object_depth, self.self_depth],
         )  # fmt: skip
-        self._launch(
-            surface.gather, (B, self.count),
-            [self.obj.surface, self.active, self.iteration, self.dilation, self.dilation_scale, self.options.band,
-             self.options.exact_below,
-             self.point_body, self.point_position, self.point_weight, self.body_p, self.body_q, self.contacts,
-             self.contact_body, self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
-             self.contact_gradient],
+        self._record_gather()
+
+    def _record_gather(self) -> None:
+        self.launches.add(
+            surface.gather, (self.capacity, self.count),
+            inputs=[self.obj.surface, self.options.band, self.options.exact_below, self.point_body,
+                    self.point_position, self.point_weight, self.active, self.iteration, self.dilation,
+                    self.dilation_scale, self.body_p, self.body_q],
+            outputs=[self.contacts, self.contact_body, self.contact_point, self.contact_normal,
+                     self.contact_distance, self.contact_weight, self.contact_gradient],
         )  # fmt: skip
 
     def _record_contact(self) -> None:
@@ -309,58 +308,61 @@ class Simulation:
             self.contacts,
             self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
         ]  # fmt: skip
-        if self.states is not None:
-            inputs.append(self.states)
+        scratch = [] if self.states is None else [self.states]
         if o.simulate:
-            self._launch(
+            self.launches.add(
                 _SOLVERS[o.contact_solver], (self.capacity, o.velocities),
-                [*inputs, self.loss, self.end, self.contact_gradient],
+                inputs=inputs, outputs=[*scratch, self.loss, self.end, self.contact_gradient],
             )  # fmt: skip
         else:
-            self._launch(
+            self.launches.add(
                 penalties.attract, (self.capacity, self.count),
-                [self.active, o.leak, o.leak_length, self.contacts, self.contact_distance, self.contact_weight,
-                 self.contact_gradient],
+                inputs=[o.leak, o.leak_length, self.active, self.contacts, self.contact_distance, self.contact_weight],
+                outputs=[self.contact_gradient],
             )  # fmt: skip
 
     def _record_penalties(self) -> None:
         B, o = self.capacity, self.options
-        self._launch(
+        pose, wrench = [self.body_p, self.body_q], [self.force, self.torque]
+        self.launches.add(
             pieces.object_in_pieces, (B, len(self.hand.model.pieces)),
-            [self.hand.pieces, self.obj.bvh.id, self.obj.samples, REFERENCE_SAMPLES / len(self.obj.samples),
-             self.active, self.iteration, self.object_weight, self.body_p, self.body_q, self.force, self.torque,
-             self.object_depth],
+            inputs=[self.hand.pieces, self.obj.bvh.id, self.obj.samples, REFERENCE_SAMPLES / len(self.obj.samples),
+                    self.active, self.iteration, self.object_weight, *pose],
+            outputs=[*wrench, self.object_depth],
         )  # fmt: skip
-        self._launch(
+        self.launches.add(
             pieces.pieces_in_pieces, (B, len(self.hand.model.pieces)),
-            [self.hand.pieces, self.body_points, self.self_scale, o.self_margin, self.active, self.iteration,
-             self.self_weight, self.body_p, self.body_q, self.force, self.torque, self.self_depth],
+            inputs=[self.hand.pieces, self.body_points, self.self_scale, o.self_margin, self.active, self.iteration,
+                    self.self_weight, *pose],
+            outputs=[*wrench, self.self_depth],
         )  # fmt: skip
-        self._launch(
+        self.launches.add(
             penalties.points_to_bodies, (B, self.count),
-            [self.active, self.iteration, self.penetration_weight, 0.0, self.contacts, self.contact_body,
-             self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
-             self.contact_gradient, self.force, self.torque, self.point_depth],
+            inputs=[0.0, self.active, self.iteration, self.penetration_weight, self.contacts, self.contact_body,
+                    self.contact_point, self.contact_normal, self.contact_distance, self.contact_weight,
+                    self.contact_gradient],
+            outputs=[*wrench, self.point_depth],
         )  # fmt: skip
-
         if self.obstacles is not None:
-            self._launch(obstacle_kernels.clear, B, [self.active, self.obstacle_depth])
-            self._launch(
+            self.launches.add(obstacle_kernels.clear, B, inputs=[self.active], outputs=[self.obstacle_depth])
+            self.launches.add(
                 obstacle_kernels.penalty, (B, self.obstacles.count),
-                [self.obstacles.features, self.obstacles.solids, self.active, self.scene, self.iteration,
-                 self.penetration_weight, self.room, self.body_p, self.body_q, self.force, self.torque,
-                 self.obstacle_depth],
+                inputs=[self.obstacles.features, self.obstacles.solids, self.active, self.scene, self.iteration,
+                        self.penetration_weight, *pose, self.room],
+                outputs=[*wrench, self.obstacle_depth],
             )  # fmt: skip
 
     def _record_gradient(self) -> None:
         B, o = self.capacity, self.options
-        self._launch(
+        self.launches.add(
             kinematics.backward, B,
-            [self.hand.tree, self.active, self.pivot, self.body_p, self.axis, self.force, self.torque, self.gradient],
+            inputs=[self.hand.tree, self.active, self.pivot, self.body_p, self.axis],
+            outputs=[self.force, self.torque, self.gradient],
         )  # fmt: skip
-        self._launch(
+        self.launches.add(
             penalties.joints, (B, self.dofs),
-            [self.active, self.q, self.hand.lower, self.hand.upper, o.range_weight, o.limit_weight, self.gradient],
+            inputs=[self.hand.lower, self.hand.upper, o.range_weight, o.limit_weight, self.active, self.q],
+            outputs=[self.gradient],
         )  # fmt: skip
 
     def record_iteration(self, optimizer: str, *, betas: tuple[float, float] = (0.9, 0.99), patience: int = 0) -> None:
@@ -373,47 +375,34 @@ class Simulation:
         """
         if optimizer not in OPTIMIZERS:
             raise InputError(f"unknown optimizer {optimizer!r}; choose one of {', '.join(OPTIMIZERS)}")
-        self._commands, self._graph = [], None
+        self.launches = Launches(self.device)
         self._record_kinematics()
         self._record_contact()
         self._record_penalties()
         self._record_gradient()
-        limits = [self.hand.lower, self.hand.upper]
+        inputs = [self.hand.lower, self.hand.upper, self.active, self.iteration, self.rates, self.gradient]
         state = [self.pivot, self.rotation, self.q]
         if optimizer == "adam":
-            inputs = [self.active, self.iteration, self.rates, *betas, *limits, self.gradient]
-            self._launch(optimizers.adam, self.capacity, [*inputs, self.first, self.second, *state])
+            self.launches.add(
+                optimizers.adam, self.capacity, inputs=[*inputs, *betas], outputs=[self.first, self.second, *state]
+            )
         else:
             clamp = int(self.options.limit_weight == 0.0)
-            inputs = [self.active, self.iteration, self.rates, clamp, *limits, self.gradient]
-            self._launch(optimizers.gradient_descent, self.capacity, [*inputs, *state])
+            self.launches.add(optimizers.gradient_descent, self.capacity, inputs=[*inputs, clamp], outputs=state)
         if patience:
-            depths = [self.point_depth, self.object_depth, self.self_depth]
-            self._launch(
+            self.launches.add(
                 optimizers.converge, self.capacity,
-                [patience, self.loss, *depths, self.best, self.waited, self.active],
+                inputs=[self.loss, self.point_depth, self.object_depth, self.self_depth, patience],
+                outputs=[self.best, self.waited, self.active],
             )  # fmt: skip
-        self._launch(optimizers.advance, 1, [self.iteration])
+        self.launches.add(optimizers.advance, 1, inputs=[], outputs=[self.iteration])
 
     def record_placement(self) -> None:
         """Fix the launches that tell contacts and penetration depths only."""
-        self._commands, self._graph = [], None
+        self.launches = Launches(self.device)
         self._record_kinematics()
         self._record_penalties()
 
     def run(self, iterations: int = 1) -> None:
         """Launch what was recorded, `iterations` times, without waiting for the device."""
-        if wp.get_device(self.device).is_cuda and iterations > 2:
-            if self._graph is None:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    self._launch_all()
-                self._graph = capture.graph
-            for _ in range(iterations):
-                wp.capture_launch(self._graph)
-            return
-        for _ in range(iterations):
-            self._launch_all()
-
-    def _launch_all(self) -> None:
-        for _, command in self._commands:
-            command.launch()
+        self.launches.run(iterations)

@@ -29,7 +29,7 @@ def evaluated(found: Descent, pivot: tuple[float, float, float], q: tuple[float,
     """The five energies of a hand; its gradient is in `found.proposal.gradient`."""
     found.proposal.set_state(HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])))
     found.new_terms.zero_()
-    for launch in found.launches[1:-2]:
+    for _, launch in found.launches.named()[1:-2]:
         launch.launch()
     return found.new_terms.numpy()[0].astype(float)
 
@@ -93,7 +93,7 @@ def probed(iteration: np.ndarray, rise: np.ndarray, uniform: np.ndarray) -> tupl
     given = [wp.array(iteration, dtype=wp.int32, device="cpu")]
     given += [wp.array(values, dtype=wp.float32, device="cpu") for values in (rise, uniform)]
     found = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.float32, wp.int32)]
-    wp.launch(kernels.probe, n, inputs=[*given, *found], device="cpu")
+    wp.launch(kernels.probe, n, inputs=given, outputs=found, device="cpu")
     return tuple(array.numpy() for array in found)
 
 

@@ -39,7 +39,7 @@ def probed(
     found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
     given = wp.array(points, dtype=wp.vec3, device="cpu")
     wp.launch(
-        kernels.probe, n, inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity), *found],
+        kernels.probe, n, inputs=[physics_of(SPHERE.gyration_radius), grid, given, wp.vec3(*velocity)], outputs=found,
         device="cpu",
     )  # fmt: skip
     return tuple(f.numpy() for f in found)
@@ -110,9 +110,10 @@ def settled(pull: float) -> tuple[np.ndarray, np.ndarray]:
     """Relaxed forces (N, 3, 3) under a constant pull of the task on x, and the contact forces (N, 3, 3)."""
     batch = touching_batch()
     batch.pull.assign([[kernels.vec6(pull, 0, 0, 0, 0, 0)] * 3])
-    batch.launches[0].launch()
+    launches = dict(batch.launches.named())
+    launches["forward"].launch()
     for _ in range(800):
-        batch.launches[2].launch()
+        launches["relax"].launch()
     s = batch.simulation
     body, place = s.point_body.numpy(), s.body_p.numpy()[0]
     points = place[body] + s.point_position.numpy()

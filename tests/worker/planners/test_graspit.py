@@ -43,7 +43,7 @@ def test_the_kernels_schedule_is_the_written_one() -> None:
     step, uniform, rise = np.array([3e4, 5e4, 7e4]), np.array([0.1, 0.6, 0.9]), np.array([-1.0, 2.0, 30.0])
     given = [wp.array(values, dtype=wp.float32, device="cpu") for values in (step, uniform, rise)]
     found = [wp.zeros(3, dtype=wp.float32, device="cpu") for _ in range(3)]
-    wp.launch(kernels.probe_schedule, 3, inputs=[*given, *found], device="cpu")
+    wp.launch(kernels.probe_schedule, 3, inputs=given, outputs=found, device="cpu")
     t = temperature(step)
     for value, expected in zip(found, (t, jump_share(uniform, t), acceptance(rise, t)), strict=True):
         np.testing.assert_allclose(value.numpy(), expected, rtol=2e-4)
@@ -62,7 +62,7 @@ def palm_only(gap: float, turn: float) -> float:
     poses = [wp.zeros((1, 3), dtype=kind, device="cpu") for kind in (wp.vec3, wp.quat)]
     legal, energy = wp.zeros(1, dtype=wp.int32, device="cpu"), wp.zeros(1, dtype=wp.float32, device="cpu")
     given = wp.array([state], dtype=kernels.vec8, device="cpu")
-    wp.launch(kernels.evaluate, 1, inputs=[problem, given, *poses, legal, energy], device="cpu")
+    wp.launch(kernels.evaluate, 1, inputs=[problem, given], outputs=[*poses, legal, energy], device="cpu")
     return float(energy.numpy()[0])
 
 

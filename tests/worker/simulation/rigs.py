@@ -12,6 +12,7 @@ from worker.objects.prepare import build
 from worker.objects.repair import Repaired
 from worker.simulation import kernels
 from worker.simulation.device import DeviceHand, DeviceObject
+from worker.simulation.launches import Launches
 from worker.simulation.sampling import object_samples
 from worker.simulation.simulation import LossOptions, Schedule, Simulation
 
@@ -46,7 +47,7 @@ def rig(
 
 def evaluate(simulation: Simulation) -> None:
     """Loss and gradient of the state, without a step."""
-    simulation._commands, simulation._graph = [], None
+    simulation.launches = Launches(simulation.device)
     simulation._record_kinematics()
     simulation._record_contact()
     simulation._record_penalties()

@@ -59,9 +59,10 @@ def run(
             wp.array(contacts.points[None], dtype=wp.vec3), wp.array(contacts.normals[None], dtype=wp.vec3),
             wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
         ]  # fmt: skip
+        outputs = [loss, end, gradient]
         if kernel is not contact.direct:
-            inputs.append(wp.zeros((1, m, max(n, passes)), dtype=contact.vec6))
-        wp.launch(kernel, dim=(1, m), inputs=[*inputs, loss, end, gradient])
+            outputs.insert(0, wp.zeros((1, m, max(n, passes)), dtype=contact.vec6))
+        wp.launch(kernel, dim=(1, m), inputs=inputs, outputs=outputs)
         return end.numpy()[0].astype(float), loss.numpy()[0].astype(float), gradient.numpy()[0].astype(float)
 
 

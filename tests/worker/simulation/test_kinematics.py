@@ -137,8 +137,8 @@ def test_the_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> 
     simulation.torque.assign(np.cross(points, force)[None].astype(np.float32))
     wp.launch(
         kinematics.backward, 1,
-        [simulation.hand.tree, simulation.active, simulation.pivot, simulation.body_p, simulation.axis,
-         simulation.force, simulation.torque, simulation.gradient],
+        inputs=[simulation.hand.tree, simulation.active, simulation.pivot, simulation.body_p, simulation.axis],
+        outputs=[simulation.force, simulation.torque, simulation.gradient],
         device="cpu",
     )  # fmt: skip
     # Sums of up to 23 float32 products of size 1.

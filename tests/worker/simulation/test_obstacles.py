@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.model.transforms import quat_rotate
-from tests.worker.simulation.rigs import ball, rig, still
+from tests.worker.simulation.rigs import ball, evaluate, rig, still
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -71,8 +71,7 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
     schedule.penetration[:] = 1.0
     simulation.set_schedule(schedule)
     simulation.set_state(state)
-    simulation.record_evaluation()
-    simulation.run()
+    evaluate(simulation)
     assert simulation.point_depth.numpy()[0] == 0.0, "the object pushes nothing here"
     found = simulation.gradient.numpy()[0]
     expected = differences(energy, state, len(found))

@@ -29,7 +29,7 @@ def distances(hand: HandModel, index: int, points: np.ndarray) -> np.ndarray:
     device = DeviceHand.create(hand, "cpu")
     with wp.ScopedDevice("cpu"):
         out = wp.zeros(len(points), dtype=wp.vec4)
-        wp.launch(ask, len(points), [device.pieces, index, wp.array(points, dtype=wp.vec3), out])
+        wp.launch(ask, len(points), inputs=[device.pieces, index, wp.array(points, dtype=wp.vec3)], outputs=[out])
         return out.numpy().astype(float)
 
 

@@ -26,7 +26,7 @@ def probe(
     with wp.ScopedDevice("cpu"):
         distance, normal = wp.zeros(len(points)), wp.zeros(len(points), dtype=wp.vec3)
         at = wp.array(points - obj.centre_of_mass, dtype=wp.vec3)
-        wp.launch(surface.probe, len(points), [device.surface, at, 0.2, exact_below], outputs=[distance, normal])
+        wp.launch(surface.probe, len(points), inputs=[device.surface, at, 0.2, exact_below], outputs=[distance, normal])
         return distance.numpy().astype(float), normal.numpy().astype(float)
 
 

@@ -115,7 +115,8 @@ class Closer:
             self._measure()
             wp.launch(
                 kernels.advance, self.capacity,
-                inputs=[standoff, SHARE, along, active, near, self.simulation.pivot], device=self.simulation.device,
+                inputs=[near, along, standoff, SHARE], outputs=[active, self.simulation.pivot],
+                device=self.simulation.device,
             )  # fmt: skip
             if not active.numpy().any():
                 break
@@ -131,8 +132,8 @@ class Closer:
             self._measure(fingers=True)
             wp.launch(
                 kernels.close, self.capacity,
-                inputs=[self.closing, TOUCH_M, SHARE, LARGEST, simulation.active, self.near, self.pairs, self.stopped,
-                        simulation.q],
+                inputs=[self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST],
+                outputs=[simulation.active, self.stopped, simulation.q],
                 device=simulation.device,
             )  # fmt: skip
             if not simulation.active.numpy().any():
@@ -149,26 +150,27 @@ class Closer:
         s, obj, device = self.simulation, self.pair.fine.obj, self.simulation.device
         wp.launch(
             kinematics.forward, self.capacity,
-            inputs=[s.hand.tree, s.active, s.pivot, s.rotation, s.q, s.body_p, s.body_q, s.axis, s.force, s.torque,
-                    s.contacts, s.point_depth, s.object_depth, s.self_depth],
+            inputs=[s.hand.tree, s.active, s.pivot, s.rotation, s.q],
+            outputs=[s.body_p, s.body_q, s.axis, s.force, s.torque, s.contacts, s.point_depth, s.object_depth,
+                     s.self_depth],
             device=device,
         )  # fmt: skip
         pose = [s.body_p, s.body_q]
-        wp.launch(kernels.clear, self.near.shape, inputs=[self.near, self.pairs, REACH_M], device=device)
+        wp.launch(kernels.clear, self.near.shape, inputs=[REACH_M], outputs=[self.near, self.pairs], device=device)
         wp.launch(
             kernels.points_to_object, (self.capacity, s.count),
-            inputs=[obj.surface, REACH_M, s.options.exact_below, s.active, s.point_body, s.point_position, *pose,
-                    self.near],
-            device=device,
+            inputs=[obj.surface, REACH_M, s.options.exact_below, s.point_body, s.point_position, s.active, *pose],
+            outputs=[self.near], device=device,
         )  # fmt: skip
         shape = (self.capacity, len(self.hand.pieces))
         wp.launch(
             kernels.object_to_pieces, shape,
-            inputs=[self.pair.hand.pieces, obj.bvh.id, obj.samples, MARGIN_M, s.active, *pose, self.near],
-            device=device,
+            inputs=[self.pair.hand.pieces, obj.bvh.id, obj.samples, s.active, *pose, MARGIN_M],
+            outputs=[self.near], device=device,
         )  # fmt: skip
         if fingers:
             wp.launch(
                 kernels.bodies_to_pieces, shape,
-                inputs=[self.pair.hand.pieces, s.body_points, MARGIN_M, s.active, *pose, self.pairs], device=device,
+                inputs=[self.pair.hand.pieces, s.body_points, s.active, *pose, MARGIN_M], outputs=[self.pairs],
+                device=device,
             )  # fmt: skip

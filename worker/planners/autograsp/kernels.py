@@ -29,7 +29,13 @@ class Closing:
 
 
 @wp.kernel
-def clear(near_out: wp.array2d(dtype=wp.float32), pair_out: wp.array3d(dtype=wp.float32), reach_in: wp.float32):
+def clear(
+    # In:
+    reach_in: wp.float32,
+    # Data out:
+    near_out: wp.array2d(dtype=wp.float32),
+    pair_out: wp.array3d(dtype=wp.float32),
+):
     """Nothing is nearer than `reach`. Launch over (B, L)."""
     b, a = wp.tid()
     near_out[b, a] = reach_in
@@ -39,14 +45,17 @@ def clear(near_out: wp.array2d(dtype=wp.float32), pair_out: wp.array3d(dtype=wp.
 
 @wp.kernel
 def points_to_object(
+    # Model:
     surface_in: Surface,
     reach_in: wp.float32,
     exact_in: wp.float32,
-    active_in: wp.array(dtype=wp.int32),
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
     """Least distance of each body's points from the object. Launch over (B, N)."""
@@ -60,13 +69,17 @@ def points_to_object(
 
 @wp.kernel
 def object_to_pieces(
+    # Model:
     pieces_in: Pieces,
     bvh_in: wp.uint64,
     sample_in: wp.array(dtype=wp.vec3),
-    margin_in: wp.float32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    margin_in: wp.float32,
+    # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
     """The same asked from the object's samples, for edges between hand points; farther than `margin` is left out.
@@ -91,12 +104,16 @@ def object_to_pieces(
 
 @wp.kernel
 def bodies_to_pieces(
+    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
-    margin_in: wp.float32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    margin_in: wp.float32,
+    # Data out:
     pair_inout: wp.array3d(dtype=wp.float32),
 ):
     """Least distance of each body's points from pieces of bodies that must stay clear of it. Launch over (B, P)."""
@@ -132,13 +149,17 @@ def nearest_of(
 
 @wp.kernel
 def close(
+    # Model:
     closing_in: Closing,
+    # Data in:
+    near_in: wp.array2d(dtype=wp.float32),
+    pair_in: wp.array3d(dtype=wp.float32),
+    # In:
     touch_in: wp.float32,
     share_in: wp.float32,
     largest_in: wp.float32,
+    # Data out:
     active_inout: wp.array(dtype=wp.int32),
-    near_in: wp.array2d(dtype=wp.float32),
-    pair_in: wp.array3d(dtype=wp.float32),
     stopped_inout: wp.array2d(dtype=wp.int32),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
@@ -184,11 +205,14 @@ def close(
 
 @wp.kernel
 def advance(
+    # Data in:
+    near_in: wp.array2d(dtype=wp.float32),
+    # In:
+    direction_in: wp.array(dtype=wp.vec3),
     standoff_in: wp.float32,
     share_in: wp.float32,
-    direction_in: wp.array(dtype=wp.vec3),
+    # Data out:
     active_inout: wp.array(dtype=wp.int32),
-    near_in: wp.array2d(dtype=wp.float32),
     pivot_inout: wp.array(dtype=wp.vec3),
 ):
     """Move the hand along its approach until its nearest body is `standoff` from the object. Launch over B."""

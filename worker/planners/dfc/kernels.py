@@ -52,15 +52,18 @@ def temperature(iteration: wp.int32):
 
 @wp.kernel
 def propose(
-    iteration_in: wp.array(dtype=wp.int32),
+    # Model:
     candidates_in: wp.int32,
-    rng_inout: wp.array(dtype=wp.uint32),
+    # Data in:
+    iteration_in: wp.array(dtype=wp.int32),
     gradient_in: wp.array2d(dtype=wp.float32),
-    moment_inout: wp.array2d(dtype=wp.float32),
     pivot_in: wp.array(dtype=wp.vec3),
     rotation_in: wp.array(dtype=wp.quat),
     q_in: wp.array2d(dtype=wp.float32),
     contact_in: wp.array2d(dtype=wp.int32),
+    # Data out:
+    rng_inout: wp.array(dtype=wp.uint32),
+    moment_inout: wp.array2d(dtype=wp.float32),
     pivot_out: wp.array(dtype=wp.vec3),
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
@@ -107,12 +110,15 @@ def propose(
 
 @wp.kernel
 def force_closure(
+    # Model:
     surface_in: Surface,
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
+    # Data in:
     contact_in: wp.array2d(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     energy_out: wp.array2d(dtype=wp.float32),
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
@@ -143,11 +149,14 @@ def force_closure(
 
 @wp.kernel
 def penetration(
+    # Model:
     pieces_in: Pieces,
     bvh_in: wp.uint64,
     sample_in: wp.array(dtype=wp.vec3),
+    # Data in:
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     energy_inout: wp.array2d(dtype=wp.float32),
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
@@ -183,12 +192,15 @@ def penetration(
 
 @wp.kernel
 def self_penetration(
+    # Model:
     first_in: wp.array(dtype=wp.int32),
     second_in: wp.array(dtype=wp.int32),
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
+    # Data in:
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     energy_inout: wp.array2d(dtype=wp.float32),
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
@@ -211,9 +223,15 @@ def self_penetration(
 
 @wp.kernel
 def limits(
-    q_in: wp.array2d(dtype=wp.float32), lower_in: wp.array(dtype=wp.float32), upper_in: wp.array(dtype=wp.float32),
-    energy_out: wp.array2d(dtype=wp.float32), gradient_inout: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+    # Model:
+    lower_in: wp.array(dtype=wp.float32),
+    upper_in: wp.array(dtype=wp.float32),
+    # Data in:
+    q_in: wp.array2d(dtype=wp.float32),
+    # Data out:
+    energy_out: wp.array2d(dtype=wp.float32),
+    gradient_inout: wp.array2d(dtype=wp.float32),
+):
     """E_joints = sum of violations of the limits, column 4. Launch over B."""
     b = wp.tid()
     total = float(0.0)
@@ -249,14 +267,16 @@ def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
 
 @wp.kernel
 def accept(
+    # Data in:
     iteration_in: wp.array(dtype=wp.int32),
-    rng_inout: wp.array(dtype=wp.uint32),
     new_terms_in: wp.array2d(dtype=wp.float32),
     new_gradient_in: wp.array2d(dtype=wp.float32),
     new_pivot_in: wp.array(dtype=wp.vec3),
     new_rotation_in: wp.array(dtype=wp.quat),
     new_q_in: wp.array2d(dtype=wp.float32),
     new_contact_in: wp.array2d(dtype=wp.int32),
+    # Data out:
+    rng_inout: wp.array(dtype=wp.uint32),
     terms_inout: wp.array2d(dtype=wp.float32),
     gradient_inout: wp.array2d(dtype=wp.float32),
     pivot_inout: wp.array(dtype=wp.vec3),
@@ -288,10 +308,15 @@ def accept(
 
 @wp.kernel
 def probe(
-    iteration_in: wp.array(dtype=wp.int32), rise_in: wp.array(dtype=wp.float32),
-    uniform_in: wp.array(dtype=wp.float32), size_out: wp.array(dtype=wp.float32),
-    temperature_out: wp.array(dtype=wp.float32), accepted_out: wp.array(dtype=wp.int32),
-):  # fmt: skip
+    # In:
+    iteration_in: wp.array(dtype=wp.int32),
+    rise_in: wp.array(dtype=wp.float32),
+    uniform_in: wp.array(dtype=wp.float32),
+    # Out:
+    size_out: wp.array(dtype=wp.float32),
+    temperature_out: wp.array(dtype=wp.float32),
+    accepted_out: wp.array(dtype=wp.int32),
+):
     """The schedule's functions, for tests. Launch over the rows."""
     i = wp.tid()
     size_out[i] = step_size(iteration_in[i])

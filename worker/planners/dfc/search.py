@@ -18,6 +18,7 @@ from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.inner_surface import inside_points
 from worker.planners.threads import Steps
 from worker.simulation.kernels import kinematics, optimizers
+from worker.simulation.launches import Launches
 from worker.simulation.simulation import HandState, Simulation, still_schedule
 
 Floats = NDArray[np.float64]
@@ -99,42 +100,51 @@ class Descent:
     def _proposed(self) -> list[Any]:
         return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
 
-    def _record(self) -> list[Any]:
-        s, n = self.proposal, self.n
+    def _record(self) -> Launches:
+        s, n, out = self.proposal, self.n, Launches(self.device)
         pose, wrench = [s.body_p, s.body_q], [s.force, s.torque]
         own = [self.new_terms, *wrench]
-        steps: list[tuple[Any, Any, list[Any]]] = [
-            (kernels.propose, n,
-             [s.iteration, len(self.candidates), self.rng, self.gradient, self.moment, *self.state, self.contact,
-              *self._proposed(), self.new_contact, self.new_terms]),
-            (kinematics.forward, n,
-             [s.hand.tree, s.active, s.pivot, s.rotation, s.q, *pose, s.axis, *wrench, s.contacts, s.point_depth,
-              s.object_depth, s.self_depth]),
-            (kernels.force_closure, n,
-             [self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose, *own]),
-            (kernels.penetration, (n, len(s.hand.model.pieces)),
-             [s.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose, *own]),
-            (kernels.self_penetration, (n, self.pairs), [*self.keys, *pose, *own]),
-            (kinematics.backward, n, [s.hand.tree, s.active, s.pivot, s.body_p, s.axis, *wrench, s.gradient]),
-            (kernels.limits, n, [s.q, s.hand.lower, s.hand.upper, self.new_terms, s.gradient]),
-            (kernels.accept, n,
-             [s.iteration, self.rng, self.new_terms, s.gradient, *self._proposed(), self.new_contact, self.terms,
-              self.gradient, *self.state, self.contact, self.taken]),
-            (optimizers.advance, 1, [s.iteration]),
-        ]  # fmt: skip
-        return [
-            wp.launch(k, dim, inputs=inputs, device=self.device, record_cmd=True)
-            for k, dim, inputs in steps
-            if dim != (n, 0)
-        ]
+        out.add(
+            kernels.propose, n,
+            inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],
+            outputs=[self.rng, self.moment, *self._proposed(), self.new_contact, self.new_terms],
+        )  # fmt: skip
+        out.add(
+            kinematics.forward, n,
+            inputs=[s.hand.tree, s.active, *self._proposed()],
+            outputs=[*pose, s.axis, *wrench, s.contacts, s.point_depth, s.object_depth, s.self_depth],
+        )  # fmt: skip
+        out.add(
+            kernels.force_closure, n,
+            inputs=[self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose],
+            outputs=own,
+        )  # fmt: skip
+        out.add(
+            kernels.penetration, (n, len(s.hand.model.pieces)),
+            inputs=[s.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose], outputs=own,
+        )  # fmt: skip
+        if self.pairs:
+            out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
+        out.add(
+            kinematics.backward, n,
+            inputs=[s.hand.tree, s.active, s.pivot, s.body_p, s.axis], outputs=[*wrench, s.gradient],
+        )  # fmt: skip
+        out.add(
+            kernels.limits, n, inputs=[s.hand.lower, s.hand.upper, s.q], outputs=[self.new_terms, s.gradient]
+        )  # fmt: skip
+        out.add(
+            kernels.accept, n,
+            inputs=[s.iteration, self.new_terms, s.gradient, *self._proposed(), self.new_contact],
+            outputs=[self.rng, self.terms, self.gradient, *self.state, self.contact, self.taken],
+        )  # fmt: skip
+        out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
+        return out
 
     def run(self, steps: int, tell: Steps) -> None:
         """So many proposals; raises TaskCancelled through `tell`."""
         for first in range(0, steps, CHUNK):
             count = min(CHUNK, steps - first)
-            for _ in range(count):
-                for launch in self.launches:
-                    launch.launch()
+            self.launches.run(count)
             tell(self.n * count, "annealing")
 
     def hands(self) -> HandState:

@@ -64,9 +64,12 @@ def force_slope(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
 
 @wp.kernel
 def multipliers(
+    # Model:
     physics: ForceModel,
-    active_in: wp.array(dtype=wp.int32),
     wanted_in: wp.array(dtype=vec6),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    # Data out:
     total_inout: wp.array2d(dtype=vec6),
     lambda_inout: wp.array2d(dtype=wp.float32),
     pull_out: wp.array2d(dtype=vec6),
@@ -102,18 +105,21 @@ def relaxed(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec
 
 @wp.kernel
 def relax(
+    # Model:
     physics: ForceModel,
     surface: Surface,
+    velocity_in: wp.array(dtype=wp.vec3),
+    point_body_in: wp.array(dtype=wp.int32),
+    point_position_in: wp.array(dtype=wp.vec3),
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
     dilation_scale_in: wp.array(dtype=wp.float32),
-    velocity_in: wp.array(dtype=wp.vec3),
-    point_body_in: wp.array(dtype=wp.int32),
-    point_position_in: wp.array(dtype=wp.vec3),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
     pull_in: wp.array2d(dtype=vec6),
+    # Data out:
     force_inout: wp.array3d(dtype=wp.vec3),
     first_inout: wp.array3d(dtype=wp.vec3),
     largest_inout: wp.array3d(dtype=wp.vec3),
@@ -166,10 +172,16 @@ def relax(
 
 @wp.kernel
 def nearest(
-    surface: Surface, point_body_in: wp.array(dtype=wp.int32), point_position_in: wp.array(dtype=wp.vec3),
-    body_p_in: wp.array2d(dtype=wp.vec3), body_q_in: wp.array2d(dtype=wp.quat),
+    # Model:
+    surface: Surface,
+    point_body_in: wp.array(dtype=wp.int32),
+    point_position_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     least_inout: wp.array(dtype=wp.float32),
-):  # fmt: skip
+):
     """Least distance of each hand's points by the grid. Launch over (B, N)."""
     b, i = wp.tid()
     body = point_body_in[i]
@@ -179,9 +191,17 @@ def nearest(
 
 @wp.kernel
 def probe(
-    physics: ForceModel, surface: Surface, point_in: wp.array(dtype=wp.vec3), velocity_in: wp.vec3,
-    distance_out: wp.array(dtype=wp.float32), force_out: wp.array(dtype=wp.vec3), slope_out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+    # Model:
+    physics: ForceModel,
+    surface: Surface,
+    # In:
+    point_in: wp.array(dtype=wp.vec3),
+    velocity_in: wp.vec3,
+    # Out:
+    distance_out: wp.array(dtype=wp.float32),
+    force_out: wp.array(dtype=wp.vec3),
+    slope_out: wp.array(dtype=wp.vec3),
+):
     """Distance, contact force and its slope at given points, for tests. Launch over them."""
     i = wp.tid()
     sample = field_distance(surface, point_in[i])

@@ -15,6 +15,7 @@ from worker.planners.graspd2022 import kernels
 from worker.planners.graspd2022.grid import distance_grid
 from worker.planners.threads import Steps
 from worker.simulation.kernels import kinematics, optimizers, pieces
+from worker.simulation.launches import Launches
 from worker.simulation.simulation import MAX_DILATION, HandState, Schedule, Simulation
 
 Floats = NDArray[np.float64]
@@ -112,51 +113,60 @@ class _Batch:
         self.simulation.dilation_scale.assign(self._first_dilation())
         self.launches = self._record()
 
-    def _forward(self) -> list[Any]:
+    def _forward(self) -> dict[str, list[Any]]:
         s = self.simulation
-        return [s.hand.tree, s.active, s.pivot, s.rotation, s.q, s.body_p, s.body_q, s.axis, s.force, s.torque,
-                s.contacts, s.point_depth, s.object_depth, s.self_depth]  # fmt: skip
+        return {
+            "inputs": [s.hand.tree, s.active, s.pivot, s.rotation, s.q],
+            "outputs": [s.body_p, s.body_q, s.axis, s.force, s.torque, s.contacts, s.point_depth, s.object_depth,
+                        s.self_depth],
+        }  # fmt: skip
 
     def _first_dilation(self) -> NDArray[np.float32]:
         """(n,) share of `MAX_DILATION` at which the dilated object is `APART_M` from each hand."""
         s = self.simulation
         with wp.ScopedDevice(self.device):
             least = wp.full(self.n, 1e3, dtype=wp.float32)
-            wp.launch(kinematics.forward, self.n, inputs=self._forward())
+            wp.launch(kinematics.forward, self.n, **self._forward())
             wp.launch(
                 kernels.nearest, (self.n, POINTS),
-                inputs=[self.grid, s.point_body, s.point_position, s.body_p, s.body_q, least],
+                inputs=[self.grid, s.point_body, s.point_position, s.body_p, s.body_q], outputs=[least],
             )  # fmt: skip
             return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
 
-    def _record(self) -> list[Any]:
-        s, n = self.simulation, self.n
-        pose = [s.body_p, s.body_q]
-        wrench = [s.force, s.torque]
-        forces = [self.force, self.first, self.largest, self.total]
-        steps: list[tuple[Any, Any, list[Any]]] = [
-            (kinematics.forward, n, self._forward()),
-            (kernels.multipliers, (n, 3),
-             [self.physics, s.active, self.task, self.total, self.multiplier, self.pull, self.gap]),
-            (kernels.relax, (n, POINTS),
-             [self.physics, self.grid, s.active, s.iteration, s.dilation, s.dilation_scale, self.velocity,
-              s.point_body, s.point_position, *pose, self.pull, *forces, *wrench]),
-            (pieces.pieces_in_pieces, (n, len(s.hand.model.pieces)),
-             [s.hand.pieces, s.body_points, s.self_scale, 0.0, s.active, s.iteration, s.self_weight, *pose, *wrench,
-              s.self_depth]),
-            (kinematics.backward, n, [s.hand.tree, s.active, s.pivot, s.body_p, s.axis, *wrench, s.gradient]),
-            (optimizers.adam, n,
-             [s.active, s.iteration, s.rates, 0.9, 0.999, s.hand.lower, s.hand.upper, s.gradient, s.first, s.second,
-              s.pivot, s.rotation, s.q]),
-            (optimizers.advance, 1, [s.iteration]),
-        ]  # fmt: skip
-        return [wp.launch(k, dim, inputs=inputs, device=self.device, record_cmd=True) for k, dim, inputs in steps]
+    def _record(self) -> Launches:
+        s, n, out = self.simulation, self.n, Launches(self.device)
+        pose, wrench = [s.body_p, s.body_q], [s.force, s.torque]
+        out.add(kinematics.forward, n, **self._forward())
+        out.add(
+            kernels.multipliers, (n, 3),
+            inputs=[self.physics, self.task, s.active], outputs=[self.total, self.multiplier, self.pull, self.gap],
+        )  # fmt: skip
+        out.add(
+            kernels.relax, (n, POINTS),
+            inputs=[self.physics, self.grid, self.velocity, s.point_body, s.point_position, s.active, s.iteration,
+                    s.dilation, s.dilation_scale, *pose, self.pull],
+            outputs=[self.force, self.first, self.largest, self.total, *wrench],
+        )  # fmt: skip
+        out.add(
+            pieces.pieces_in_pieces, (n, len(s.hand.model.pieces)),
+            inputs=[s.hand.pieces, s.body_points, s.self_scale, 0.0, s.active, s.iteration, s.self_weight, *pose],
+            outputs=[*wrench, s.self_depth],
+        )  # fmt: skip
+        out.add(
+            kinematics.backward, n,
+            inputs=[s.hand.tree, s.active, s.pivot, s.body_p, s.axis], outputs=[*wrench, s.gradient],
+        )  # fmt: skip
+        out.add(
+            optimizers.adam, n,
+            inputs=[s.hand.lower, s.hand.upper, s.active, s.iteration, s.rates, s.gradient, 0.9, 0.999],
+            outputs=[s.first, s.second, s.pivot, s.rotation, s.q],
+        )  # fmt: skip
+        out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
+        return out
 
     def run(self, iterations: int) -> None:
         """Launch so many iterations."""
-        for _ in range(iterations):
-            for launch in self.launches:
-                launch.launch()
+        self.launches.run(iterations)
 
     def residual(self) -> Floats:
         """(n,) largest residual of the moving tasks, 1: as if nothing touched."""

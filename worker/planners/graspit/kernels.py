@@ -246,8 +246,11 @@ def neighbour(problem: Problem, x: vec8, t: wp.float32, rng: wp.uint32):
 
 @wp.kernel
 def begin(
+    # Model:
     problem: Problem,
+    # In:
     tries_in: wp.int32,
+    # Data out:
     rng_inout: wp.array(dtype=wp.uint32),
     state_out: wp.array(dtype=vec8),
     energy_out: wp.array(dtype=wp.float32),
@@ -305,10 +308,13 @@ def remember(
 
 @wp.kernel
 def anneal(
+    # Model:
     problem: Problem,
+    # In:
     rounds_in: wp.int32,
     last_in: wp.int32,
     alike_in: wp.float32,
+    # Data out:
     step_inout: wp.array(dtype=wp.int32),
     rng_inout: wp.array(dtype=wp.uint32),
     state_inout: wp.array(dtype=vec8),
@@ -350,9 +356,15 @@ def anneal(
 
 @wp.kernel
 def unpack(
-    problem: Problem, state_in: wp.array(dtype=vec8), pivot_out: wp.array(dtype=wp.vec3),
-    rotation_out: wp.array(dtype=wp.quat), q_out: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+    # Model:
+    problem: Problem,
+    # Data in:
+    state_in: wp.array(dtype=vec8),
+    # Data out:
+    pivot_out: wp.array(dtype=wp.vec3),
+    rotation_out: wp.array(dtype=wp.quat),
+    q_out: wp.array2d(dtype=wp.float32),
+):
     """States as hands. Launch over them."""
     b = wp.tid()
     x = state_in[b]
@@ -364,9 +376,16 @@ def unpack(
 
 @wp.kernel
 def evaluate(
-    problem: Problem, state_in: wp.array(dtype=vec8), body_p_out: wp.array2d(dtype=wp.vec3),
-    body_q_out: wp.array2d(dtype=wp.quat), legal_out: wp.array(dtype=wp.int32), energy_out: wp.array(dtype=wp.float32),
-):  # fmt: skip
+    # Model:
+    problem: Problem,
+    # Data in:
+    state_in: wp.array(dtype=vec8),
+    # Data out:
+    body_p_out: wp.array2d(dtype=wp.vec3),
+    body_q_out: wp.array2d(dtype=wp.quat),
+    legal_out: wp.array(dtype=wp.int32),
+    energy_out: wp.array(dtype=wp.float32),
+):
     """Legality and contact energy of given states. Launch over them."""
     b = wp.tid()
     legal_out[b] = legal(problem, b, state_in[b], body_p_out, body_q_out)
@@ -376,10 +395,15 @@ def evaluate(
 
 @wp.kernel
 def probe_schedule(
-    step_in: wp.array(dtype=wp.float32), uniform_in: wp.array(dtype=wp.float32), rise_in: wp.array(dtype=wp.float32),
-    temperature_out: wp.array(dtype=wp.float32), jump_out: wp.array(dtype=wp.float32),
+    # In:
+    step_in: wp.array(dtype=wp.float32),
+    uniform_in: wp.array(dtype=wp.float32),
+    rise_in: wp.array(dtype=wp.float32),
+    # Out:
+    temperature_out: wp.array(dtype=wp.float32),
+    jump_out: wp.array(dtype=wp.float32),
     acceptance_out: wp.array(dtype=wp.float32),
-):  # fmt: skip
+):
     """The schedule's functions, for tests. Launch over the rows."""
     i = wp.tid()
     t = temperature(step_in[i])

@@ -118,7 +118,7 @@ class Search:
             best = wp.zeros((chains, keep), dtype=kernels.vec8)
             best_energy = wp.full((chains, keep), NOT_YET, dtype=wp.float32)
             scratch = [wp.zeros((chains, self.hand.bodies), dtype=kind) for kind in (wp.vec3, wp.quat)]
-            wp.launch(kernels.begin, chains, inputs=[self.problem, START_TRIES, rng, state, energy, *scratch])
+            wp.launch(kernels.begin, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch])
             if (energy.numpy() < 0).any():
                 raise InputError(f"{self.hand.name} finds no free place around {self.pair.fine.obj.model.name}")
             tell(0, "starts")
@@ -126,8 +126,8 @@ class Search:
             for _ in range(0, max(0, PATIENCE * (steps - FIRST_STEP)), ROUNDS):
                 wp.launch(
                     kernels.anneal, chains,
-                    inputs=[self.problem, ROUNDS, steps, ALIKE, counter, rng, state, energy, best, best_energy,
-                            *scratch],
+                    inputs=[self.problem, ROUNDS, steps, ALIKE],
+                    outputs=[counter, rng, state, energy, best, best_energy, *scratch],
                 )  # fmt: skip
                 now = int((counter.numpy() - FIRST_STEP).sum())
                 tell(now - done, "annealing")
@@ -141,7 +141,7 @@ class Search:
         pivot, rotation = wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat)
         q = wp.zeros((n, self.hand.dofs), dtype=wp.float32)
         given = wp.array(states, dtype=kernels.vec8)
-        wp.launch(kernels.unpack, n, inputs=[self.problem, given, pivot, rotation, q])
+        wp.launch(kernels.unpack, n, inputs=[self.problem, given], outputs=[pivot, rotation, q])
         return HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
 
 

@@ -1,7 +1,10 @@
 """Warp kernels. Gradients are written out by hand: Warp's tape is silently wrong for loops that update locals.
 
-Arguments end in `_in` or `_out`; `_inout` is read and written. Quaternions are x y z w here, and here only. Each module
-compiles on first use and is cached on disk. The object frame of all kernels has its origin at the centre of mass.
+A kernel's arguments come in groups: the model (hand, object, points, options: what does not change), the data of the
+hands that it reads, other inputs, the data that it writes, other outputs. They end in `_in` or `_out`; `_inout` is read
+and written, and stands with the outputs. Launches give `inputs` and `outputs` in that order. Quaternions are x y z w
+here, and here only. Each module compiles on first use and is cached on disk. The object frame of all kernels has its
+origin at the centre of mass.
 """
 
 from __future__ import annotations

@@ -125,9 +125,11 @@ def leaked(pull: wp.float32, gap: wp.float32, physics: Physics):
 
 @wp.kernel
 def direct(
+    # Model:
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -137,6 +139,7 @@ def direct(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
+    # Data out:
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
     gradient_inout: wp.array2d(dtype=wp.float32),
@@ -216,9 +219,11 @@ def inverse_mass_along(physics: Physics, j: vec6):
 
 @wp.kernel
 def gauss_seidel(
+    # Model:
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -228,6 +233,7 @@ def gauss_seidel(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
+    # Data out:
     states_out: wp.array3d(dtype=vec6),
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
@@ -303,9 +309,11 @@ def gauss_seidel(
 
 @wp.kernel
 def jacobi(
+    # Model:
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
@@ -315,6 +323,7 @@ def jacobi(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
+    # Data out:
     states_out: wp.array3d(dtype=vec6),
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),

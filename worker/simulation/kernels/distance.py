@@ -17,13 +17,16 @@ BLEND = wp.constant(2.0e-4)
 
 @wp.kernel
 def mesh_distance(
+    # Model:
     mesh_in: wp.uint64,
     winding_in: wp.int32,
     corner_normal_in: wp.array(dtype=wp.vec3),
     low_in: wp.vec3,
     high_in: wp.vec3,
+    # In:
     reach_in: wp.float32,
     point_in: wp.array(dtype=wp.vec3),
+    # Out:
     distance_out: wp.array(dtype=wp.float32),
     closest_out: wp.array(dtype=wp.vec3),
     normal_out: wp.array(dtype=wp.vec3),
@@ -80,11 +83,14 @@ def mesh_distance(
 
 @wp.kernel
 def pieces_distance(
+    # Model:
     pieces_in: Pieces,
+    # In:
     piece_p_in: wp.array2d(dtype=wp.vec3),
     piece_q_in: wp.array2d(dtype=wp.quat),
     reach_in: wp.float32,
     point_in: wp.array(dtype=wp.vec3),
+    # Out:
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Least distance of S points to each of P pieces for B grasps; what is farther than `reach` is left out.
@@ -102,11 +108,14 @@ def pieces_distance(
 
 @wp.kernel
 def self_distance(
+    # Model:
     pieces_in: Pieces,
+    # In:
     piece_p_in: wp.array2d(dtype=wp.vec3),
     piece_q_in: wp.array2d(dtype=wp.quat),
     body_in: wp.array(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
+    # Out:
     depth_inout: wp.array2d(dtype=wp.float32),
 ):
     """Depth (B, L) of each body in others whose contact counts, or of others in it. Launch over points (B, N)."""

@@ -118,11 +118,13 @@ def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, m
 
 @wp.kernel
 def grow_hull(
+    # In:
     point_in: wp.array(dtype=vec6),
     order_in: wp.array(dtype=wp.int32),
     mark_in: wp.array(dtype=wp.int64),
     mask_in: wp.int64,
     stamp_in: int,
+    # Out:
     hull_inout: Hull,
     result_out: wp.array(dtype=wp.float64),
 ):

@@ -82,7 +82,12 @@ def outside_sphere(obstacles: Obstacles, k: wp.int32, centre: wp.vec3, reach: wp
 
 
 @wp.kernel
-def clear(active_in: wp.array(dtype=wp.int32), depth_out: wp.array(dtype=wp.float32)):
+def clear(
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    # Data out:
+    depth_out: wp.array(dtype=wp.float32),
+):
     """No depth yet. Launch over B."""
     b = wp.tid()
     if active_in[b] != 0:
@@ -91,15 +96,19 @@ def clear(active_in: wp.array(dtype=wp.int32), depth_out: wp.array(dtype=wp.floa
 
 @wp.kernel
 def penalty(
+    # Model:
     features_in: Features,
     obstacles_in: Obstacles,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     scene_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
-    room_in: wp.float32,
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    room_in: wp.float32,
+    # Data out:
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),
@@ -131,14 +140,18 @@ def penalty(
 
 @wp.kernel
 def residuals(
+    # Model:
     features_in: Features,
     obstacles_in: Obstacles,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     scene_in: wp.array(dtype=wp.int32),
-    near_in: wp.float32,
-    target_in: wp.float32,
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    near_in: wp.float32,
+    target_in: wp.float32,
+    # Out:
     residuals_out: Residuals,
 ):
     """Features nearer to an obstacle than margin + near go to margin + target. Over (B, F)."""

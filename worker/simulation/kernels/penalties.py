@@ -7,10 +7,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def points_to_bodies(
+    # Model:
+    clearance_in: wp.float32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     penetration_weight_in: wp.array(dtype=wp.float32),
-    clearance_in: wp.float32,
     count_in: wp.array(dtype=wp.int32),
     body_in: wp.array2d(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
@@ -18,6 +20,7 @@ def points_to_bodies(
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
     gradient_in: wp.array2d(dtype=wp.float32),
+    # Data out:
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),
@@ -43,12 +46,15 @@ def points_to_bodies(
 
 @wp.kernel
 def joints(
-    active_in: wp.array(dtype=wp.int32),
-    q_in: wp.array2d(dtype=wp.float32),
+    # Model:
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
     range_weight_in: wp.float32,
     limit_weight_in: wp.float32,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    q_in: wp.array2d(dtype=wp.float32),
+    # Data out:
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
     """Gradient of L_range + L_limit (paper, section III-D). Launch over (B, D).
@@ -69,12 +75,15 @@ def joints(
 
 @wp.kernel
 def attract(
-    active_in: wp.array(dtype=wp.int32),
+    # Model:
     pull_in: wp.float32,
     length_in: wp.float32,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
+    # Data out:
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
     """The control without a simulation: free points are drawn to the object, fading with distance. Over (B, N)."""

@@ -126,15 +126,18 @@ def world_extent(q: wp.quat, half: wp.vec3):
 
 @wp.kernel
 def object_in_pieces(
+    # Model:
     pieces_in: Pieces,
     bvh_in: wp.uint64,
     sample_in: wp.array(dtype=wp.vec3),
     sample_weight_in: wp.float32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),
@@ -202,15 +205,18 @@ def may_touch(
 
 @wp.kernel
 def pieces_in_pieces(
+    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
     point_weight_in: wp.float32,
     margin_in: wp.float32,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     force_inout: wp.array2d(dtype=wp.vec3),
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),

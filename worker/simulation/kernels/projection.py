@@ -52,17 +52,20 @@ def emit(
 
 @wp.kernel
 def point_residuals(
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
-    near_in: wp.float32,
-    target_in: wp.float32,
-    hold_in: wp.float32,
-    hold_target_in: wp.float32,
-    hold_weight_in: wp.float32,
     count_in: wp.array(dtype=wp.int32),
     body_in: wp.array2d(dtype=wp.int32),
     point_in: wp.array2d(dtype=wp.vec3),
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
+    # In:
+    near_in: wp.float32,
+    target_in: wp.float32,
+    hold_in: wp.float32,
+    hold_target_in: wp.float32,
+    hold_weight_in: wp.float32,
+    # Out:
     residuals_out: Residuals,
 ):
     """Hand points nearer than `near` go to `target`; those nearer than `hold` are held near it, weakly. Over (B, N)."""
@@ -78,14 +81,18 @@ def point_residuals(
 
 @wp.kernel
 def sample_residuals(
-    active_in: wp.array(dtype=wp.int32),
-    near_in: wp.float32,
-    target_in: wp.float32,
+    # Model:
     pieces_in: Pieces,
     bvh_in: wp.uint64,
     sample_in: wp.array(dtype=wp.vec3),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    near_in: wp.float32,
+    target_in: wp.float32,
+    # Out:
     residuals_out: Residuals,
 ):
     """Object samples nearer to a link than `near` go to `target`. Launch over (B, P)."""
@@ -112,13 +119,17 @@ def sample_residuals(
 
 @wp.kernel
 def self_residuals(
-    active_in: wp.array(dtype=wp.int32),
-    near_in: wp.float32,
-    target_in: wp.float32,
+    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    near_in: wp.float32,
+    target_in: wp.float32,
+    # Out:
     residuals_out: Residuals,
 ):
     """Points of one link nearer than `near` to another link go to `target`. Launch over (B, P)."""
@@ -160,12 +171,16 @@ def add_chain(
 
 @wp.kernel
 def normal_equations(
+    # Model:
     tree_in: Tree,
+    # Data in:
     active_in: wp.array(dtype=wp.int32),
     pivot_in: wp.array(dtype=wp.vec3),
     body_p_in: wp.array2d(dtype=wp.vec3),
     axis_in: wp.array2d(dtype=wp.vec3),
+    # In:
     residuals_in: Residuals,
+    # Out:
     row_out: wp.array2d(dtype=wp.float32),
     matrix_out: wp.array3d(dtype=wp.float32),
     vector_out: wp.array2d(dtype=wp.float32),

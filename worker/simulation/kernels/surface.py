@@ -133,9 +133,15 @@ def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: w
 
 @wp.kernel
 def sample_field(
-    surface_in: Surface, origin_in: wp.vec3, cell_in: wp.float32, reach_in: wp.float32,
+    # Model:
+    surface_in: Surface,
+    # In:
+    origin_in: wp.vec3,
+    cell_in: wp.float32,
+    reach_in: wp.float32,
+    # Out:
     field_out: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
+):
     """Fill a grid with mesh distances. Launch over the grid."""
     i, j, k = wp.tid()
     point = origin_in + cell_in * wp.vec3(float(i), float(j), float(k))
@@ -144,9 +150,16 @@ def sample_field(
 
 @wp.kernel
 def probe(
-    surface_in: Surface, point_in: wp.array(dtype=wp.vec3), reach_in: wp.float32, exact_below_in: wp.float32,
-    distance_out: wp.array(dtype=wp.float32), normal_out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+    # Model:
+    surface_in: Surface,
+    # In:
+    point_in: wp.array(dtype=wp.vec3),
+    reach_in: wp.float32,
+    exact_below_in: wp.float32,
+    # Out:
+    distance_out: wp.array(dtype=wp.float32),
+    normal_out: wp.array(dtype=wp.vec3),
+):
     """Distances and normals at given points. Launch over the points."""
     i = wp.tid()
     sample = distance(surface_in, point_in[i], reach_in, exact_below_in)
@@ -156,18 +169,21 @@ def probe(
 
 @wp.kernel
 def gather(
+    # Model:
     surface_in: Surface,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
-    dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
     band_in: wp.float32,
     exact_in: wp.float32,
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
     weight_in: wp.array(dtype=wp.float32),
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
+    # Data out:
     count_inout: wp.array(dtype=wp.int32),
     contact_body_out: wp.array2d(dtype=wp.int32),
     contact_point_out: wp.array2d(dtype=wp.vec3),

@@ -6,7 +6,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def forget(active_in: wp.array(dtype=wp.int32), count_out: wp.array(dtype=wp.int32)):
+def forget(
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    # Data out:
+    count_out: wp.array(dtype=wp.int32),
+):
     """No contacts yet. Launch over B."""
     b = wp.tid()
     if active_in[b] == 1:

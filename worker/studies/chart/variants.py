@@ -27,10 +27,9 @@ class AskingEach(Simulation):
 
     def _record_kinematics(self) -> None:
         super()._record_kinematics()
-        gather = self._commands[-1]
         for _ in range(self.options.velocities - 1):
-            self._launch(kernels.forget, self.capacity, [self.active, self.contacts])
-            self._commands.append(gather)
+            self.launches.add(kernels.forget, self.capacity, inputs=[self.active], outputs=[self.contacts])
+            self._record_gather()
 
 
 def asking_each(pair: Pair) -> Pair:

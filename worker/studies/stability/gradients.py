@@ -51,9 +51,10 @@ def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
             wp.array(contacts.normals[None], dtype=wp.vec3),
             wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
         ]  # fmt: skip
+        outputs = [loss, end, gradient]
         if name != "direct":
-            inputs.append(wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6))
-        wp.launch(_KERNELS[name], dim=(1, m), inputs=[*inputs, loss, end, gradient])
+            outputs.insert(0, wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6))
+        wp.launch(_KERNELS[name], dim=(1, m), inputs=inputs, outputs=outputs)
         return gradient.numpy()[0].astype(float)
 
 
