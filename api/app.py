@@ -13,7 +13,6 @@ from fastapi.staticfiles import StaticFiles
 
 from api import problems
 from api.access.keys import KeyFile
-from api.catalog.catalog import Catalog
 from api.dashboard import pages
 from api.dashboard.rendering import STATIC, problem_page
 from api.hosts import host_name, is_loopback
@@ -25,6 +24,7 @@ from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
 from api.routes import datasets, grasps, jobs, shards, system
 from api.routes.assets import asset_router
+from api.routes.dependencies import provide
 from api.routes.long_requests import FORMS, UPLOADS, Turns
 from service.index.rebuild import complete_if_new
 from service.model.domain import AssetKind
@@ -69,7 +69,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     )
     app.state.settings = settings
     app.state.keys = keys
-    app.state.catalog = Catalog(opened)
+    provide(app, opened)
     app.state.metrics = Metrics()
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     problems.install(app, problem_page)
@@ -77,7 +77,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         app.include_router(routes.router)
     for router in (*map(asset_router, AssetKind), *datasets.routers):
         app.include_router(router)
-    pages.install(app)
+    pages.install(app, opened)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     _add_middleware(app, settings, keys, rates)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]

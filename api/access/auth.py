@@ -25,6 +25,12 @@ _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via",
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
 
 
+def caller_id() -> str:
+    """Id of the caller's key; empty while the service is open."""
+    key = caller.get()
+    return key.id if key else ""
+
+
 class NotYours(ApiError):
     """A thing that another key submitted."""
 

@@ -4,11 +4,8 @@ its key does."""
 from __future__ import annotations
 
 import asyncio
-import threading
-import time
 from collections.abc import AsyncIterator
 from typing import Final
-from weakref import WeakKeyDictionary
 
 from anyio.to_thread import run_sync
 from fastapi import Request
@@ -16,7 +13,8 @@ from fastapi.sse import ServerSentEvent
 
 from api.access.auth import may_still
 from api.access.keys import Scope
-from api.catalog.catalog import Catalog
+from api.catalog.jobs import Jobs
+from api.catalog.overview import Overview
 from service.model.digests import digest_json
 from service.model.errors import UnavailableError
 
@@ -25,12 +23,12 @@ POLL_S: Final = 0.5
 RETRY_MS: Final = 2000
 
 
-async def job_events(catalog: Catalog, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
+async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
     """`progress` with the job whenever it changed; `end` when its state is final."""
     last = ""
     while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
-            job = await run_sync(catalog.job_state, job_id)
+            job = await run_sync(jobs.moving, job_id)
         except UnavailableError as error:
             yield ServerSentEvent(event="unavailable", data={"detail": str(error)}, retry=RETRY_MS)
             await asyncio.sleep(RETRY_MS / 1000)
@@ -46,42 +44,15 @@ async def job_events(catalog: Catalog, job_id: str, request: Request) -> AsyncIt
         await asyncio.sleep(POLL_S)
 
 
-async def service_events(catalog: Catalog, request: Request) -> AsyncIterator[ServerSentEvent]:
+async def service_events(overview: Overview, request: Request) -> AsyncIterator[ServerSentEvent]:
     """`progress` without content whenever a job, a task or a worker changed: the home page looks again."""
     last = ""
     while not await request.is_disconnected() and may_still(request, Scope.READ):
         try:
-            digest = await run_sync(_seen.of, catalog)
+            digest = await run_sync(overview.fingerprint)
         except UnavailableError as error:
             digest = str(error)
         if digest != last:
             last = digest
             yield ServerSentEvent(event="progress", data={}, retry=RETRY_MS)
         await asyncio.sleep(2 * POLL_S)
-
-
-class _Fingerprints:
-    """What the service looks like, asked anew at most once a pause however many pages are open."""
-
-    def __init__(self) -> None:
-        self._known: WeakKeyDictionary[Catalog, tuple[float, str]] = WeakKeyDictionary()
-        self._lock = threading.Lock()
-
-    def of(self, catalog: Catalog) -> str:
-        with self._lock:
-            at, digest = self._known.get(catalog, (0.0, ""))
-            now = time.monotonic()
-            if not digest or now - at >= 2 * POLL_S:
-                digest = _fingerprint(catalog)
-                self._known[catalog] = (now, digest)
-            return digest
-
-
-_seen: Final = _Fingerprints()
-
-
-def _fingerprint(catalog: Catalog) -> str:
-    jobs = catalog.jobs(limit=20).items
-    workers = [(worker.name, worker.state, worker.task_id) for worker in catalog.workers()]
-    moving = [(job.id, job.state, round(job.progress, 3)) for job in jobs]
-    return digest_json({"stats": catalog.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})

@@ -13,17 +13,17 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from api.access.auth import NotYours
-from api.catalog import dataset_quota
-from api.catalog.catalog import Catalog
+from api.catalog.assets import Assets
+from api.catalog.datasets import Datasets
+from api.catalog.jobs import Jobs
 from api.dashboard.figures import matrix
 from api.dashboard.form_uploads import asset_choices
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
-from api.routes.dependencies import CatalogOf, may_read, may_submit
+from api.routes.dependencies import AssetsOf, DatasetsOf, JobsOf, may_read, may_submit
 from service.index.dataset_views import CellView
 from service.model.domain import OFFERED, AssetKind, JobRequest, State
 from service.model.errors import ConflictError, InputError
-from service.pipeline.datasets import actions
 from service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
@@ -39,42 +39,44 @@ router = APIRouter(prefix="/datasets", include_in_schema=False)
 @router.get("", dependencies=[Depends(may_read)])
 def datasets_page(
     request: Request,
-    catalog: CatalogOf,
+    datasets: DatasetsOf,
+    assets: AssetsOf,
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
     """All datasets, and every hand on every object that the service knows."""
-    return _overview(request, catalog, cursor=cursor)
+    return _overview(request, datasets, assets, cursor=cursor)
 
 
 @router.post("", dependencies=[Depends(may_submit)], response_model=None)
-async def create(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
+async def create(request: Request, datasets: DatasetsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
     """Make a dataset of the form."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_create, request, catalog, fields)
+        return await run_in_threadpool(_create, request, datasets, assets, fields)
 
 
 @router.post("/cells", dependencies=[Depends(may_submit)], response_model=None)
-async def act_on_pairs(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
+async def act_on_pairs(
+    request: Request, jobs: JobsOf, datasets: DatasetsOf, assets: AssetsOf
+) -> HTMLResponse | RedirectResponse:
     """Submit, retry or cancel the jobs of chosen pairs."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_act_on_pairs, request, catalog, fields)
+        return await run_in_threadpool(_act_on_pairs, request, jobs, datasets, assets, fields)
 
 
 @router.get("/{name}", dependencies=[Depends(may_read)])
 def dataset_page(
     request: Request,
     name: str,
-    catalog: CatalogOf,
+    datasets: DatasetsOf,
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
     """One dataset: its matrix, its progress, its snapshots."""
-    index = catalog.parts.index
-    dataset = index.dataset(name)
+    dataset = datasets.one(name)
     chosen = State(state) if state in set(State) else None
     as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
-    page = None if as_matrix else index.dataset_cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
-    cells = _all_cells(catalog, name) if page is None else page.items
+    page = None if as_matrix else datasets.cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
+    cells = _all_cells(datasets, name) if page is None else page.items
     return render(
         request,
         "dataset.html",
@@ -86,26 +88,26 @@ def dataset_page(
         cells=cells,
         chosen=chosen or "",
         next=page.next if page else None,
-        snapshots=index.snapshots(name, limit=10).items,
+        snapshots=datasets.snapshots(name, limit=10).items,
         did=_did(request),
     )
 
 
 @router.post("/{name}/cells", dependencies=[Depends(may_submit)])
-async def act_on_cells(request: Request, name: str, catalog: CatalogOf) -> RedirectResponse:
+async def act_on_cells(request: Request, name: str, jobs: JobsOf) -> RedirectResponse:
     """Retry or cancel the jobs of chosen cells of a dataset."""
     async with request.form(max_fields=_MAX_FIELDS) as fields:
-        return await run_in_threadpool(_act_on_cells, catalog, name, fields)
+        return await run_in_threadpool(_act_on_cells, jobs, name, fields)
 
 
 @router.post("/{name}/{action}", dependencies=[Depends(may_submit)], response_model=None)
-def act(request: Request, name: str, action: str, catalog: CatalogOf) -> RedirectResponse | HTMLResponse:
+def act(request: Request, name: str, action: str, datasets: DatasetsOf) -> RedirectResponse | HTMLResponse:
     """Cancel, retry or delete a whole dataset, or take a snapshot of it."""
     do: dict[str, Callable[[], Any]] = {
-        "cancel": lambda: dataset_quota.cancel(catalog, name),
-        "retry": lambda: dataset_quota.retry(catalog, name),
-        "snapshot": lambda: actions.snapshot(catalog.parts, name),
-        "delete": lambda: catalog.delete_dataset(name),
+        "cancel": lambda: datasets.cancel(name),
+        "retry": lambda: datasets.retry(name),
+        "snapshot": lambda: datasets.take_snapshot(name),
+        "delete": lambda: datasets.delete(name),
     }
     if action not in do:
         raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
@@ -115,54 +117,56 @@ def act(request: Request, name: str, action: str, catalog: CatalogOf) -> Redirec
     return _redirect(f"/datasets/{name}", action, done=1)
 
 
-def _create(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
+def _create(request: Request, datasets: Datasets, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
     form = {key: str(fields[key]) for key in ("name", "grasps", "fidelity") if fields.get(key)}
     wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
     try:
-        dataset, _ = dataset_quota.create(catalog, DatasetRequest.model_validate(wanted))
+        dataset = datasets.create(DatasetRequest.model_validate(wanted))
     except (ValidationError, InputError) as error:
         message = first_message(error) if isinstance(error, ValidationError) else str(error)
-        return _overview(request, catalog, problem=message, form=wanted, status=422)
+        return _overview(request, datasets, assets, problem=message, form=wanted, status=422)
     return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
 
 
-def _act_on_pairs(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
+def _act_on_pairs(
+    request: Request, jobs: Jobs, datasets: Datasets, assets: Assets, fields: FormData
+) -> HTMLResponse | RedirectResponse:
     action = str(fields.get("action", ""))
     pairs = [(hand, obj) for cell in fields.getlist("cell") for hand, _, obj in [str(cell).partition("|")] if obj]
     try:
         if action == "submit":
             options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
             wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
-            done, left = _each(catalog.submit, wanted)
+            done, left = _each(jobs.submit, wanted)
         else:
-            done, left = _each(_job_action(catalog, action), _jobs_of(catalog, pairs, action))
+            done, left = _each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
     except (ValidationError, InputError) as error:
         message = first_message(error) if isinstance(error, ValidationError) else str(error)
-        return _overview(request, catalog, problem=message, status=422)
+        return _overview(request, datasets, assets, problem=message, status=422)
     return _redirect("/datasets", action, done=done, left=left)
 
 
-def _act_on_cells(catalog: Catalog, name: str, fields: FormData) -> RedirectResponse:
+def _act_on_cells(jobs: Jobs, name: str, fields: FormData) -> RedirectResponse:
     action = str(fields.get("action", ""))
-    done, left = _each(_job_action(catalog, action), [str(cell) for cell in fields.getlist("cell")])
+    done, left = _each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
     return _redirect(f"/datasets/{name}", action, done=done, left=left)
 
 
-def _job_action(catalog: Catalog, action: str) -> Callable[[str], Any]:
+def _job_action(jobs: Jobs, action: str) -> Callable[[str], Any]:
     if action == "retry":
-        return catalog.retry
+        return jobs.retry
     if action == "cancel":
-        return catalog.cancel
+        return jobs.cancel
     raise InputError(f"cells have no action {action!r}; they can be submitted, retried or cancelled")
 
 
-def _jobs_of(catalog: Catalog, pairs: Iterable[tuple[str, str]], action: str) -> list[str]:
+def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[str]:
     states = (State.FAILED, State.CANCELLED) if action == "retry" else (State.QUEUED, State.RUNNING)
     return [
         job.id
         for hand, obj in pairs
         for state in states
-        for job in catalog.parts.index.jobs(state=state, hand=hand, object=obj, limit=_CELLS_AT_ONCE).items
+        for job in jobs.page(state=state, hand=hand, object=obj, limit=_CELLS_AT_ONCE).items
     ]
 
 
@@ -199,11 +203,11 @@ def _did(request: Request) -> str:
     )
 
 
-def _all_cells(catalog: Catalog, name: str) -> list[CellView]:
+def _all_cells(datasets: Datasets, name: str) -> list[CellView]:
     cells: list[CellView] = []
     cursor = None
     while True:
-        page = catalog.parts.index.dataset_cells(name, limit=_CELLS_AT_ONCE, cursor=cursor)
+        page = datasets.cells(name, limit=_CELLS_AT_ONCE, cursor=cursor)
         cells += page.items
         cursor = page.next
         if cursor is None:
@@ -212,16 +216,16 @@ def _all_cells(catalog: Catalog, name: str) -> list[CellView]:
 
 def _overview(
     request: Request,
-    catalog: Catalog,
+    datasets: Datasets,
+    assets: Assets,
     *,
     cursor: str | None = None,
     problem: str = "",
     form: dict[str, Any] | None = None,
     status: int = 200,
 ) -> HTMLResponse:
-    hands, objects = (asset_choices(catalog, kind) for kind in (AssetKind.HAND, AssetKind.OBJECT))
-    index = catalog.parts.index
-    page = index.datasets(limit=PAGE_SIZE, cursor=cursor)
+    hands, objects = (asset_choices(assets, kind) for kind in (AssetKind.HAND, AssetKind.OBJECT))
+    page = datasets.page(limit=PAGE_SIZE, cursor=cursor)
     return render(
         request,
         "datasets.html",
@@ -231,7 +235,7 @@ def _overview(
         refresh_s=10,
         datasets=page.items,
         next=page.next,
-        grid=matrix.of_service(index.matrix(), [name for name, _ in hands], [name for name, _ in objects]),
+        grid=matrix.of_service(datasets.matrix(), [name for name, _ in hands], [name for name, _ in objects]),
         hands=hands,
         objects=objects,
         fidelities=OFFERED,

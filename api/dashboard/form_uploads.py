@@ -14,13 +14,12 @@ from typing import Any, Final
 from fastapi import Request
 from starlette.datastructures import FormData, UploadFile
 
-from api.catalog.catalog import Catalog
+from api.catalog.assets import Assets
 from api.routes.assets import store_upload
 from service.index.views import AssetView
 from service.model.domain import AssetKind
 from service.model.errors import GraspdError, InputError
 from service.store.descriptions import json_object
-from service.store.library import load_asset_files
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
@@ -46,55 +45,55 @@ class Chosen:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
-def chosen(request: Request, catalog: Catalog, fields: FormData, kind: AssetKind) -> Chosen:
+def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> Chosen:
     """The hand or object that a submitted form means: its file, else the file that it holds, else the known one."""
     file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
-            asset = _store(request, catalog, kind, file, _units(fields))
+            asset = _store(request, assets, kind, file, _units(fields))
         except InputError as error:
             return Chosen(refused=str(error), file=file.filename)
-        return _checked(catalog, asset)
+        return _checked(assets, asset)
     if known:
         return Chosen(name=known)
     if held := _text(fields, f"{kind.value}_held"):
         try:
-            return _checked(catalog, _again(catalog, kind, held, fields))
+            return _checked(assets, _again(assets, kind, held, fields))
         except InputError as error:
             return Chosen(refused=str(error), file=held, held=held)
     return Chosen(refused=f"choose a known {kind.value}, or a file")
 
 
-def _store(request: Request, catalog: Catalog, kind: AssetKind, file: UploadFile, units: str) -> AssetView:
+def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, units: str) -> AssetView:
     options = json.dumps({"units": units}) if kind is AssetKind.OBJECT and units != "m" else ""
     limit = request.app.state.settings.max_upload_bytes
-    return store_upload(catalog, kind, file, None, limit_bytes=limit, options=options)
+    return store_upload(assets, kind, file, None, limit_bytes=limit, options=options)
 
 
-def _again(catalog: Catalog, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
+def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
     """The same file under the units that the form has now."""
-    before, units = catalog.asset(kind, digest), _units(fields)
+    before, units = assets.one(kind, digest), _units(fields)
     if kind is not AssetKind.OBJECT or units == _text(fields, "held_units"):
         return before
-    files = load_asset_files(catalog.store, kind, before.digest)
+    files = assets.files(before)
     stated = json_object(files["asset.json"], "asset.json")
-    return catalog.add_asset(kind, before.name, {**files, "asset.json": json.dumps(stated | {"units": units}).encode()})
+    return assets.add(kind, before.name, {**files, "asset.json": json.dumps(stated | {"units": units}).encode()})
 
 
-def _checked(catalog: Catalog, asset: AssetView) -> Chosen:
+def _checked(assets: Assets, asset: AssetView) -> Chosen:
     """Give a worker a moment to check an upload, so that one press of the button is enough."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
-        asset = catalog.asset(asset.kind, asset.digest)
+        asset = assets.one(asset.kind, asset.digest)
     if asset.verdict == "refuse":
         return Chosen(refused=asset.message or "it was refused", file=asset.name, held=asset.digest)
     return Chosen(name=asset.name)
 
 
-def choices(catalog: Catalog, kind: AssetKind, shown: str, one: Chosen) -> list[tuple[str, str]]:
+def choices(assets: Assets, kind: AssetKind, shown: str, one: Chosen) -> list[tuple[str, str]]:
     """Names to choose from, the one that the form shows always among them."""
-    known = asset_choices(catalog, kind)
+    known = asset_choices(assets, kind)
     if one.refused:
         return [("", f"your file {one.file} (refused)" if one.file else f"choose a {kind.value}"), *known]
     if shown not in dict(known):
@@ -102,15 +101,15 @@ def choices(catalog: Catalog, kind: AssetKind, shown: str, one: Chosen) -> list[
     return known
 
 
-def asset_choices(catalog: Catalog, kind: AssetKind) -> list[tuple[str, str]]:
+def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
     """Names to choose from, with a word on those that cannot be used now."""
     try:
-        assets = catalog.assets(kind, limit=200).items
+        known = assets.page(kind, limit=200).items
     except GraspdError:
         return []
     notes = {"refuse": " (refused)", None: " (being checked)"}
     # Of several versions of a name the newest is meant.
-    newest = {asset.name: asset for asset in reversed(assets)}
+    newest = {asset.name: asset for asset in reversed(known)}
     return [(name, name + ("" if one.builtin else notes.get(one.verdict, ""))) for name, one in sorted(newest.items())]
 
 

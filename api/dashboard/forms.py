@@ -10,10 +10,11 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
-from api.catalog.catalog import Catalog
+from api.catalog.assets import Assets
+from api.catalog.jobs import Jobs
 from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen
 from api.dashboard.rendering import render
-from api.routes.dependencies import CatalogOf, may_read, may_submit
+from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
 from service.model.domain import AssetKind, JobRequest
 from service.model.errors import InputError
 
@@ -26,41 +27,41 @@ DEFAULTS: Final[dict[str, Any]] = {
 
 
 @router.get("/submit", dependencies=[Depends(may_read)])
-def submit_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
     """The form; parameters of the address fill it in."""
     given = {key: value for key, value in request.query_params.items() if key in DEFAULTS}
-    return _form(request, catalog, DEFAULTS | given)
+    return _form(request, assets, DEFAULTS | given)
 
 
 @router.post("/submit", dependencies=[Depends(may_submit)], response_model=None)
-async def submit(request: Request, catalog: CatalogOf) -> HTMLResponse | RedirectResponse:
+async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
     """Submit what the form says, after the upload of a hand or a mesh if there is one."""
     async with request.form(max_files=2, max_fields=24) as fields:
         sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
         # A file that the form holds is read and awaited like one that was sent.
         has_upload = sent or any(fields.get(f"{kind.value}_held") for kind in FILE_FIELDS)
         run = request.app.state.forms.run if has_upload else run_in_threadpool
-        return await run(_submit, request, catalog, fields)
+        return await run(_submit, request, jobs, assets, fields)
 
 
 @router.post("/jobs/{job_id}/cancel", dependencies=[Depends(may_submit)])
-def cancel(job_id: str, catalog: CatalogOf) -> RedirectResponse:
+def cancel(job_id: str, jobs: JobsOf) -> RedirectResponse:
     """Cancel a job and show it."""
-    catalog.cancel(job_id)
+    jobs.cancel(job_id)
     return RedirectResponse(f"/jobs/{job_id}", status_code=303)
 
 
 @router.post("/jobs/{job_id}/retry", dependencies=[Depends(may_submit)])
-def retry(job_id: str, catalog: CatalogOf) -> RedirectResponse:
+def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
     """Retry a job and show it."""
-    catalog.retry(job_id)
+    jobs.retry(job_id)
     return RedirectResponse(f"/jobs/{job_id}", status_code=303)
 
 
 @router.post("/jobs/{job_id}/delete", dependencies=[Depends(may_submit)])
-def delete(job_id: str, catalog: CatalogOf) -> RedirectResponse:
+def delete(job_id: str, jobs: JobsOf) -> RedirectResponse:
     """Take a job away that has ended, and show the others."""
-    catalog.delete_job(job_id)
+    jobs.delete(job_id)
     return RedirectResponse("/", status_code=303)
 
 
@@ -74,14 +75,14 @@ def first_message(error: ValueError) -> str:
     return str(error)
 
 
-def _submit(request: Request, catalog: Catalog, fields: FormData) -> HTMLResponse | RedirectResponse:
+def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
     form: dict[str, Any] = {
         name: fields[name]
         for name in DEFAULTS
         if name not in ("hand", "object") and isinstance(fields.get(name), str) and fields[name] != ""
     }
     form["stereo"] = fields.get("stereo") == "true"
-    things = {kind: chosen(request, catalog, fields, kind) for kind in FILE_FIELDS}
+    things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
     # Without a default: a form that names no object gets none.
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
@@ -90,14 +91,14 @@ def _submit(request: Request, catalog: Catalog, fields: FormData) -> HTMLRespons
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
         body = JobRequest.model_validate(form | named)
     except ValidationError as error:
-        return _form(request, catalog, shown, things=things, errors=refused | _by_field(error), status=422)
+        return _form(request, assets, shown, things=things, errors=refused | _by_field(error), status=422)
     if refused:
-        return _form(request, catalog, shown, things=things, errors=refused, status=422)
+        return _form(request, assets, shown, things=things, errors=refused, status=422)
     try:
-        job = catalog.submit(body)
+        job = jobs.submit(body)
     except InputError as error:
         problem = {"title": error.title, "detail": str(error)}
-        return _form(request, catalog, shown, things=things, problem=problem, status=error.status)
+        return _form(request, assets, shown, things=things, problem=problem, status=error.status)
     return RedirectResponse(f"/jobs/{job.id}", status_code=303)
 
 
@@ -112,7 +113,7 @@ def _by_field(error: ValidationError) -> dict[str, str]:
 
 def _form(
     request: Request,
-    catalog: Catalog,
+    assets: Assets,
     form: dict[str, Any],
     *,
     things: dict[AssetKind, Chosen] | None = None,
@@ -129,8 +130,8 @@ def _form(
         form={"units": "m"} | form,
         errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
         problem=problem,
-        hands=choices(catalog, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
-        objects=choices(catalog, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
+        hands=choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
+        objects=choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
         held={kind.value: one.held for kind, one in things.items()},
         expected=request.app.state.expectations.of(form),
         units=UNITS,

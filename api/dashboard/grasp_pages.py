@@ -7,11 +7,12 @@ from typing import Any, Final
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse
 
+from api.catalog.assets import Assets
 from api.dashboard import snippets
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
 from api.models import GraspDetail, GraspQuery
-from api.routes.dependencies import CatalogOf, may_read
+from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, may_read
 from api.routes.paging import next_address
 from service.model.domain import AssetKind
 
@@ -30,7 +31,7 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/grasps", dependencies=[Depends(may_read)])
-def grasps_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf) -> HTMLResponse:
     """Every grasp of the index: filters, order, pages. The address holds all of it."""
     given = {key: value for key, value in request.query_params.items() if value}
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
@@ -38,7 +39,7 @@ def grasps_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
     problem, page, query = "", None, GraspQuery()
     try:
         query = GraspQuery.model_validate(given)
-        page = catalog.grasps(query, limit=PAGE_SIZES[view], cursor=cursor)
+        page = grasps.page(query, limit=PAGE_SIZES[view], cursor=cursor)
     except ValueError as error:
         problem = first_message(error)
     rows = page.items if page else []
@@ -50,10 +51,10 @@ def grasps_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
         filters={name: given.get(name, "") for name in GraspQuery.model_fields},
         filtered=bool(set(given) - {"sort", "order"}),
         problem=problem,
-        hands=_names(catalog, AssetKind.HAND),
-        objects=_names(catalog, AssetKind.OBJECT),
+        hands=_names(assets, AssetKind.HAND),
+        objects=_names(assets, AssetKind.OBJECT),
         rows=rows,
-        models=catalog.parts.index.assets_of_shards({grasp.shard_id for grasp in rows}) if view == "cards" else {},
+        models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
         sort=query.sort,
         sorts=[(key, label) for key, label, _ in COLUMNS],
@@ -69,16 +70,16 @@ def grasps_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
 
 
 @router.get("/grasps/{shard_id}/{row}", dependencies=[Depends(may_read)])
-def grasp_page(request: Request, shard_id: str, row: int, catalog: CatalogOf) -> HTMLResponse:
+def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf) -> HTMLResponse:
     """One grasp: 3D, verdict, quality, and where it is kept."""
-    grasp, shard = catalog.grasp(shard_id, row), catalog.shard(shard_id)
+    grasp, shard = grasps.one(shard_id, row), shards.one(shard_id)
     return render(
         request,
         "grasp.html",
         page="/grasps",
         grasp=grasp,
         shard=shard,
-        job=catalog.parts.index.job_of_shard(shard_id),
+        job=shards.job_of(shard_id),
         metrics=_metrics(grasp),
         loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
     )
@@ -96,8 +97,8 @@ def _metrics(grasp: GraspDetail) -> list[tuple[str, float | None, str]]:
     ]
 
 
-def _names(catalog: CatalogOf, kind: AssetKind) -> list[tuple[str, str]]:
-    names = sorted({asset.name for asset in catalog.assets(kind, limit=200).items})
+def _names(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
+    names = sorted({asset.name for asset in assets.page(kind, limit=200).items})
     return [(name, name) for name in names]
 
 

@@ -12,8 +12,8 @@ from api.dashboard.figures import charts
 from api.dashboard.grasp_pages import COLUMNS
 from api.dashboard.pictures import Channel
 from api.dashboard.rendering import render
-from api.models import GraspQuery, JobDetail
-from api.routes.dependencies import CatalogOf, may_read
+from api.models import GraspQuery, JobDetail, LossCurve
+from api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, may_read
 
 _SHOWN_PICTURES: Final = 8
 _SHOWN_GRASPS: Final = 10
@@ -22,14 +22,14 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/jobs/{job_id}", dependencies=[Depends(may_read)])
-def job_page(request: Request, job_id: str, catalog: CatalogOf) -> HTMLResponse:
+def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf) -> HTMLResponse:
     """All of one job."""
-    job = catalog.job(job_id)
+    job = jobs.one(job_id)
     pictures = _pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     judged = job.request.referee != "none"
     query = GraspQuery(job=job_id, valid=True if judged else None)
-    rows = catalog.grasps(query, limit=_SHOWN_GRASPS).items if (job.valid if judged else job.grasps) else []
+    rows = grasps.page(query, limit=_SHOWN_GRASPS).items if (job.valid if judged else job.grasps) else []
     where = {"job": job_id} | ({"valid": "true"} if judged else {})
     return render(
         request,
@@ -38,9 +38,9 @@ def job_page(request: Request, job_id: str, catalog: CatalogOf) -> HTMLResponse:
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         histograms=[
-            (*shown[data.metric], data, charts.bars(data, "/grasps", where)) for data in catalog.histograms(job)
+            (*shown[data.metric], data, charts.bars(data, "/grasps", where)) for data in grasps.histograms(job)
         ],
-        loss=_loss(catalog, job),
+        loss=_loss(jobs.loss_curve(job)),
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,
@@ -58,18 +58,17 @@ def picture(
     request: Request,
     shard_id: str,
     index: int,
-    catalog: CatalogOf,
+    shards: ShardsOf,
     channel: Channel = "rgb",
     width: Annotated[int | None, Query(ge=16, le=4096)] = None,
 ) -> Response:
     """One rendered view as a PNG: colour, depth or segmentation, whole or no wider than `width` pixels."""
-    shard = catalog.shard(shard_id)
+    shard = shards.one(shard_id)
     data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
 
-def _loss(catalog: CatalogOf, job: JobDetail) -> charts.Plot | None:
-    curve = catalog.loss_curve(job)
+def _loss(curve: LossCurve | None) -> charts.Plot | None:
     if curve is None:
         return None
     return charts.line(curve.iterations, curve.losses, x="iteration", y="Loss", log=True)

@@ -15,25 +15,26 @@ from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
 from api.problems import ERRORS
-from api.routes.dependencies import CatalogOf, may_read
+from api.routes.dependencies import OverviewOf, may_read
+from service.pipeline.backends import Parts
 
 router = APIRouter(include_in_schema=False)
 
 
-def install(app: FastAPI) -> None:
+def install(app: FastAPI, parts: Parts) -> None:
     """Add the pages to the application."""
     app.state.templates = environment()
-    app.state.pictures = Pictures(app.state.catalog.store)
-    app.state.expectations = Expectations(app.state.catalog.parts.index)
+    app.state.pictures = Pictures(parts.store)
+    app.state.expectations = Expectations(parts.index)
     for part in (service_pages, job_pages, grasp_pages, dataset_pages, forms, session):
         app.include_router(part.router)
     app.include_router(router)
 
 
 @router.get("/events", dependencies=[Depends(may_read)], response_class=EventSourceResponse)
-async def watch(request: Request, catalog: CatalogOf) -> AsyncIterable[ServerSentEvent]:
+async def watch(request: Request, overview: OverviewOf) -> AsyncIterable[ServerSentEvent]:
     """Says that something on the home page has changed."""
-    async for event in events.service_events(catalog, request):
+    async for event in events.service_events(overview, request):
         yield event
 
 

@@ -47,7 +47,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "events": "",
         "refresh_s": 0,
         "poll_s": 0,
-        "health": request.app.state.catalog.health(),
+        "health": request.app.state.overview.health(),
     } | context
     context |= {
         "navigation": NAVIGATION,

@@ -9,15 +9,16 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 
-from api.catalog.catalog import Catalog
+from api.catalog.datasets import Datasets
+from api.catalog.overview import Overview
 from api.dashboard.figures import charts, stability, tradeoff
 from api.dashboard.rendering import render
 from api.models import STAGE_LABELS
-from api.routes.dependencies import CatalogOf, may_read
+from api.routes.dependencies import DatasetsOf, JobsOf, OverviewOf, StoreOf, may_read
 from service.index.dataset_views import DatasetView
-from service.index.views import TaskView, WorkerView
+from service.index.views import WorkerView
 from service.model.domain import State
-from service.model.errors import NotFoundError, UnavailableError
+from service.model.errors import UnavailableError
 
 PAGE_SIZE: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
@@ -32,13 +33,15 @@ router = APIRouter(include_in_schema=False)
 @router.get("/", dependencies=[Depends(may_read)])
 def home(
     request: Request,
-    catalog: CatalogOf,
+    overview: OverviewOf,
+    jobs: JobsOf,
+    datasets: DatasetsOf,
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
     """Health, throughput, jobs, queue, workers, failures."""
     chosen = State(state) if state in set(State) else None
-    minutes = catalog.valid_per_minute(minutes=_MINUTES)
+    minutes = overview.valid_per_minute(minutes=_MINUTES)
     start = time.time() // 60 * 60 - 60 * (_MINUTES - 1)
     return render(
         request,
@@ -47,22 +50,22 @@ def home(
         events="/events",
         refresh_s=5,
         chosen=chosen or "",
-        stats=catalog.stats(),
+        stats=overview.stats(),
         minutes=minutes,
         pace=charts.minutes(minutes, start),
-        jobs=catalog.jobs(state=chosen, limit=PAGE_SIZE, cursor=cursor),
-        stages=stage_depths(catalog),
-        workers=[worker for worker in catalog.workers() if is_recent(worker)],
-        failures=catalog.failures(limit=4),
-        datasets=_latest_datasets(catalog),
-        damage=catalog.damage(),
+        jobs=jobs.page(state=chosen, limit=PAGE_SIZE, cursor=cursor),
+        stages=stage_depths(overview),
+        workers=[worker for worker in overview.workers() if is_recent(worker)],
+        failures=overview.failures(limit=4),
+        datasets=_latest_datasets(datasets),
+        damage=overview.damage(),
     )
 
 
 @router.get("/workers", dependencies=[Depends(may_read)])
-def workers_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
     """Who works on what, on which device, and since when."""
-    workers = [worker for worker in catalog.workers() if is_recent(worker)]
+    workers = [worker for worker in overview.workers() if is_recent(worker)]
     return render(
         request,
         "workers.html",
@@ -70,18 +73,18 @@ def workers_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
         events="/events",
         refresh_s=5,
         workers=workers,
-        tasks={worker.name: task for worker in workers if (task := _task_of(catalog, worker)) is not None},
+        tasks={worker.name: task for worker in workers if (task := overview.task_of(worker)) is not None},
         busy=sum(worker.state == "busy" for worker in workers),
         alive=sum(worker.state != "lost" for worker in workers),
-        stages=stage_depths(catalog),
-        damage=catalog.damage(),
+        stages=stage_depths(overview),
+        damage=overview.damage(),
     )
 
 
 @router.get("/chart", dependencies=[Depends(may_read)])
-def chart_page(request: Request, catalog: CatalogOf, y: str = "gsr", hand: str = "", object: str = "") -> HTMLResponse:
+def chart_page(request: Request, store: StoreOf, y: str = "gsr", hand: str = "", object: str = "") -> HTMLResponse:
     """Speed against accuracy of methods and fidelities, as `graspd chart` measured them last."""
-    measured = tradeoff.load(catalog.store)
+    measured = tradeoff.load(store)
     axis = y if y in tradeoff.AXES else "gsr"
     return render(
         request,
@@ -98,9 +101,9 @@ def chart_page(request: Request, catalog: CatalogOf, y: str = "gsr", hand: str =
 
 
 @router.get("/stability", dependencies=[Depends(may_read)])
-def stability_page(request: Request, catalog: CatalogOf) -> HTMLResponse:
+def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
     """Maps of where integrators and the planner fail, as `graspd stability` measured them last."""
-    measured = stability.load(catalog.store)
+    measured = stability.load(store)
     return render(
         request,
         "stability.html",
@@ -117,10 +120,10 @@ def is_recent(worker: WorkerView) -> bool:
     return worker.state != "lost" or age < _LOST_SHOWN
 
 
-def stage_depths(catalog: Catalog) -> list[tuple[str, int]]:
+def stage_depths(overview: Overview) -> list[tuple[str, int]]:
     """Waiting tasks by stage; empty where Redis does not answer, which the page says elsewhere."""
     try:
-        depths = catalog.depths()
+        depths = overview.depths()
     except UnavailableError:
         return []
     totals = dict.fromkeys(STAGE_LABELS, 0)
@@ -129,17 +132,7 @@ def stage_depths(catalog: Catalog) -> list[tuple[str, int]]:
     return [(STAGE_LABELS[stage], waiting) for stage, waiting in totals.items()]
 
 
-def _latest_datasets(catalog: Catalog) -> list[DatasetView]:
+def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
     """The newest datasets, those still at work first."""
-    newest = catalog.parts.index.datasets(limit=_DATASETS).items
+    newest = datasets.page(limit=_DATASETS).items
     return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
-
-
-def _task_of(catalog: Catalog, worker: WorkerView) -> TaskView | None:
-    """What a worker does; a check of an upload is no task of the index."""
-    if worker.state != "busy" or not worker.task_id:
-        return None
-    try:
-        return catalog.parts.index.task(worker.task_id)
-    except NotFoundError:
-        return None

@@ -9,15 +9,14 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, Form, Request, Response, UploadFile
 from starlette.datastructures import UploadFile as AnyUpload
 
-from api.catalog.catalog import Catalog
+from api.catalog.assets import Assets
 from api.problems import responses
 from api.routes.conditions import is_known
-from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.routes.dependencies import AssetsOf, Cursor, Limit, may_read, may_submit
 from api.routes.long_requests import UPLOADS, Turns
 from api.routes.paging import link_next
 from api.uploads import files_of_upload, name_of_upload
 from service.index.views import AssetView, Page
-from service.model import names
 from service.model.domain import AssetKind, Name
 from service.model.errors import RateError
 
@@ -33,19 +32,19 @@ def asset_router(kind: AssetKind) -> APIRouter:
 
     @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503), name=f"list_{kind}s")
     def list_assets(
-        request: Request, response: Response, catalog: CatalogOf, limit: Limit = 50, cursor: Cursor = None
+        request: Request, response: Response, assets: AssetsOf, limit: Limit = 50, cursor: Cursor = None
     ) -> Page[AssetView]:
         """All of them, by name."""
-        page = catalog.assets(kind, limit=limit, cursor=cursor)
+        page = assets.page(kind, limit=limit, cursor=cursor)
         link_next(request, response, page.next)
         return page
 
     @router.get(
         "/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503), name=f"get_{kind}"
     )
-    def get_asset(name: str, catalog: CatalogOf) -> AssetView:
+    def get_asset(name: str, assets: AssetsOf) -> AssetView:
         """One of them, with what the check found."""
-        return catalog.asset(kind, name)
+        return assets.one(kind, name)
 
     @router.head("/{name}/model", dependencies=[Depends(may_read)], include_in_schema=False)
     @router.get(
@@ -64,12 +63,12 @@ def asset_router(kind: AssetKind) -> APIRouter:
         ),
         name=f"get_{kind}_model",
     )
-    def get_model(name: str, request: Request, catalog: CatalogOf) -> Response:
+    def get_model(name: str, request: Request, assets: AssetsOf) -> Response:
         """The prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
-        asset = catalog.asset(kind, name)
+        asset = assets.one(kind, name)
         # Under a digest it never changes; a name may come to stand for something else.
         lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
-        data = catalog.store.get(names.asset_model(kind, asset.digest))
+        data = assets.model(asset)
         headers = {"ETag": f'"{hashlib.sha256(data).hexdigest()}"', "Cache-Control": lasting}
         if is_known(request.headers, headers["ETag"]):
             return Response(status_code=304, headers=headers)
@@ -88,7 +87,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         file: UploadFile,
         response: Response,
         request: Request,
-        catalog: CatalogOf,
+        assets: AssetsOf,
         name: Annotated[Name | None, Form()] = None,
         options: Annotated[
             str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
@@ -97,7 +96,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
         limit = request.app.state.settings.max_upload_bytes
         uploads: Turns = request.app.state.uploads
-        asset = await uploads.run(store_upload, catalog, kind, file, name, limit_bytes=limit, options=options)
+        asset = await uploads.run(store_upload, assets, kind, file, name, limit_bytes=limit, options=options)
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         response.headers["Retry-After"] = "1"
         return asset
@@ -109,15 +108,15 @@ def asset_router(kind: AssetKind) -> APIRouter:
         responses=responses(401, 403, 404, 409, 503),
         name=f"delete_{kind}",
     )
-    def delete_asset(name: str, catalog: CatalogOf) -> None:
+    def delete_asset(name: str, assets: AssetsOf) -> None:
         """Take it away; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
-        catalog.delete_asset(kind, name)
+        assets.delete(kind, name)
 
     return router
 
 
 def store_upload(
-    catalog: Catalog, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int, options: str = ""
+    assets: Assets, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int, options: str = ""
 ) -> AssetView:
     """An asset of immutable bytes, and the task that checks it. The upload lies in a file of its own until then.
 
@@ -129,6 +128,6 @@ def store_upload(
         raise RateError("too many uploads at once; try again in a moment")
     try:
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
-        return catalog.add_asset(kind, name or name_of_upload(filename), files)
+        return assets.add(kind, name or name_of_upload(filename), files)
     finally:
         _AT_ONCE.release()

@@ -7,20 +7,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from api.access.auth import caller, must_own
-from api.catalog import dataset_quota
 from api.problems import ApiError, responses
-from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.routes.dependencies import Cursor, DatasetsOf, Limit, may_read, may_submit
 from api.routes.paging import link_next
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import Page
 from service.model.dataset_records import Snapshot
 from service.model.domain import Name, State
-from service.pipeline.datasets import actions
-from service.pipeline.datasets.cost import Estimate, estimate
+from service.pipeline.datasets.cost import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
-from service.pipeline.fidelity_choice import Resolver
-from service.store.datasets import load_snapshot
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 sets_router = APIRouter(prefix="/v1/object-sets", tags=["object sets"])
@@ -46,18 +41,18 @@ class ObjectSetRequest(BaseModel):
     dependencies=[Depends(may_submit)],
     responses=responses(400, 401, 403, 404, 409, 413, 422, 503, others=_ENDED),
 )
-def create_dataset(body: DatasetRequest, response: Response, catalog: CatalogOf) -> DatasetView:
+def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Create a dataset. The same name with the same content is the same dataset: what is made is not made again."""
-    dataset, _ = dataset_quota.create(catalog, body)
+    dataset = datasets.create(body)
     if dataset.state.is_final:
         response.status_code = 200
     return _placed(dataset, response)
 
 
 @router.post("/estimate", dependencies=[Depends(may_read)], responses=responses(400, 401, 403, 404, 413, 422, 503))
-def estimate_dataset(body: Matrix, catalog: CatalogOf) -> Estimate:
+def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
     """What a dataset will cost: time for 1, 8 and 64 workers, storage, network. Nothing is recorded."""
-    return estimate(catalog.parts.index, body, Resolver(catalog.parts.store))
+    return datasets.estimate(body)
 
 
 @router.api_route("/estimate", methods=["GET", "HEAD", "PUT", "PATCH", "DELETE"], include_in_schema=False)
@@ -68,18 +63,18 @@ def no_dataset() -> None:
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 422, 503))
 def list_datasets(
-    request: Request, response: Response, catalog: CatalogOf, limit: Limit = 50, cursor: Cursor = None
+    request: Request, response: Response, datasets: DatasetsOf, limit: Limit = 50, cursor: Cursor = None
 ) -> Page[DatasetView]:
     """Datasets, the newest first."""
-    page = catalog.parts.index.datasets(limit=limit, cursor=cursor)
+    page = datasets.page(limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
 
 
 @router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
-def get_dataset(name: DatasetName, catalog: CatalogOf) -> DatasetView:
+def get_dataset(name: DatasetName, datasets: DatasetsOf) -> DatasetView:
     """A dataset in numbers: cells by state, grasps, progress, time, bytes."""
-    return catalog.parts.index.dataset(name)
+    return datasets.one(name)
 
 
 @router.get("/{name}/cells", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
@@ -87,13 +82,13 @@ def list_cells(
     name: DatasetName,
     request: Request,
     response: Response,
-    catalog: CatalogOf,
+    datasets: DatasetsOf,
     state: State | None = None,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[CellView]:
     """Each hand x object with its job, state, yield and failures, hand by hand."""
-    page = catalog.parts.index.dataset_cells(name, state=state, limit=limit, cursor=cursor)
+    page = datasets.cells(name, state=state, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
 
@@ -104,9 +99,9 @@ def list_cells(
     dependencies=[Depends(may_submit)],
     responses=responses(401, 403, 404, 409, 503),
 )
-def cancel_dataset(name: DatasetName, response: Response, catalog: CatalogOf) -> DatasetView:
+def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Stop a dataset and its unfinished jobs; what is written stays, and jobs that another dataset wants go on."""
-    return _placed(dataset_quota.cancel(catalog, name), response)
+    return _placed(datasets.cancel(name), response)
 
 
 @router.post(
@@ -115,9 +110,9 @@ def cancel_dataset(name: DatasetName, response: Response, catalog: CatalogOf) ->
     dependencies=[Depends(may_submit)],
     responses=responses(401, 403, 404, 409, 503),
 )
-def retry_dataset(name: DatasetName, response: Response, catalog: CatalogOf) -> DatasetView:
+def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Start the cells again that failed or were cancelled; what is written is not made twice."""
-    return _placed(dataset_quota.retry(catalog, name), response)
+    return _placed(datasets.retry(name), response)
 
 
 @router.delete(
@@ -126,9 +121,9 @@ def retry_dataset(name: DatasetName, response: Response, catalog: CatalogOf) -> 
     dependencies=[Depends(may_submit)],
     responses=responses(401, 403, 404, 409, 503),
 )
-def delete_dataset(name: DatasetName, catalog: CatalogOf) -> None:
+def delete_dataset(name: DatasetName, datasets: DatasetsOf) -> None:
     """Take away a dataset that has ended, its snapshots, and those of its jobs that were planned for it alone."""
-    catalog.delete_dataset(name)
+    datasets.delete(name)
 
 
 @router.post(
@@ -139,9 +134,9 @@ def delete_dataset(name: DatasetName, catalog: CatalogOf) -> None:
         401, 403, 404, 409, 503, others={200: {"model": SnapshotView, "description": "There was one of these shards"}}
     ),
 )
-def take_snapshot(name: DatasetName, response: Response, catalog: CatalogOf) -> SnapshotView:
+def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -> SnapshotView:
     """Write down which shards the dataset holds now. The same shards again are the same snapshot."""
-    taken, new = actions.snapshot(catalog.parts, name)
+    taken, new = datasets.take_snapshot(name)
     response.headers["Location"] = f"/v1/datasets/{name}/snapshots/{taken.digest}"
     if not new:
         response.status_code = 200
@@ -153,12 +148,12 @@ def list_snapshots(
     name: DatasetName,
     request: Request,
     response: Response,
-    catalog: CatalogOf,
+    datasets: DatasetsOf,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[SnapshotView]:
     """Snapshots of a dataset, the newest first."""
-    page = catalog.parts.index.snapshots(name, limit=limit, cursor=cursor)
+    page = datasets.snapshots(name, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
 
@@ -166,9 +161,9 @@ def list_snapshots(
 @router.get(
     "/{name}/snapshots/{digest}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503)
 )
-def get_snapshot(name: DatasetName, digest: SnapshotDigest, catalog: CatalogOf) -> Snapshot:
+def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf) -> Snapshot:
     """A snapshot with its list of shards and their checksums."""
-    return load_snapshot(catalog.store, name, digest)
+    return datasets.snapshot(name, digest)
 
 
 @sets_router.post(
@@ -177,30 +172,23 @@ def get_snapshot(name: DatasetName, digest: SnapshotDigest, catalog: CatalogOf) 
     dependencies=[Depends(may_submit)],
     responses=responses(400, 401, 403, 404, 413, 422, 503),
 )
-def add_object_set(body: ObjectSetRequest, response: Response, catalog: CatalogOf) -> ObjectSetView:
+def add_object_set(body: ObjectSetRequest, response: Response, datasets: DatasetsOf) -> ObjectSetView:
     """Give objects a name together. Others under the same name are its next version: for its owner, or an admin."""
-    key = caller.get()
-    found = actions.add_object_set(
-        catalog.parts,
-        body.name,
-        body.objects,
-        owner=key.id if key else "",
-        may_follow=lambda owner: must_own(owner, f"the set {body.name!r}"),
-    )
+    found = datasets.add_object_set(body.name, body.objects)
     response.headers["Location"] = f"/v1/object-sets/{found.name}"
     return found
 
 
 @sets_router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 503))
-def list_object_sets(catalog: CatalogOf) -> list[ObjectSetView]:
+def list_object_sets(datasets: DatasetsOf) -> list[ObjectSetView]:
     """The newest version of each set, by name."""
-    return catalog.parts.index.object_sets()
+    return datasets.object_sets()
 
 
 @sets_router.get("/{name}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
-def get_object_set(name: DatasetName, catalog: CatalogOf) -> ObjectSetView:
+def get_object_set(name: DatasetName, datasets: DatasetsOf) -> ObjectSetView:
     """The newest version of a set."""
-    return catalog.parts.index.object_set(name)
+    return datasets.object_set(name)
 
 
 def _placed(dataset: DatasetView, response: Response) -> DatasetView:

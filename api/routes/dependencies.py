@@ -1,21 +1,41 @@
-"""What routes ask for: the catalogue of this application, and the right to use it."""
+"""What routes ask for: the nouns of this application, and the right to use them."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any
 
-from fastapi import Depends, Query, Request
+from fastapi import Depends, FastAPI, Query, Request
 
 from api.access.auth import authorize
+from api.access.idempotency import Idempotency
 from api.access.keys import Scope
-from api.catalog.catalog import Catalog
+from api.access.quotas import Quotas
+from api.access.unfinished import unfinished
+from api.catalog.assets import Assets
+from api.catalog.datasets import Datasets
+from api.catalog.grasps import Grasps
+from api.catalog.jobs import Jobs
+from api.catalog.overview import Overview
+from api.catalog.shards import Shards
+from service.pipeline.backends import Parts
+from service.queue.address import redis_url
+from service.queue.connection import connect
+from service.store.store import Store
 
 MAX_LIMIT = 200
 
 
-def get_catalog(request: Request) -> Catalog:
-    """The catalogue that `create_app` opened."""
-    return request.app.state.catalog
+def provide(app: FastAPI, parts: Parts) -> None:
+    """Put what routes ask for over these parts."""
+    redis = connect(redis_url(parts.settings), patience=1)
+    quotas = Quotas(parts.settings, redis, lambda ids: unfinished(parts.index, ids))
+    state = app.state
+    state.store = parts.store
+    state.grasps, state.shards = Grasps(parts), Shards(parts)
+    state.jobs = Jobs(parts, quotas, Idempotency(redis), state.grasps, state.shards)
+    state.datasets, state.assets = Datasets(parts, quotas), Assets(parts)
+    state.overview = Overview(parts, state.jobs)
 
 
 def may_read(request: Request) -> None:
@@ -32,6 +52,20 @@ def may_scrape(request: Request) -> None:
         authorize(request, Scope.READ)
 
 
-CatalogOf = Annotated[Catalog, Depends(get_catalog)]
+def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
+    # A coroutine, because FastAPI would take a thread for a plain function.
+    async def found(request: Request) -> Any:
+        return getattr(request.app.state, name)
+
+    return found
+
+
+JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
+DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
+AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
+GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
+ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
+StoreOf = Annotated[Store, Depends(_provided("store"))]
+OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]

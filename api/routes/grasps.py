@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from api.models import GraspDetail, GraspPageQuery
 from api.problems import responses
-from api.routes.dependencies import CatalogOf, may_read
+from api.routes.dependencies import GraspsOf, may_read
 from api.routes.paging import link_next
 from service.index.views import GraspView, Page
 
@@ -16,20 +16,20 @@ router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 
 
 @router.get("/{shard_id}/{row}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
-def get_grasp(shard_id: str, row: int, response: Response, catalog: CatalogOf) -> GraspDetail:
+def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> GraspDetail:
     """One grasp whole: its postures, and its quality at every contact threshold."""
     response.headers["Cache-Control"] = "private, max-age=86400"
-    return catalog.grasp(shard_id, row)
+    return grasps.one(shard_id, row)
 
 
 @router.get("", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 422, 503))
 def list_grasps(
     request: Request,
     response: Response,
-    catalog: CatalogOf,
+    grasps: GraspsOf,
     query: Annotated[GraspPageQuery, Query()],
 ) -> Page[GraspView]:
     """Grasps that pass every filter, in the order asked for."""
-    page = catalog.grasps(query, limit=query.limit, cursor=query.cursor)
+    page = grasps.page(query, limit=query.limit, cursor=query.cursor)
     link_next(request, response, page.next)
     return page

@@ -11,7 +11,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from api.catalog import events
 from api.models import Job, JobDetail
 from api.problems import responses
-from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read, may_submit
+from api.routes.dependencies import Cursor, JobsOf, Limit, may_read, may_submit
 from api.routes.paging import link_next
 from service.index.views import Page
 from service.model.domain import JobRequest, State
@@ -40,11 +40,9 @@ IdempotencyKey = Annotated[
         others={200: {"model": JobDetail, "description": "It has ended"}},
     ),
 )
-def submit(
-    body: JobRequest, response: Response, catalog: CatalogOf, idempotency_key: IdempotencyKey = None
-) -> JobDetail:
+def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
     """Submit a job. The same content is the same job: its id follows from the request, the hand and the object."""
-    job = catalog.submit(body, idempotency_key=idempotency_key)
+    job = jobs.submit(body, idempotency_key=idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if job.state.is_final:
         response.status_code = 200
@@ -57,7 +55,7 @@ def submit(
 def list_jobs(
     request: Request,
     response: Response,
-    catalog: CatalogOf,
+    jobs: JobsOf,
     state: State | None = None,
     hand: Annotated[str | None, Query(max_length=64)] = None,
     object: Annotated[str | None, Query(max_length=64)] = None,
@@ -65,15 +63,15 @@ def list_jobs(
     cursor: Cursor = None,
 ) -> Page[Job]:
     """Jobs, the newest first."""
-    page = catalog.jobs(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
+    page = jobs.page(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
 
 
 @router.get("/{job_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
-def get_job(job_id: str, catalog: CatalogOf) -> JobDetail:
+def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     """A job with the progress of its stages, failed attempts, mean metrics and shards."""
-    return catalog.job(job_id)
+    return jobs.one(job_id)
 
 
 @router.post(
@@ -82,17 +80,17 @@ def get_job(job_id: str, catalog: CatalogOf) -> JobDetail:
     dependencies=[Depends(may_submit)],
     responses=responses(401, 403, 404, 409, 503),
 )
-def cancel(job_id: str, catalog: CatalogOf) -> JobDetail:
+def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
     """Stop a job's waiting and running tasks; what is written stays."""
-    return catalog.cancel(job_id)
+    return jobs.cancel(job_id)
 
 
 @router.post(
     "/{job_id}/retry", status_code=202, dependencies=[Depends(may_submit)], responses=responses(401, 403, 404, 409, 503)
 )
-def retry(job_id: str, catalog: CatalogOf) -> JobDetail:
+def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     """Run again what failed or was cancelled; what is written is not made twice."""
-    return catalog.retry(job_id)
+    return jobs.retry(job_id)
 
 
 @router.delete(
@@ -101,14 +99,14 @@ def retry(job_id: str, catalog: CatalogOf) -> JobDetail:
     dependencies=[Depends(may_submit)],
     responses=responses(401, 403, 404, 409, 503),
 )
-def delete(job_id: str, catalog: CatalogOf) -> None:
+def delete(job_id: str, jobs: JobsOf) -> None:
     """Take away a job that has ended. Its shards, where no other job needs them, follow after a grace time."""
-    catalog.delete_job(job_id)
+    jobs.delete(job_id)
 
 
-def known_job(job_id: str, catalog: CatalogOf) -> None:
+def known_job(job_id: str, jobs: JobsOf) -> None:
     """A stream has begun before its first event: what can be refused is refused before that."""
-    catalog.job_state(job_id)
+    jobs.moving(job_id)
 
 
 @router.get(
@@ -117,7 +115,7 @@ def known_job(job_id: str, catalog: CatalogOf) -> None:
     response_class=EventSourceResponse,
     responses=responses(401, 403, 404, 503),
 )
-async def watch(job_id: str, request: Request, catalog: CatalogOf) -> AsyncIterable[ServerSentEvent]:
+async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[ServerSentEvent]:
     """Progress of a job: `progress` with the job at each change, `end` with its last state."""
-    async for event in events.job_events(catalog, job_id, request):
+    async for event in events.job_events(jobs, job_id, request):
         yield event

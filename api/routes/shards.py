@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -12,7 +11,7 @@ from fastapi.responses import RedirectResponse, StreamingResponse
 from api.models import Shard
 from api.problems import ApiError, responses
 from api.routes.conditions import is_known, range_applies
-from api.routes.dependencies import CatalogOf, Cursor, Limit, may_read
+from api.routes.dependencies import Cursor, Limit, ShardsOf, may_read
 from api.routes.paging import link_next
 from service.index.views import Page
 
@@ -27,22 +26,22 @@ _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 def list_shards(
     request: Request,
     response: Response,
-    catalog: CatalogOf,
+    shards: ShardsOf,
     job: Annotated[str | None, Query(max_length=64)] = None,
     kind: Literal["base", "scene", "views"] | None = None,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> Page[Shard]:
     """Shards, all or those of a job."""
-    page = catalog.shards(job=job, kind=kind, limit=limit, cursor=cursor)
+    page = shards.page(job=job, kind=kind, limit=limit, cursor=cursor)
     link_next(request, response, page.next)
     return page
 
 
 @router.get("/{shard_id}", dependencies=[Depends(may_read)], responses=responses(401, 403, 404, 503))
-def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
+def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     """A shard with its whole manifest."""
-    return catalog.shard(shard_id)
+    return shards.one(shard_id)
 
 
 @router.head("/{shard_id}/file", dependencies=[Depends(may_read)], include_in_schema=False)
@@ -64,21 +63,21 @@ def get_shard(shard_id: str, catalog: CatalogOf) -> Shard:
         },
     ),
 )
-def get_file(shard_id: str, request: Request, catalog: CatalogOf) -> Response:
+def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
     """The HDF5 file: from the store itself where it signs addresses, else through the API, by Range if asked.
 
     If-None-Match and If-Range are heeded. One that is not what its checksum says is refused.
     """
-    shard = catalog.checked_shard(shard_id)
+    shard = shards.intact(shard_id)
     # The name says the content: what was fetched once never changes.
     headers = {"ETag": f'"{shard.sha256}"', "Cache-Control": "private, max-age=31536000, immutable"}
     if is_known(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     only_head = request.method == "HEAD"
     # A signed address is for GET alone.
-    if not only_head and (address := catalog.store.sign(shard.key)) is not None:
+    if not only_head and (address := shards.address(shard)) is not None:
         return RedirectResponse(address, status_code=307)
-    size = catalog.store.size(shard.key)
+    size = shards.size(shard)
     wanted = request.headers.get("range")
     span = None if only_head or not range_applies(request.headers, headers["ETag"]) else parse_range(wanted, size)
     start, end = span or (0, size)
@@ -91,7 +90,7 @@ def get_file(shard_id: str, request: Request, catalog: CatalogOf) -> Response:
         return Response(media_type=_MEDIA_TYPE, headers=headers)
     if span is not None:
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
-    chunks: Iterator[bytes] = catalog.store.stream(shard.key, start, end - start)
+    chunks = shards.stream(shard, start, end - start)
     status = 200 if span is None else 206
     return StreamingResponse(chunks, status_code=status, media_type=_MEDIA_TYPE, headers=headers)
 

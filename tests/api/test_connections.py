@@ -160,8 +160,10 @@ def test_a_stream_of_events_ends_with_its_key(
 
     async def watch() -> None:
         request = Request({"type": "http", "app": app, "headers": headers, "state": {}}, nothing)
-        catalog = app.state.catalog
-        stream = events.job_events(catalog, job, request) if what == "job" else events.service_events(catalog, request)
+        if what == "job":
+            stream = events.job_events(app.state.jobs, job, request)
+        else:
+            stream = events.service_events(app.state.overview, request)
         async with asyncio.timeout(20):
             await anext(stream)
             if end == "revoked":

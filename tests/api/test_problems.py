@@ -116,7 +116,7 @@ def test_an_unforeseen_error_tells_nothing_of_its_inside(
     def burst() -> None:
         raise RuntimeError("secret: /home/someone")
 
-    monkeypatch.setattr(app.state.catalog, "stats", burst)
+    monkeypatch.setattr(app.state.overview, "stats", burst)
     document = problem(http.get("/v1/stats"), 500, "internal")
     assert "secret" not in str(document)
 

@@ -15,7 +15,7 @@ from tests.damage import overwrite
 
 
 def asked_anew(app: FastAPI) -> dict[str, object]:
-    app.state.catalog._probes._known = None
+    app.state.overview._probes._known = None
     with TestClient(app, base_url="http://127.0.0.1:8000") as http:
         answer = http.get("/readyz")
         return {"status": answer.status_code, **answer.json()["parts"]["index"]}

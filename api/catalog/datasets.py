@@ -1,0 +1,136 @@
+"""Datasets and named sets of objects.
+
+A dataset counts against its key's quota as one job with all its grasps until it ends, and only its owner changes it.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from api.access.auth import caller, caller_id, must_own
+from api.access.quotas import Quotas
+from api.access.unfinished import DATASET_PREFIX
+from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
+from service.index.views import MatrixCell, Page
+from service.model.dataset_records import Snapshot
+from service.model.domain import State
+from service.pipeline import deletion
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.cost import Estimate, estimate
+from service.pipeline.datasets.spec import DatasetRequest, Matrix
+from service.pipeline.fidelity_choice import Resolver
+from service.store.datasets import load_snapshot
+
+log = logging.getLogger(__name__)
+
+
+class Datasets:
+    """Datasets of everybody; what changes one asks whose it is."""
+
+    def __init__(self, parts: Parts, quotas: Quotas) -> None:
+        self._parts = parts
+        self._quotas = quotas
+
+    def create(self, request: DatasetRequest) -> DatasetView:
+        """`actions.create` within the caller's quota.
+
+        Raises:
+            QuotaError: the caller's key has all it may have.
+        """
+        hands, objects = actions.members(self._parts, request)
+        asked = len(hands) * len(objects) * request.grasps
+        with self._quotas.claim(caller.get(), DATASET_PREFIX + request.name, asked) as claim:
+            dataset, claim.counts = actions.create(self._parts, request, owner=caller_id())
+        return dataset
+
+    def cancel(self, name: str) -> DatasetView:
+        """`actions.cancel` of the caller's own dataset.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        self._owned(name)
+        return actions.cancel(self._parts, name)
+
+    def retry(self, name: str) -> DatasetView:
+        """`actions.retry` of the caller's own dataset within his quota: it counts the cells that are started again.
+
+        Raises:
+            NotYours: another key submitted it.
+            QuotaError: the caller's key has all it may have.
+        """
+        dataset = self._owned(name)
+        again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
+        grasps = again * dataset.options.grasps
+        with self._quotas.claim(caller.get(), DATASET_PREFIX + name, grasps, is_new=False):
+            return actions.retry(self._parts, name)
+
+    def delete(self, name: str) -> None:
+        """Take a dataset away that has ended.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        self._owned(name)
+        deletion.delete_dataset(self._parts, name, owner=caller_id())
+        log.info("dataset %s deleted", name)
+
+    def estimate(self, matrix: Matrix) -> Estimate:
+        """What a matrix will cost. Nothing is recorded."""
+        return estimate(self._parts.index, matrix, Resolver(self._parts.store))
+
+    def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+        """Datasets, the newest first."""
+        return self._parts.index.datasets(limit=limit, cursor=cursor)
+
+    def one(self, name: str) -> DatasetView:
+        return self._parts.index.dataset(name)
+
+    def cells(
+        self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
+    ) -> Page[CellView]:
+        """Each hand x object of a dataset with its job, hand by hand."""
+        return self._parts.index.dataset_cells(name, state=state, limit=limit, cursor=cursor)
+
+    def matrix(self) -> list[MatrixCell]:
+        """Each hand x object of which there is a job, of a dataset or not."""
+        return self._parts.index.matrix()
+
+    def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
+        """Write down which shards a dataset holds now; and whether that made a new snapshot."""
+        return actions.snapshot(self._parts, name)
+
+    def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
+        """Snapshots of a dataset, the newest first."""
+        return self._parts.index.snapshots(name, limit=limit, cursor=cursor)
+
+    def snapshot(self, name: str, digest: str) -> Snapshot:
+        """A snapshot with its list of shards."""
+        return load_snapshot(self._parts.store, name, digest)
+
+    def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
+        """Give objects a name together; others under the same name are its next version.
+
+        Raises:
+            NotYours: another key made the set.
+        """
+        return actions.add_object_set(
+            self._parts,
+            name,
+            objects,
+            owner=caller_id(),
+            may_follow=lambda owner: must_own(owner, f"the set {name!r}"),
+        )
+
+    def object_sets(self) -> list[ObjectSetView]:
+        """The newest version of each set, by name."""
+        return self._parts.index.object_sets()
+
+    def object_set(self, name: str) -> ObjectSetView:
+        return self._parts.index.object_set(name)
+
+    def _owned(self, name: str) -> DatasetView:
+        dataset = self._parts.index.dataset(name)
+        must_own(dataset.owner, f"dataset {name!r}")
+        return dataset

@@ -1,0 +1,184 @@
+"""Jobs: submitted within the caller's quota, shown with their progress, changed by those who own them."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Sequence
+from typing import Final
+
+from api.access.auth import caller, caller_id, must_own
+from api.access.idempotency import Idempotency
+from api.access.quotas import Quotas
+from api.catalog.grasps import MEAN_METRICS, Grasps
+from api.catalog.progress import Paces, eta_of_job, progress_of_job, stage_statuses
+from api.catalog.shards import Shards
+from api.models import Job, JobDetail, LossCurve, MeanMetrics
+from service.index.views import JobView, Page, TaskView
+from service.logs import bind
+from service.model.domain import JobRequest, Stage, State
+from service.pipeline import deletion, job_actions
+from service.pipeline.backends import Parts
+
+log = logging.getLogger(__name__)
+_PAGE: Final = 200
+_ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
+_KEPT_LOSSES: Final = 256
+_LOSS_BATCHES: Final = 8
+
+
+class Jobs:
+    """Jobs of everybody; what changes one asks whose it is."""
+
+    def __init__(self, parts: Parts, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards) -> None:
+        self._parts = parts
+        self._quotas = quotas
+        self._idempotency = idempotency
+        self._grasps = grasps
+        self._shards = shards
+        self._paces = Paces()
+        self._losses: dict[str, tuple[int, list[float]] | None] = {}
+
+    def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
+        """Record a job, or find the same one.
+
+        Raises:
+            InputError: the idempotency key came with another request before.
+            QuotaError: the caller's key has all it may have.
+        """
+        key = caller.get()
+        bound: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+        if idempotency_key is not None:
+            bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
+        with bound:
+            record = job_actions.prepare(self._parts, request, owner=caller_id())
+            with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
+                job, is_new = job_actions.enter(self._parts, record)
+                claim.counts = is_new
+                log.info("job submitted" if is_new else "job was there already")
+        return self._detail(job)
+
+    def cancel(self, job_id: str) -> JobDetail:
+        """Stop a job.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        self._owned(job_id)
+        with bind(job=job_id):
+            job = job_actions.cancel(self._parts, job_id)
+            log.info("job cancelled")
+        return self._detail(job)
+
+    def retry(self, job_id: str) -> JobDetail:
+        """Run again what failed or was cancelled.
+
+        Raises:
+            NotYours: another key submitted it.
+            QuotaError: the caller's key has all it may have.
+        """
+        grasps = self._owned(job_id).request.grasps
+        with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
+            job = job_actions.retry(self._parts, job_id)
+            log.info("job retried")
+        return self._detail(job)
+
+    def delete(self, job_id: str) -> None:
+        """Take a job away that has ended.
+
+        Raises:
+            NotYours: another key submitted it.
+        """
+        self._owned(job_id)
+        with bind(job=job_id):
+            deletion.delete_job(self._parts, job_id, owner=caller_id())
+            log.info("job deleted")
+
+    def page(
+        self,
+        *,
+        state: State | None = None,
+        hand: str | None = None,
+        object: str | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[Job]:
+        """Jobs, newest first."""
+        page = self._parts.index.jobs(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
+        return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
+
+    def one(self, job_id: str) -> JobDetail:
+        """A job with its attempts, mean metrics and shards."""
+        return self._detail(self._parts.index.job(job_id))
+
+    def moving(self, job_id: str) -> Job:
+        """A job with the progress of its stages and nothing else: what a stream of events repeats."""
+        return self._job(self._parts.index.job(job_id), self._running(job_id))
+
+    def loss_curve(self, job: JobDetail) -> LossCurve | None:
+        """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
+        batches = [shard.id for shard in job.shards if shard.kind == "base"][:_LOSS_BATCHES]
+        kept = [self._loss(shard) for shard in batches]
+        curves = [curve for curve in kept if curve is not None]
+        if not curves:
+            return None
+        length = min(len(losses) for _, losses in curves)
+        means = [sum(losses[i] for _, losses in curves) / len(curves) for i in range(length)]
+        return LossCurve(iterations=[(i + 1) * curves[0][0] for i in range(length)], losses=means)
+
+    def _loss(self, shard_id: str) -> tuple[int, list[float]] | None:
+        """Iterations between two values, and the values; a shard never changes, so its answer is kept."""
+        if shard_id not in self._losses:
+            info = self._parts.index.shard(shard_id).manifest.get("info", {})
+            curve = [value for value in info.get("loss_curve") or [] if value is not None]
+            if len(self._losses) >= _KEPT_LOSSES:
+                self._losses.clear()
+            self._losses[shard_id] = (int(info.get("chunk", 1)), curve) if curve else None
+        return self._losses[shard_id]
+
+    def _owned(self, job_id: str) -> JobView:
+        job = self._parts.index.job(job_id)
+        must_own(job.owner, f"job {job_id}")
+        return job
+
+    def _detail(self, job: JobView) -> JobDetail:
+        mean = {data.metric: data.mean for data in self._grasps.histograms(job)}
+        shards = self._shards.page(job=job.id, limit=_PAGE).items
+        return JobDetail(
+            **self._job(job, self._running(job.id)).model_dump(),
+            request=job.request,
+            note=job.note,
+            audited=job.audited,
+            audit_held=job.audit_held,
+            hand_digest=job.hand_digest,
+            object_digest=job.object_digest,
+            attempts=self._parts.index.attempts(job=job.id, limit=50),
+            mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
+            shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
+        )
+
+    def _job(self, job: JobView, running: Sequence[TaskView]) -> Job:
+        fidelity = job.request.fidelity
+        stages = stage_statuses(job, running, self._paces)
+        return Job(
+            id=job.id,
+            state=job.state,
+            hand=job.request.hand,
+            object=job.request.object,
+            method=job.request.method,
+            fidelity=fidelity if isinstance(fidelity, str) else fidelity.name,
+            requested=job.request.grasps,
+            grasps=job.grasps,
+            valid=job.valid,
+            tried=job.tried,
+            progress=progress_of_job(job),
+            eta_s=eta_of_job(job, stages),
+            created=job.created,
+            owner=job.owner,
+            finished=job.finished,
+            reason=job.reason,
+            stages=stages,
+        )
+
+    def _running(self, job_id: str) -> list[TaskView]:
+        return self._parts.index.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items

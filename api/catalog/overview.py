@@ -1,0 +1,129 @@
+"""The service as a whole: its workers, its queue, its health, its numbers."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+from api.catalog.health import Probes
+from api.catalog.jobs import Jobs
+from api.metrics import Snapshot
+from api.models import Health, Part, Worker
+from service.index.at_scrape import read_index
+from service.index.notes import Damage
+from service.index.views import FailureGroup, Stats, TaskView
+from service.model.digests import digest_json
+from service.model.domain import Lane, Stage
+from service.model.errors import NotFoundError, UnavailableError
+from service.pipeline.backends import Parts
+from service.pipeline.keeper import PART as KEEPER
+from service.queue.at_scrape import QueueNow
+
+_DAMAGE_SHOWN: Final = 5
+_JOBS_WATCHED: Final = 20
+#: The fingerprint is made anew at most this often, however many pages watch it [s].
+FINGERPRINT_S: Final = 1.0
+
+
+class Overview:
+    """What the home page, probes and Prometheus ask for; it changes nothing."""
+
+    def __init__(self, parts: Parts, jobs: Jobs) -> None:
+        self._parts = parts
+        self._jobs = jobs
+        self._probes = Probes(parts)
+        self._fingerprint = (0.0, "")
+        self._lock = threading.Lock()
+
+    def workers(self) -> list[Worker]:
+        """Workers, the living first, each with the stage it does and the age of its lease."""
+        known = self._parts.index.workers()
+        doing = self._parts.index.outputs([worker.task_id for worker in known if worker.task_id])
+        try:
+            pulses = self._queue_now().workers
+        except UnavailableError:
+            pulses = {}
+        return [
+            Worker(
+                **worker.model_dump(),
+                stage=Stage(doing[worker.task_id][0]) if worker.task_id in doing else None,
+                lease_age_s=round(pulses[worker.name].lease_age_s, 3) if worker.name in pulses else None,
+            )
+            for worker in known
+        ]
+
+    def task_of(self, worker: Worker) -> TaskView | None:
+        """What a worker does; a check of an upload is no task of the index."""
+        if worker.state != "busy" or not worker.task_id:
+            return None
+        try:
+            return self._parts.index.task(worker.task_id)
+        except NotFoundError:
+            return None
+
+    def stats(self) -> Stats:
+        return self._parts.index.stats()
+
+    def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
+        """Valid grasps made in each of the last minutes, the oldest first."""
+        start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
+        made = [0] * minutes
+        for bucket in self._parts.index.throughput(since=start.isoformat().replace("+00:00", "Z"), bucket_s=60):
+            minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
+            made[min(max(minute, 0), minutes - 1)] += bucket.valid
+        return made
+
+    def failures(self, *, limit: int = 5) -> list[FailureGroup]:
+        return self._parts.index.failures(limit=limit)
+
+    def depths(self) -> dict[tuple[Lane, Stage], int]:
+        """Waiting tasks by lane and stage."""
+        return self._parts.queue.depths()
+
+    def health(self) -> Health:
+        """State of the three parts; asked anew at most every two seconds."""
+        return self._probes.health()
+
+    def damage(self) -> tuple[int, list[Damage]]:
+        """Number of objects of the store known to be damaged or missing, and the first of them."""
+        return self._parts.index.known_damage(limit=_DAMAGE_SHOWN)
+
+    def snapshot(self) -> Snapshot:
+        """The service as Prometheus sees it; a part that is away leaves its numbers out."""
+        found = Snapshot()
+        parts = self.health().parts
+        found.add_parts({name: _seconds(part) for name, part in parts.items()})
+        with contextlib.suppress(UnavailableError):
+            queue = self._parts.queue
+            found.add_queue(self._queue_now(), keeper_is_up=queue.announced(KEEPER))
+            found.add_sums(queue.counted())
+        with contextlib.suppress(UnavailableError):
+            found.add_index(read_index(self._parts.index))
+        return found
+
+    def fingerprint(self) -> str:
+        """Another text whenever a job, a task or a worker changed."""
+        with self._lock:
+            at, digest = self._fingerprint
+            now = time.monotonic()
+            if not digest or now - at >= FINGERPRINT_S:
+                digest = self._digest()
+                self._fingerprint = (now, digest)
+            return digest
+
+    def _digest(self) -> str:
+        jobs = self._jobs.page(limit=_JOBS_WATCHED).items
+        workers = [(worker.name, worker.state, worker.task_id) for worker in self.workers()]
+        moving = [(job.id, job.state, round(job.progress, 3)) for job in jobs]
+        return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
+
+    def _queue_now(self) -> QueueNow:
+        # A worker's registration lives for whole seconds: see `worker.process.heartbeat`.
+        return self._parts.queue.now(lease_s=max(2, round(self._parts.settings.lease_s)))
+
+
+def _seconds(part: Part) -> float | None:
+    return None if part.latency_ms is None else part.latency_ms / 1000

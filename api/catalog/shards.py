@@ -1,0 +1,68 @@
+"""Shards: the files that jobs make, and what their manifests say."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import Literal
+
+from api.models import Shard
+from service.index.views import Page, ShardView
+from service.pipeline.backends import Parts
+from service.store.integrity import Checked
+
+
+class Shards:
+    """Shards of all jobs; they never change."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._checked = Checked(parts.store)
+
+    def page(
+        self,
+        *,
+        job: str | None = None,
+        kind: Literal["base", "scene", "views"] | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> Page[Shard]:
+        """Shards, all or those of a job."""
+        page = self._parts.index.shards(job=job, kind=kind, limit=limit, cursor=cursor)
+        return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
+
+    def one(self, shard_id: str) -> Shard:
+        return _shard(self._parts.index.shard(shard_id))
+
+    def intact(self, shard_id: str) -> Shard:
+        """A shard whose file is what its checksum says; read through once, then again only where it was changed.
+
+        Raises:
+            DamagedShard: its file is gone, or has another checksum.
+        """
+        shard = self.one(shard_id)
+        self._checked.check(shard.key, shard.sha256)
+        return shard
+
+    def address(self, shard: Shard) -> str | None:
+        """Where the store itself hands the file out to a GET; None where it does not."""
+        return self._parts.store.sign(shard.key)
+
+    def size(self, shard: Shard) -> int:
+        """Bytes of the file as it lies in the store."""
+        return self._parts.store.size(shard.key)
+
+    def stream(self, shard: Shard, start: int, length: int) -> Iterator[bytes]:
+        """Bytes of the file, in chunks."""
+        return self._parts.store.stream(shard.key, start, length)
+
+    def job_of(self, shard_id: str) -> str | None:
+        """A job that a shard belongs to; None where it is gone."""
+        return self._parts.index.job_of_shard(shard_id)
+
+    def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Digests of the hand and the object of each shard."""
+        return self._parts.index.assets_of_shards(ids)
+
+
+def _shard(shard: ShardView) -> Shard:
+    return Shard(**shard.model_dump(), file=f"/v1/shards/{shard.id}/file")
