@@ -13,7 +13,7 @@ from service.index.views import AssetView
 from service.model import names
 from service.model.domain import AssetKind
 from service.pipeline.backends import Parts
-from service.store.library import load_asset
+from service.store.library import load_asset, load_asset_files
 from tests.api.dashboard.test_pages import FORM
 
 MESH = ("part.stl", b"solid part\nendsolid\n")
@@ -85,7 +85,7 @@ def test_a_refused_file_is_checked_again_in_other_units_without_being_sent_again
     assert http.post("/submit", data=fields_of(waiting.text), follow_redirects=False).status_code == 303
     assert jobs(parts) == ["part"]
     assert meant.digest != first.digest
-    assert json.loads(form_uploads.load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
+    assert json.loads(load_asset_files(parts.store, AssetKind.OBJECT, meant.digest)["asset.json"]) == {
         "file": "part.stl", "units": "mm",
     }  # fmt: skip
 
