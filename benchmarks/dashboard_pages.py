@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     settings = Settings(data_dir=given.data_dir)
     index = Index(settings.resolved_index_url)
     parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
-    stats = index.stats()
+    stats = index.overview.stats()
     say(f"{stats.grasps:,} grasps, {sum(stats.jobs.values()):,} jobs, {stats.shards:,} shards")
     paths = pages(parts)
     with serving(settings, parts) as address:
@@ -66,8 +66,8 @@ def say(line: str) -> None:
 
 def pages(parts: Parts) -> list[str]:
     """One address of each kind of page that the index can show."""
-    jobs = [job.id for job in parts.index.jobs(limit=3).items]
-    pairs = parts.index.matrix()[:1]
+    jobs = [job.id for job in parts.index.jobs.page(limit=3).items]
+    pairs = parts.index.overview.matrix()[:1]
     found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
     found += [f"/grasps?hand={pair.hand}&object={pair.object}&sort=penetration_depth_mm&order=asc" for pair in pairs]
     found += ["/grasps?valid=true&min_epsilon=0.3&max_penetration_depth_mm=0.5", "/workers", "/chart", "/submit"]

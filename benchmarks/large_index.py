@@ -50,14 +50,14 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
     Returns:
         number of rows of each table.
     """
-    if index.has_jobs():
+    if index.feed.has_jobs():
         raise SystemExit("the index is not empty; give another data folder or database")
     for asset in publish_builtins(store):
-        index.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
+        index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
     maker = _Maker(index, grasps // jobs, jobs, np.random.default_rng(seed))
-    with index.writing() as connection:
+    with index.database.writing() as connection:
         maker.insert(connection)
-    with index.reading() as connection:
+    with index.database.reading() as connection:
         if connection.dialect.name == "postgresql":  # which does so by itself in a while
             connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM ANALYZE")
     return maker.counts
@@ -69,8 +69,8 @@ class _Maker:
         share = sum(_MIX[state] * _done_share(state) for state in _MIX) / sum(_MIX.values())
         self._grasps_a_job = max(1, round(grasps_a_job / share))
         self._jobs, self._random = jobs, random
-        self._hands = index.assets(AssetKind.HAND).items
-        self._objects = index.assets(AssetKind.OBJECT).items
+        self._hands = index.assets.page(AssetKind.HAND).items
+        self._objects = index.assets.page(AssetKind.OBJECT).items
         self._states = [state for state, n in _MIX.items() for _ in range(n)]
         self._now = datetime.now(UTC)
         self.counts = {"jobs": 0, "tasks": 0, "attempts": 0, "shards": 0, "grasps": 0}

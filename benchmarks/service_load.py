@@ -74,7 +74,7 @@ def run(parts: Parts, batches: int, seed: int) -> float:
     """Seconds from the submission of a bulk job to its end."""
     start = time.perf_counter()
     job = job_actions.submit(parts, request(grasps=32 * batches, seed=seed), lane=Lane.BULK)[0].id
-    while parts.index.job(job).state is not State.SUCCEEDED:
+    while parts.index.jobs.get(job).state is not State.SUCCEEDED:
         time.sleep(0.05)
     return time.perf_counter() - start
 
@@ -125,7 +125,7 @@ def indexer(url: str | None) -> None:
         made = [make_shard(parts.store, message_of(record, t, attempt=1, max_attempt=3)) for t in plan(record)]
         start = time.perf_counter()
         for begin in range(0, len(made), 100):
-            index.add_manifests(made[begin : begin + 100])
+            index.write.add_manifests(made[begin : begin + 100])
         rate = len(made) / (time.perf_counter() - start)
         index.close()
     say(f"| indexer | {rate:.0f} shards/s | {32 * rate:.0f} grasps/s |")

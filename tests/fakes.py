@@ -95,7 +95,7 @@ def add_assets(parts: Parts) -> None:
         asset = publish_asset(parts.store, kind, name, files)
         check = b'{"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}'
         parts.store.put(names.asset_check(kind, asset.digest), check)
-        parts.index.add_asset(asset, {"verdict": "accept", "message": "fine"})
+        parts.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
 
 
 def request(**changes: Any) -> JobRequest:

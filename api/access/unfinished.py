@@ -13,5 +13,5 @@ DATASET_PREFIX: Final = "dataset:"
 def unfinished(index: Index, ids: Collection[str]) -> set[str]:
     """Of these jobs and datasets, as quotas name them, those that have not ended."""
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
-    found = index.unfinished_of([one for one in ids if not one.startswith(DATASET_PREFIX)])
-    return found | {DATASET_PREFIX + name for name in index.unfinished_datasets(names)}
+    found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
+    return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}

@@ -27,10 +27,10 @@ class Assets:
 
     def page(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
         """All of a kind, by name."""
-        return self._parts.index.assets(kind, limit=limit, cursor=cursor)
+        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor)
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
-        return self._parts.index.asset(kind, name)
+        return self._parts.index.assets.get(kind, name)
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         """Its files as they were uploaded, `asset.json` among them."""
@@ -54,11 +54,11 @@ class Assets:
         index, store = self._parts.index, self._parts.store
         asset = library.store_files(store, kind, name, files, owner=caller_id())
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
-        with index.writing() as connection:
+        with index.database.writing() as connection:
             self._refuse_taken(kind, name, asset.digest)
             asset = library.record_asset(store, asset)
-            index.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
-        return index.asset(kind, asset.digest)
+            index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
+        return index.assets.get(kind, asset.digest)
 
     def delete(self, kind: AssetKind, name: str) -> None:
         """Take a hand or object away that nothing needs.
@@ -66,7 +66,7 @@ class Assets:
         Raises:
             NotYours: another key uploaded it.
         """
-        asset = self._parts.index.asset(kind, name)
+        asset = self._parts.index.assets.get(kind, name)
         if not asset.builtin:
             must_own(asset.owner, f"{kind.value} {name!r}")
         deletion.delete_asset(self._parts, kind, asset.digest, owner=caller_id())
@@ -74,7 +74,7 @@ class Assets:
 
     def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
         with contextlib.suppress(NotFoundError):
-            known = self._parts.index.asset(kind, name)
+            known = self._parts.index.assets.get(kind, name)
             # A refused upload holds no name: the same file with the mend must get in.
             if known.digest != digest and known.verdict != "refuse":
                 raise ConflictError(f"there is another {kind.value} named {name!r}; choose a name of its own")

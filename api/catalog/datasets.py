@@ -82,20 +82,20 @@ class Datasets:
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
         """Datasets, the newest first."""
-        return self._parts.index.datasets(limit=limit, cursor=cursor)
+        return self._parts.index.datasets.page(limit=limit, cursor=cursor)
 
     def one(self, name: str) -> DatasetView:
-        return self._parts.index.dataset(name)
+        return self._parts.index.datasets.get(name)
 
     def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
         """Each hand x object of a dataset with its job, hand by hand."""
-        return self._parts.index.dataset_cells(name, state=state, limit=limit, cursor=cursor)
+        return self._parts.index.datasets.cells(name, state=state, limit=limit, cursor=cursor)
 
     def matrix(self) -> list[MatrixCell]:
         """Each hand x object of which there is a job, of a dataset or not."""
-        return self._parts.index.matrix()
+        return self._parts.index.overview.matrix()
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Write down which shards a dataset holds now; and whether that made a new snapshot."""
@@ -103,7 +103,7 @@ class Datasets:
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
         """Snapshots of a dataset, the newest first."""
-        return self._parts.index.snapshots(name, limit=limit, cursor=cursor)
+        return self._parts.index.datasets.snapshots(name, limit=limit, cursor=cursor)
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         """A snapshot with its list of shards."""
@@ -125,12 +125,12 @@ class Datasets:
 
     def object_sets(self) -> list[ObjectSetView]:
         """The newest version of each set, by name."""
-        return self._parts.index.object_sets()
+        return self._parts.index.object_sets.newest()
 
     def object_set(self, name: str) -> ObjectSetView:
-        return self._parts.index.object_set(name)
+        return self._parts.index.object_sets.get(name)
 
     def _owned(self, name: str) -> DatasetView:
-        dataset = self._parts.index.dataset(name)
+        dataset = self._parts.index.datasets.get(name)
         must_own(dataset.owner, f"dataset {name!r}")
         return dataset

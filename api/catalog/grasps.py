@@ -30,11 +30,11 @@ class Grasps:
     def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         """Grasps that pass every filter."""
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
-        return self._index.grasps(grasp_filter(query), sort=sort, limit=limit, cursor=cursor)
+        return self._index.grasps.page(grasp_filter(query), sort=sort, limit=limit, cursor=cursor)
 
     def one(self, shard_id: str, row: int) -> GraspDetail:
         """One grasp with all that its shard says of it."""
-        grasp, shard = self._index.grasp(shard_id, row), self._index.shard(shard_id)
+        grasp, shard = self._index.grasps.get(shard_id, row), self._index.shards.get(shard_id)
         return self._files.detail(grasp, shard)
 
     def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:
@@ -52,9 +52,9 @@ class Grasps:
                 Histogram(
                     metric=metric,
                     **vars(summary),
-                    counts=self._index.histogram(where, metric, summary.low, summary.high, bins),
+                    counts=self._index.statistics.histogram(where, metric, summary.low, summary.high, bins),
                 )
-                for metric, summary in self._index.summaries(where, MEAN_METRICS).items()
+                for metric, summary in self._index.statistics.summaries(where, MEAN_METRICS).items()
             ]
             if len(self._histograms) >= _KEPT_HISTOGRAMS:
                 self._histograms.clear()

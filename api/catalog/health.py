@@ -52,7 +52,7 @@ class Probes:
 
     def _index(self) -> Part:
         """An index that may lack what the store has is not ready: jobs would seem to be gone."""
-        part, made = _answering(self._parts.index.ping()), self._parts.index.completeness()
+        part, made = _answering(self._parts.index.database.ping()), self._parts.index.notes.completeness()
         if made is None:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
         if made.left_out:

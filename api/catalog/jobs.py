@@ -104,16 +104,16 @@ class Jobs:
         cursor: str | None = None,
     ) -> Page[Job]:
         """Jobs, newest first."""
-        page = self._parts.index.jobs(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
+        page = self._parts.index.jobs.page(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
     def one(self, job_id: str) -> JobDetail:
         """A job with its attempts, mean metrics and shards."""
-        return self._detail(self._parts.index.job(job_id))
+        return self._detail(self._parts.index.jobs.get(job_id))
 
     def moving(self, job_id: str) -> Job:
         """A job with the progress of its stages and nothing else: what a stream of events repeats."""
-        return self._job(self._parts.index.job(job_id), self._running(job_id))
+        return self._job(self._parts.index.jobs.get(job_id), self._running(job_id))
 
     def loss_curve(self, job: JobDetail) -> LossCurve | None:
         """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
@@ -129,7 +129,7 @@ class Jobs:
     def _loss(self, shard_id: str) -> tuple[int, list[float]] | None:
         """Iterations between two values, and the values; a shard never changes, so its answer is kept."""
         if shard_id not in self._losses:
-            info = self._parts.index.shard(shard_id).manifest.get("info", {})
+            info = self._parts.index.shards.get(shard_id).manifest.get("info", {})
             curve = [value for value in info.get("loss_curve") or [] if value is not None]
             if len(self._losses) >= _KEPT_LOSSES:
                 self._losses.clear()
@@ -137,7 +137,7 @@ class Jobs:
         return self._losses[shard_id]
 
     def _owned(self, job_id: str) -> JobView:
-        job = self._parts.index.job(job_id)
+        job = self._parts.index.jobs.get(job_id)
         must_own(job.owner, f"job {job_id}")
         return job
 
@@ -152,7 +152,7 @@ class Jobs:
             audit_held=job.audit_held,
             hand_digest=job.hand_digest,
             object_digest=job.object_digest,
-            attempts=self._parts.index.attempts(job=job.id, limit=50),
+            attempts=self._parts.index.jobs.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
             shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
         )
@@ -181,4 +181,4 @@ class Jobs:
         )
 
     def _running(self, job_id: str) -> list[TaskView]:
-        return self._parts.index.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
+        return self._parts.index.jobs.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items

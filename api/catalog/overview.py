@@ -13,7 +13,7 @@ from api.catalog.jobs import Jobs
 from api.metrics import Snapshot
 from api.models import Health, Part, Worker
 from service.index.at_scrape import read_index
-from service.index.notes import Damage
+from service.index.damage import Damage
 from service.index.views import FailureGroup, Stats, TaskView
 from service.model.digests import digest_json
 from service.model.domain import Lane, Stage
@@ -40,8 +40,8 @@ class Overview:
 
     def workers(self) -> list[Worker]:
         """Workers, the living first, each with the stage it does and the age of its lease."""
-        known = self._parts.index.workers()
-        doing = self._parts.index.outputs([worker.task_id for worker in known if worker.task_id])
+        known = self._parts.index.overview.workers()
+        doing = self._parts.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
         try:
             pulses = self._queue_now().workers
         except UnavailableError:
@@ -60,24 +60,26 @@ class Overview:
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
-            return self._parts.index.task(worker.task_id)
+            return self._parts.index.jobs.task(worker.task_id)
         except NotFoundError:
             return None
 
     def stats(self) -> Stats:
-        return self._parts.index.stats()
+        return self._parts.index.overview.stats()
 
     def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
         """Valid grasps made in each of the last minutes, the oldest first."""
         start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
         made = [0] * minutes
-        for bucket in self._parts.index.throughput(since=start.isoformat().replace("+00:00", "Z"), bucket_s=60):
+        for bucket in self._parts.index.overview.throughput(
+            since=start.isoformat().replace("+00:00", "Z"), bucket_s=60
+        ):
             minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
             made[min(max(minute, 0), minutes - 1)] += bucket.valid
         return made
 
     def failures(self, *, limit: int = 5) -> list[FailureGroup]:
-        return self._parts.index.failures(limit=limit)
+        return self._parts.index.overview.failures(limit=limit)
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         """Waiting tasks by lane and stage."""
@@ -89,7 +91,7 @@ class Overview:
 
     def damage(self) -> tuple[int, list[Damage]]:
         """Number of objects of the store known to be damaged or missing, and the first of them."""
-        return self._parts.index.known_damage(limit=_DAMAGE_SHOWN)
+        return self._parts.index.damage.known(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
         """The service as Prometheus sees it; a part that is away leaves its numbers out."""
@@ -101,7 +103,7 @@ class Overview:
             found.add_queue(self._queue_now(), keeper_is_up=queue.announced(KEEPER))
             found.add_sums(queue.counted())
         with contextlib.suppress(UnavailableError):
-            found.add_index(read_index(self._parts.index))
+            found.add_index(read_index(self._parts.index.database))
         return found
 
     def fingerprint(self) -> str:

@@ -27,11 +27,11 @@ class Shards:
         cursor: str | None = None,
     ) -> Page[Shard]:
         """Shards, all or those of a job."""
-        page = self._parts.index.shards(job=job, kind=kind, limit=limit, cursor=cursor)
+        page = self._parts.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor)
         return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
 
     def one(self, shard_id: str) -> Shard:
-        return _shard(self._parts.index.shard(shard_id))
+        return _shard(self._parts.index.shards.get(shard_id))
 
     def intact(self, shard_id: str) -> Shard:
         """A shard whose file is what its checksum says; read through once, then again only where it was changed.
@@ -57,11 +57,11 @@ class Shards:
 
     def job_of(self, shard_id: str) -> str | None:
         """A job that a shard belongs to; None where it is gone."""
-        return self._parts.index.job_of_shard(shard_id)
+        return self._parts.index.shards.job_of(shard_id)
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         """Digests of the hand and the object of each shard."""
-        return self._parts.index.assets_of_shards(ids)
+        return self._parts.index.shards.assets_of(ids)
 
 
 def _shard(shard: ShardView) -> Shard:

@@ -11,7 +11,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from service.index.index import Index
-from service.index.queries.costs import BatchCost
+from service.index.queries.costs import BatchCost, Costs
 from service.model.domain import OFFERED, Stage
 from service.model.errors import GraspdError
 from service.pipeline.datasets.cost import estimate
@@ -45,7 +45,8 @@ class Expectations:
     """Estimates for the form of a job; what it remembers between two requests may be lost."""
 
     def __init__(self, index: Index) -> None:
-        self._index = _Remembering(index)
+        self._index = index
+        self._costs = _RememberedCosts(index.costs)
 
     def of(self, form: Mapping[str, Any]) -> list[Expected]:
         """Every offered fidelity for what a form says; without numbers where it cannot be estimated."""
@@ -55,7 +56,7 @@ class Expectations:
     def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> Expected:
         try:
             matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
-            cost = estimate(self._index, matrix)
+            cost = estimate(self._index, matrix, costs=self._costs.of_batches)
         except (ValidationError, GraspdError):
             return Expected(name, WORDS[name], None, None, None, None, "")
         rate = cost.rates[0] if cost.rates else None
@@ -63,18 +64,17 @@ class Expectations:
         return Expected(name, WORDS[name], cost.seconds, cost.seconds_low, cost.seconds_high, share, origin)
 
 
-class _Remembering(Index):
-    """An index whose costs of batches are read at most once in a while."""
+class _RememberedCosts:
+    """Costs of batches, read at most once in a while."""
 
-    def __init__(self, index: Index) -> None:
-        # It shares the connections of the index that it stands for.
-        self.__dict__ = dict(index.__dict__)
-        self._costs: dict[Stage, tuple[float, list[BatchCost]]] = {}
-        self._costs_lock = threading.Lock()
+    def __init__(self, costs: Costs) -> None:
+        self._costs = costs
+        self._read: dict[Stage, tuple[float, list[BatchCost]]] = {}
+        self._lock = threading.Lock()
 
-    def batch_costs(self, stage: Stage) -> list[BatchCost]:
-        with self._costs_lock:
+    def of_batches(self, stage: Stage) -> list[BatchCost]:
+        with self._lock:
             now = time.monotonic()
-            if stage not in self._costs or now - self._costs[stage][0] > KEPT_S:
-                self._costs[stage] = (now, super().batch_costs(stage))
-            return self._costs[stage][1]
+            if stage not in self._read or now - self._read[stage][0] > KEPT_S:
+                self._read[stage] = (now, self._costs.of_batches(stage))
+            return self._read[stage][1]

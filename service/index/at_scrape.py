@@ -32,11 +32,11 @@ class IndexNow:
     """Objects of the store that are known to be damaged or missing, counted up to `MOST_JOBS`."""
 
 
-def read_index(index: Database) -> IndexNow:
+def read_index(database: Database) -> IndexNow:
     """Unfinished jobs up to `MOST_JOBS`, the oldest of each state, and the shards of the last minute."""
     since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
     counted, oldest = {}, {}
-    with index.reading() as connection:
+    with database.reading() as connection:
         for state in UNFINISHED:
             counted[state] = int(connection.scalar(count_jobs(state)) or 0)
             first = connection.scalar(oldest_job(state))

@@ -3,33 +3,57 @@
 from __future__ import annotations
 
 from service.index.changes.datasets import DatasetChanges
+from service.index.changes.live import Live
 from service.index.changes.records import Changes
 from service.index.changes.removals import Removals
+from service.index.damage import KnownDamage
+from service.index.database import Database
 from service.index.notes import Notes
-from service.index.queries.costs import CostQueries
-from service.index.queries.datasets import DatasetQueries
+from service.index.queries.assets import Assets
+from service.index.queries.costs import Costs
+from service.index.queries.dataset_feed import DatasetFeed
+from service.index.queries.datasets import Datasets
 from service.index.queries.feed import Feed
-from service.index.queries.grasps import GraspQueries
-from service.index.queries.jobs import JobQueries
-from service.index.queries.service import ServiceQueries
-from service.index.queries.summaries import Summaries
+from service.index.queries.grasps import Grasps
+from service.index.queries.jobs import Jobs
+from service.index.queries.object_sets import ObjectSets
+from service.index.queries.overview import Overview
+from service.index.queries.shards import Shards
+from service.index.queries.statistics import Statistics
 
 
-class Index(
-    JobQueries,
-    GraspQueries,
-    Summaries,
-    ServiceQueries,
-    DatasetQueries,
-    CostQueries,
-    Feed,
-    Changes,
-    DatasetChanges,
-    Notes,
-    Removals,
-):
+class Index:
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
-    Reads answer the API; writes come from the API and the keeper only. Every method raises IndexUnavailable when the
-    database is away. Cursors are opaque, `limit` is cut to 200; an unknown id is a NotFoundError.
+    Reads answer the API; writes come from the API and the keeper only. Every method of every part raises
+    IndexUnavailable when the database is away. Cursors are opaque, `limit` is cut to 200; an unknown id is a
+    NotFoundError.
     """
+
+    def __init__(self, url: str) -> None:
+        """Connect and migrate: see `Database` for errors."""
+        self.database = database = Database(url)
+        # What is read.
+        self.jobs = Jobs(database)
+        self.grasps = Grasps(database)
+        self.shards = Shards(database)
+        self.statistics = Statistics(database)
+        self.datasets = Datasets(database)
+        self.object_sets = ObjectSets(database)
+        self.assets = Assets(database)
+        self.costs = Costs(database)
+        self.overview = Overview(database)
+        self.feed = Feed(database)
+        self.dataset_feed = DatasetFeed(database)
+        # What is written.
+        self.write = Changes(database)
+        self.write_dataset = DatasetChanges(database)
+        self.live = Live(database)
+        self.removals = Removals(database)
+        # What is both.
+        self.notes = Notes(database)
+        self.damage = KnownDamage(database)
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self.database.close()

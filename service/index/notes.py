@@ -1,4 +1,4 @@
-"""What the index knows of itself: whether it was made whole. And what is known to be damaged in the store."""
+"""What the index knows of itself: whether it was made whole, and how far the store was read through."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from sqlalchemy import Connection, delete, func, select
+from sqlalchemy import Connection, delete, select
 
 from service.index.database import Database, upsert
-from service.index.tables import damage, notes
+from service.index.tables import notes
 from service.model.clock import timestamp
 
 _REBUILT: Final = "rebuilt"
@@ -31,16 +31,6 @@ class Completeness:
 
 
 @dataclass(frozen=True)
-class Damage:
-    """An object of the store that is not what it was."""
-
-    key: str
-    what: str
-    shard: str = ""
-    found: str = ""
-
-
-@dataclass(frozen=True)
 class ScrubNote:
     """How far the keeper has read through the store in this round."""
 
@@ -53,51 +43,32 @@ class ScrubNote:
     """Key up to which it has read that folder."""
 
 
-class Notes(Database):
-    """Part of the index: see there for errors."""
+@dataclass(frozen=True)
+class Notes:
+    """Notes of the service to itself."""
+
+    database: Database
 
     def completeness(self) -> Completeness | None:
         """None while the index may lack what the store has: it is new, and was not made from the store yet."""
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _REBUILT))
         return None if value is None else Completeness(value["at"], value["left_out"], tuple(value["names"]))
 
     def set_complete(self, left_out: Sequence[str] = (), *, within: Connection | None = None) -> None:
         """From now on the index holds all that the store says, but for these records."""
         value = {"at": timestamp(), "left_out": len(left_out), "names": list(left_out[:_NAMED])}
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             upsert(connection, notes, [{"name": _REBUILT, "value": value}])
-
-    def known_damage(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
-        """Number of damaged objects found so far and not mended, and the first of them."""
-        query = select(damage).order_by(damage.c.found, damage.c.key).limit(limit)
-        with self.reading() as connection:
-            count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)
-            rows = connection.execute(query).mappings()
-            return count, [Damage(row["key"], row["what"], row["shard"], row["found"]) for row in rows]
-
-    def set_damage(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
-        """Objects found damaged, and others found intact."""
-        rows = [{"key": one.key, "what": one.what, "shard": one.shard, "found": timestamp()} for one in found]
-        with self.writing() as connection:
-            upsert(connection, damage, rows, keep=("found",))
-            if intact:
-                connection.execute(delete(damage).where(damage.c.key.in_(list(intact))))
-
-    def replace_damage(self, found: Sequence[Damage]) -> None:
-        """All that is damaged, after the whole store was looked through."""
-        with self.writing() as connection:
-            connection.execute(delete(damage).where(damage.c.key.not_in([one.key for one in found])))
-        self.set_damage(found)
 
     def scrub_note(self) -> ScrubNote:
         """How far the keeper has read through the store; nothing read yet: a note of defaults."""
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             value: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB))
         return ScrubNote(**value) if value else ScrubNote()
 
     def set_scrub_note(self, note: ScrubNote) -> None:
-        with self.writing() as connection:
+        with self.database.writing() as connection:
             upsert(connection, notes, [{"name": _SCRUB, "value": asdict(note)}])
 
     def take_scrub_turn(self, holder: str, *, is_keeper: bool, lasts_s: float) -> bool:
@@ -108,7 +79,7 @@ class Notes(Database):
             is_keeper: a keeper gives way to who is none.
             lasts_s: after so long without a call the right is free again [s].
         """
-        with self.writing() as connection:
+        with self.database.writing() as connection:
             held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
             if held and held["holder"] != holder and held["until"] > timestamp() and (is_keeper or not held["keeper"]):
                 return False
@@ -118,7 +89,7 @@ class Notes(Database):
 
     def end_scrub_turn(self, holder: str) -> None:
         """Free the right, if this one has it."""
-        with self.writing() as connection:
+        with self.database.writing() as connection:
             held: Any = connection.scalar(select(notes.c.value).where(notes.c.name == _SCRUB_TURN))
             if held and held["holder"] == holder:
                 connection.execute(delete(notes).where(notes.c.name == _SCRUB_TURN))

@@ -38,7 +38,7 @@ _SHOWN_DIFFERENCES: Final = 50
 def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] | None = None) -> dict[str, int]:
     """Replace all rows by what follows from the store. The old rows stay until all new ones are there.
 
-    A record that is damaged is left out, named in the log and in `index.completeness()`; the others go on.
+    A record that is damaged is left out, named in the log and in `index.notes.completeness()`; the others go on.
 
     Args:
         progress: called with what is being read and how many of it there were so far.
@@ -46,7 +46,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
     Returns:
         number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of records left out.
     """
-    with index.writing() as connection:
+    with index.database.writing() as connection:
         for table in metadata.tables.values():
             if table.name not in LIVE_TABLES:
                 connection.execute(delete(table))
@@ -55,7 +55,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         made.jobs()
         made.shards()
         made.datasets()
-        index.set_complete(made.left_out, within=connection)
+        index.notes.set_complete(made.left_out, within=connection)
     return {**made.counts, "left_out": len(made.left_out)}
 
 
@@ -75,7 +75,7 @@ class _Rebuild:
             with self._each(names.asset_check(kind, digest)):
                 check = load_check(self._store, kind, digest)
                 with self._each(names.asset_record(kind, digest), "assets"):
-                    self._index.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
+                    self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def jobs(self) -> None:
         """Jobs, then their failed attempts in order, then what users did to them."""
@@ -83,7 +83,7 @@ class _Rebuild:
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._each(key, "jobs"):
                 record = parse_record(JobRecord, data, key)
-                self._index.add_job(record, within=self._connection)
+                self._index.write.add_job(record, within=self._connection)
                 known.append(record.id)
         attempts = []
         for key, data in self._read(names.TASKS, lambda key: key.endswith(".json")):
@@ -91,30 +91,30 @@ class _Rebuild:
                 attempts.append(parse_record(AttemptRecord, data, key))
         for attempt in sorted(attempts, key=lambda attempt: attempt.number):
             with self._each(names.attempt(attempt.task_id, attempt.number), "attempts"):
-                self._index.add_attempt(attempt, within=self._connection)
+                self._index.write.add_attempt(attempt, within=self._connection)
         for job in known:
             if events := self._events(JobEvent, names.job_events(job)):
-                self._index.set_job_events(job, events, within=self._connection)
+                self._index.write.set_job_events(job, events, within=self._connection)
 
     def shards(self) -> None:
         for key, data in self._read(names.SHARDS, lambda key: key.endswith(".json")):
             with self._each(key, "shards"):
-                self._index.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
+                self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
     def datasets(self) -> None:
         """Datasets with what users did to them, snapshots, sets of objects."""
         for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._each(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
-                self._index.add_dataset(record, within=self._connection)
+                self._index.write_dataset.add(record, within=self._connection)
                 if events := self._events(DatasetEvent, names.dataset_events(record.name)):
-                    self._index.set_dataset_events(record.name, events, within=self._connection)
+                    self._index.write_dataset.set_events(record.name, events, within=self._connection)
         for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
             with self._each(key, "snapshots"):
-                self._index.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
+                self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
         for key, data in self._read(names.OBJECT_SETS, lambda key: key.endswith(".json")):
             with self._each(key, "object_sets"):
-                self._index.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
+                self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
 
     def _events(self, model: type[EventT], prefix: str) -> list[EventT]:
         found = []
@@ -160,10 +160,10 @@ class _Rebuild:
 
 def complete_if_new(index: Index, store: Store) -> None:
     """An index is whole, though nobody made it from the store, where the store holds no job yet."""
-    if index.completeness() is None and not any(
+    if index.notes.completeness() is None and not any(
         True for prefix in (names.JOBS, names.DATASETS) for _ in store.list(prefix)
     ):
-        index.set_complete()
+        index.notes.set_complete()
 
 
 def differences(index: Index, store: Store) -> list[str]:
@@ -172,9 +172,9 @@ def differences(index: Index, store: Store) -> list[str]:
         fresh = Index(f"sqlite:///{Path(folder) / 'index.sqlite'}")
         try:
             rebuild(fresh, store)
-            made = fresh.completeness()
+            made = fresh.notes.completeness()
             damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
-            with index.reading() as live, fresh.reading() as derived:
+            with index.database.reading() as live, fresh.database.reading() as derived:
                 rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
             return [*damaged, *rows][:_SHOWN_DIFFERENCES]
         finally:

@@ -26,14 +26,14 @@ def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "") -
         NotFoundError: there is none of that name or digest.
         ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
     """
-    asset = parts.index.asset(kind, name)
+    asset = parts.index.assets.get(kind, name)
     if asset.builtin:
         raise ConflictError(f"the {kind.value} {asset.name!r} comes with graspd and cannot be deleted")
-    with parts.index.writing() as connection:
-        if user := parts.index.user_of_asset(kind, asset.name, asset.digest, within=connection):
+    with parts.index.database.writing() as connection:
+        if user := parts.index.removals.user_of_asset(kind, asset.name, asset.digest, within=connection):
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         _record(parts.store, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner))
-        parts.index.remove_asset(kind, asset.digest, within=connection)
+        parts.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
 def delete_job(parts: Parts, job_id: str, *, owner: str = "") -> None:
@@ -43,18 +43,18 @@ def delete_job(parts: Parts, job_id: str, *, owner: str = "") -> None:
         NotFoundError: there is no such job.
         ConflictError: it has not ended, or a dataset holds it.
     """
-    parts.index.job(job_id)
+    parts.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, parts.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
         record = None  # then its shards cannot be told, and stay
-    with parts.index.writing() as connection:
-        if user := parts.index.user_of_job(job_id, within=connection):
+    with parts.index.database.writing() as connection:
+        if user := parts.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
-        attempts = parts.index.attempts_of(job_id, within=connection)
+        attempts = parts.index.removals.attempts_of(job_id, within=connection)
         deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts)
         _record(parts.store, deletion)
-        parts.index.remove_job(job_id, within=connection)
+        parts.index.removals.remove_job(job_id, within=connection)
 
 
 def delete_dataset(parts: Parts, name: str, *, owner: str = "") -> None:
@@ -64,12 +64,12 @@ def delete_dataset(parts: Parts, name: str, *, owner: str = "") -> None:
         NotFoundError: there is no such dataset.
         ConflictError: it has not ended.
     """
-    dataset = parts.index.dataset(name)
+    dataset = parts.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
-    with parts.index.writing() as connection:
+    with parts.index.database.writing() as connection:
         _record(parts.store, Deletion(what="dataset", id=name, at=timestamp(), owner=owner))
-        parts.index.remove_dataset(name, within=connection)
+        parts.index.removals.remove_dataset(name, within=connection)
 
 
 def _record(store: Store, deletion: Deletion) -> None:

@@ -68,7 +68,7 @@ class Indexer:
         self._index(made)
         if progress:
             with _left_out(f"progress of {len(progress)} tasks"):
-                self._parts.index.set_progress(progress)
+                self._parts.index.live.set_progress(progress)
         return waiting
 
     def _take_up(self, event: Event, made: list[ShardManifest]) -> None:
@@ -81,7 +81,7 @@ class Indexer:
     def _index(self, made: list[ShardManifest]) -> None:
         """Shards in one transaction; where the index cannot hold one of them, each by itself."""
         try:
-            states = self._parts.index.add_manifests(made) if made else {}
+            states = self._parts.index.write.add_manifests(made) if made else {}
         except InputError:
             if len(made) == 1:
                 log.exception("shard %s is left out", made[0].shard_id)
@@ -112,19 +112,19 @@ class Indexer:
             self.checked(AssetKind(kind), digest)
         else:
             manifest = load_manifest(self._parts.store, stage, output)
-            self.tell(self._parts.index.add_manifest(manifest))
+            self.tell(self._parts.index.write.add_manifest(manifest))
             self._tally.made([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
         """Index a hand or object as the store has it now."""
         asset = load_asset(self._parts.store, kind, digest)
-        self._parts.index.add_asset(asset, load_check(self._parts.store, kind, digest))
+        self._parts.index.write.add_asset(asset, load_check(self._parts.store, kind, digest))
 
     def failed(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
         """Index a failed attempt; the next follows after a back-off, or at once."""
         wait = 0.0 if at_once else backoff(self._parts.settings.retry_backoff_s, attempt.number)
         not_before = time.time() + wait
-        state = self._parts.index.add_attempt(attempt, not_before=not_before)
+        state = self._parts.index.write.add_attempt(attempt, not_before=not_before)
         if state is not None:
             about = {
                 "job": attempt.job_id,
@@ -143,7 +143,7 @@ class Indexer:
     def _apply(self, event: Event) -> None:
         if event.kind is EventKind.STARTED:
             if event.stage is not Stage.INGEST and (
-                started := self._parts.index.set_running(event.task_id, event.worker)
+                started := self._parts.index.live.set_running(event.task_id, event.worker)
             ):
                 self.tell(dict([started]))
         elif event.kind is EventKind.FINISHED:
@@ -151,7 +151,7 @@ class Indexer:
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
         elif event.kind is EventKind.LEFT:
-            self._parts.index.forget_worker(event.worker)
+            self._parts.index.live.forget_worker(event.worker)
         elif event.kind is EventKind.DEFERRED:
             self._tally.handed_back(event.stage or "", event.kind.value)
             self._defer(event)
@@ -167,9 +167,9 @@ class Indexer:
     def _wait_again(self, event: Event, not_before: float, message: str | None) -> None:
         if event.stage is Stage.INGEST:
             digest = event.output.partition("/")[2]
-            self._parts.index.set_asset_waiting([digest], queued=False, not_before=not_before)
+            self._parts.index.live.set_asset_waiting([digest], queued=False, not_before=not_before)
         else:
-            self.tell(self._parts.index.set_waiting([event.task_id], not_before=not_before, message=message))
+            self.tell(self._parts.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
 
 
 @contextmanager

@@ -87,18 +87,18 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
         if not new:
             record = read_record(JobRecord, parts.store, key)
         wanted = ((AssetKind.HAND, record.hand_digest), (AssetKind.OBJECT, record.object_digest))
-        with parts.index.writing() as connection:
+        with parts.index.database.writing() as connection:
             if not new and not parts.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
-            if not keeps_assets and (missing := parts.index.missing_assets(wanted, within=connection)):
+            if not keeps_assets and (missing := parts.index.assets.missing(wanted, within=connection)):
                 raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-            parts.index.add_job(record, within=connection)
+            parts.index.write.add_job(record, within=connection)
     except InputError:
         if new:
             parts.store.delete(key)
         raise
     _start(parts, record.id)
-    return parts.index.job(record.id), new
+    return parts.index.jobs.get(record.id), new
 
 
 def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
@@ -111,10 +111,10 @@ def cancel(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job is already finished.
     """
-    job = parts.index.job(job_id)
+    job = parts.index.jobs.get(job_id)
     if job.state.is_final:
         raise ConflictError(f"job {job_id} has already {_ended(job.state)}; there is nothing to cancel")
-    in_queue = parts.index.unfinished_tasks(job_id)
+    in_queue = parts.index.feed.unfinished_tasks(job_id)
     add_job_event(parts.store, job_id, "cancelled", cause=cause)
     _index_events(parts, job_id)
     try:
@@ -134,10 +134,10 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
         NotFoundError: unknown job.
         ConflictError: the job neither failed nor was cancelled.
     """
-    job = parts.index.job(job_id)
+    job = parts.index.jobs.get(job_id)
     if job.state not in (State.FAILED, State.CANCELLED):
         raise ConflictError(f"job {job_id} is {job.state}; only a failed or cancelled job can be retried")
-    add_job_event(parts.store, job_id, "retried", parts.index.failed_tasks(job_id), cause=cause)
+    add_job_event(parts.store, job_id, "retried", parts.index.feed.failed_tasks(job_id), cause=cause)
     _index_events(parts, job_id)
     _start(parts, job_id)
     return _told(parts, job_id)
@@ -151,7 +151,7 @@ def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, again: bool = False
     """
     added = 0
     if ready:
-        parts.index.set_queued([task.task.id for task in ready])
+        parts.index.live.set_queued([task.task.id for task in ready])
     for lane in Lane:
         messages = [
             message_of(
@@ -172,7 +172,7 @@ def _start(parts: Parts, job_id: str) -> None:
     try:
         room = parts.settings.queue_window - sum(parts.queue.depths().values())
         if room > 0:
-            queue_tasks(parts, parts.index.ready_of_job(job_id, limit=room))
+            queue_tasks(parts, parts.index.feed.ready_of_job(job_id, limit=room))
         _told(parts, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
@@ -180,12 +180,12 @@ def _start(parts: Parts, job_id: str) -> None:
 
 def _index_events(parts: Parts, job_id: str) -> None:
     """What users did to a job, read while nobody else writes: of two at once the later one must know of both events."""
-    with parts.index.writing() as connection:
-        parts.index.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
+    with parts.index.database.writing() as connection:
+        parts.index.write.set_job_events(job_id, job_events(parts.store, job_id), within=connection)
 
 
 def _told(parts: Parts, job_id: str) -> JobView:
-    job = parts.index.job(job_id)
+    job = parts.index.jobs.get(job_id)
     try:
         parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))
     except UnavailableError as error:
@@ -201,7 +201,7 @@ def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
         InputError: it was refused when it was checked.
         ConflictError: its check is still running.
     """
-    asset = parts.index.asset(kind, name)
+    asset = parts.index.assets.get(kind, name)
     if asset.verdict == "refuse":
         raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
     if asset.verdict is None:

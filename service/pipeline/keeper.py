@@ -100,7 +100,7 @@ class Keeper:
         """
         if not self._started:
             self._start()
-        elif self._parts.index.completeness() is None:
+        elif self._parts.index.notes.completeness() is None:
             self._make_whole()
         away: list[UnavailableError] = []
         with _noted(away):
@@ -132,7 +132,7 @@ class Keeper:
     def _look_after_workers(self) -> None:
         self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
         # One that ended as it should says so, but its registration is gone a moment before that is read.
-        self._parts.index.set_workers(
+        self._parts.index.live.set_workers(
             self._parts.queue.workers(),
             lost_before=timestamp(self._parts.settings.lease_s),
             forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
@@ -141,7 +141,7 @@ class Keeper:
     def _start(self) -> None:
         publish_builtins(self._parts.store)
         complete_if_new(self._parts.index, self._parts.store)
-        made = self._parts.index.completeness()
+        made = self._parts.index.notes.completeness()
         # What was left out may have been mended since.
         if made is None or made.left_out:
             self._make_whole()
@@ -187,7 +187,7 @@ class Keeper:
         leases = self._parts.queue.leases()
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
-        if stray := self._parts.index.cancelled(present):
+        if stray := self._parts.index.feed.cancelled(present):
             self._parts.queue.discard(stray)
         self._reaper.find_missing(present)
         self._feed(present)
@@ -197,15 +197,15 @@ class Keeper:
         now = time.time()
         for lane in Lane:
             room = self._parts.settings.queue_window - sum(n for (of, _), n in depths.items() if of is lane)
-            ready = self._parts.index.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
+            ready = self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
             # After a rebuild the index does not know what is in the queue already.
-            self._parts.index.set_queued([task.task.id for task in ready if task.task.id in present])
+            self._parts.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
             queue_tasks(self._parts, [task for task in ready if task.task.id not in present], again=True)
         self._feed_checks(present, now)
 
     def _feed_checks(self, present: set[str], now: float) -> None:
-        for check in self._parts.index.ready_checks(now=now, limit=self._parts.settings.queue_window):
-            self._parts.index.set_asset_waiting([check.digest], queued=True)
+        for check in self._parts.index.feed.ready_checks(now=now, limit=self._parts.settings.queue_window):
+            self._parts.index.live.set_asset_waiting([check.digest], queued=True)
             if self._parts.store.exists(names.asset_check(check.kind, check.digest)):
                 with _noted([]):
                     self._indexer.checked(check.kind, check.digest)

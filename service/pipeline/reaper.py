@@ -57,7 +57,7 @@ class Reaper:
 
     def find_missing(self, present: Collection[str]) -> list[str]:
         """Ids of tasks that the index believes in the queue, but that are neither there nor with a worker."""
-        tasks, checks = self._parts.index.believed_queued()
+        tasks, checks = self._parts.index.feed.believed_queued()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
@@ -72,11 +72,11 @@ class Reaper:
     def _recover(self, missing: list[str]) -> None:
         """Make good a lost event from the store; what the store knows nothing of is queued again."""
         again = []
-        for task, (stage, shard) in self._parts.index.outputs(missing).items():
+        for task, (stage, shard) in self._parts.index.feed.outputs(missing).items():
             if shard_exists(self._parts.store, Stage(stage), shard):
                 self._find(task, Stage(stage), shard)
                 continue
-            known = self._parts.index.task(task).attempt
+            known = self._parts.index.jobs.task(task).attempt
             try:
                 recorded = [a for a in task_attempts(self._parts.store, task) if a.number >= known]
             except DamagedError as error:
@@ -88,7 +88,7 @@ class Reaper:
                 again.append(task)
         if again:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
-            self._indexer.tell(self._parts.index.set_waiting(again))
+            self._indexer.tell(self._parts.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> None:
         """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again."""
@@ -99,7 +99,7 @@ class Reaper:
 
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
         """End a task that a damaged record stands in the way of."""
-        task = self._parts.index.task(task_id)
+        task = self._parts.index.jobs.task(task_id)
         attempt = AttemptRecord(
             task_id=task_id,
             job_id=task.job_id,
@@ -121,7 +121,7 @@ class Reaper:
             except DamagedError as error:
                 log.warning("%s", error)
         else:
-            self._parts.index.set_asset_waiting([digest], queued=False)
+            self._parts.index.live.set_asset_waiting([digest], queued=False)
 
     def _lose(self, lease: Lease) -> None:
         message = lease.message
@@ -170,4 +170,4 @@ class Reaper:
             self._parts.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
             self._indexer.checked(message.kind, message.digest)
         else:
-            self._parts.index.add_asset_attempt(message.digest, message.attempt, not_before=0.0)
+            self._parts.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 
-from service.index.notes import Damage
+from service.index.damage import Damage
 from service.model import names
 from service.model.domain import Lane, Stage
 from service.model.errors import DamagedError, NotFoundError
@@ -77,14 +77,14 @@ def _clear(parts: Parts, one: Damage, stage: Stage) -> None:
 
 def _known_to_index(parts: Parts, shard: str, file: str) -> bool:
     try:
-        return parts.index.shard(shard).sha256 == hashlib.sha256(parts.store.get(file)).hexdigest()
+        return parts.index.shards.get(shard).sha256 == hashlib.sha256(parts.store.get(file)).hexdigest()
     except NotFoundError:
         return False
 
 
 def _planned(parts: Parts, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
     """The task that makes a shard; or why there is none."""
-    job = parts.index.job_of_shard(shard)
+    job = parts.index.shards.job_of(shard)
     if job is None:
         return "no job makes it, so it cannot be made again; put a copy in its place"
     try:

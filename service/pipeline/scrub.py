@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service.index.notes import Damage
+from service.index.damage import Damage
 from service.model import names
 from service.model.clock import age_of
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot

@@ -12,7 +12,8 @@ from dataclasses import replace
 from typing import Final
 from uuid import uuid4
 
-from service.index.notes import Damage, ScrubNote
+from service.index.damage import Damage
+from service.index.notes import ScrubNote
 from service.model.clock import age_of, timestamp
 from service.model.errors import GraspdError
 from service.pipeline.backends import Parts
@@ -51,7 +52,9 @@ class Turn:
         """Take the turn, or keep it; asks the index every few seconds."""
         now = self._clock()
         if now - self._said >= _TURN_S:
-            if not self._parts.index.take_scrub_turn(self._holder, is_keeper=self._is_keeper, lasts_s=3 * _TURN_S):
+            if not self._parts.index.notes.take_scrub_turn(
+                self._holder, is_keeper=self._is_keeper, lasts_s=3 * _TURN_S
+            ):
                 return False
             self._said = now
         return True
@@ -61,7 +64,7 @@ class Turn:
         self.is_mine()
 
     def end(self) -> None:
-        self._parts.index.end_scrub_turn(self._holder)
+        self._parts.index.notes.end_scrub_turn(self._holder)
         self._said = -_TURN_S
 
 
@@ -104,7 +107,7 @@ class Scrubber:
             UnavailableError: a part is away; call again.
         """
         self._look_again_in_time(None)
-        note = self._parts.index.scrub_note()
+        note = self._parts.index.notes.scrub_note()
         if note.folder >= len(FOLDERS):
             if (age_of(note.started) or 0.0) < ROUND_S:
                 return False
@@ -119,22 +122,22 @@ class Scrubber:
         note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
         if note.folder == len(FOLDERS):
             note = replace(note, ended=timestamp())
-        self._parts.index.set_scrub_note(note)
+        self._parts.index.notes.set_scrub_note(note)
         return True
 
     def _look_again_in_time(self, reached: ScrubNote | None) -> None:
         if self._clock() - self._looked > _AGAIN_S:
             if reached is not None:
-                self._parts.index.set_scrub_note(reached)
+                self._parts.index.notes.set_scrub_note(reached)
             self.look_again()
 
     def look_again(self) -> None:
         """Examine anew what is known to be damaged; forget what is well, and what was removed since."""
         self._looked = self._clock()
-        _, known = self._parts.index.known_damage(limit=_KNOWN)
+        _, known = self._parts.index.damage.known(limit=_KNOWN)
         well = [one.key for one in known if self._is_well(one)]
         if well:
-            self._parts.index.set_damage([], intact=well)
+            self._parts.index.damage.mark([], intact=well)
 
     def _is_well(self, one: Damage) -> bool:
         stem, dot, _ = one.key.rpartition(".")
@@ -147,7 +150,7 @@ class Scrubber:
             return
         if not is_on_its_way(self._parts.store, wrong):
             log.warning("%s: %s", wrong.key, wrong.what)
-            self._parts.index.set_damage([wrong])
+            self._parts.index.damage.mark([wrong])
 
     def _keys(self, folder: str, after: str) -> list[str]:
         listed = self._parts.store.list(folder, offset=after or None)

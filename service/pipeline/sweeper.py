@@ -55,7 +55,7 @@ class Sweeper:
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
         """Remove shards that have not been needed for the grace time. Returns whether something is left to do."""
-        known = self._parts.index.completeness()
+        known = self._parts.index.notes.completeness()
         if known is not None and known.left_out:
             return False  # a job whose record cannot be read may need one of them
         deadline = self._clock() + budget_s
@@ -78,16 +78,16 @@ class Sweeper:
     def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
         """Rows once more, in case the process ended between record and rows; then the objects. Whether all is done."""
         if deletion.what == "job":
-            self._parts.index.remove_job(deletion.id)
+            self._parts.index.removals.remove_job(deletion.id)
             self._remove_job(deletion)
         elif deletion.what == "dataset":
-            self._parts.index.remove_dataset(deletion.id)
+            self._parts.index.removals.remove_dataset(deletion.id)
             if not self._remove_jobs_of(deletion.id, deadline):
                 return False
             self._remove_below(f"{names.DATASETS}/{deletion.id}", last=names.dataset_record(deletion.id))
         else:
             kind = AssetKind(deletion.what)
-            self._parts.index.remove_asset(kind, deletion.id)
+            self._parts.index.removals.remove_asset(kind, deletion.id)
             record = names.asset_record(kind, deletion.id)
             self._remove_below(record.rpartition("/")[0], last=record)
         return True
@@ -107,7 +107,7 @@ class Sweeper:
         except (NotFoundError, DamagedError):
             return True
         for start in range(0, len(jobs), _AT_ONCE):
-            for job in self._parts.index.planned_only(jobs[start : start + _AT_ONCE]):
+            for job in self._parts.index.removals.planned_only(jobs[start : start + _AT_ONCE]):
                 if self._clock() > deadline:
                     return False
                 try:
@@ -126,13 +126,13 @@ class Sweeper:
         planned = [(task.stage, task.output) for task in plan(released.job)]
         for start in range(0, len(planned), _AT_ONCE):
             some = planned[start : start + _AT_ONCE]
-            unneeded = self._parts.index.unneeded_shards([shard for _, shard in some])
+            unneeded = self._parts.index.removals.unneeded_shards([shard for _, shard in some])
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
         """The manifest first: without it the shard does not exist. A job that is entered meanwhile waits for the lock,
         and makes the shard anew."""
-        with self._parts.index.writing() as connection:
-            if self._parts.index.remove_shard(shard, within=connection):
+        with self._parts.index.database.writing() as connection:
+            if self._parts.index.removals.remove_shard(shard, within=connection):
                 self._parts.store.delete(names.shard_manifest(stage, shard))
                 self._parts.store.delete(names.shard_file(stage, shard))

@@ -49,7 +49,7 @@ def verify(
             turn.keep()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
-        parts.index.replace_damage(found)
+        parts.index.damage.replace(found)
         repaired, left = mend(parts, found) if repair else ([], found)
     finally:
         turn.end()

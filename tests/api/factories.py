@@ -27,14 +27,14 @@ Arrays = dict[str, NDArray[np.generic]]
 def add_builtins(parts: Parts) -> None:
     """The built-in hands and objects, as `graspd up` publishes them."""
     for asset in publish_builtins(parts.store):
-        parts.index.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
+        parts.index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
 
 
 def add_job(parts: Parts, **fields: object) -> JobRecord:
     """A job that waits."""
     request = JobRequest.model_validate({"hand": "allegro", "object": "mug", "grasps": 32} | fields)
-    hand = parts.index.asset(AssetKind.HAND, request.hand).digest
-    object_ = parts.index.asset(AssetKind.OBJECT, request.object).digest
+    hand = parts.index.assets.get(AssetKind.HAND, request.hand).digest
+    object_ = parts.index.assets.get(AssetKind.OBJECT, request.object).digest
     record = JobRecord(
         id=job_id(request, hand, object_),
         request=request,
@@ -44,7 +44,7 @@ def add_job(parts: Parts, **fields: object) -> JobRecord:
         created=timestamp(),
     )
     put_record(parts.store, names.job_record(record.id), record)
-    parts.index.add_job(record)
+    parts.index.write.add_job(record)
     return record
 
 
@@ -65,7 +65,7 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
         message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
     )
     publish_shard(parts.store, manifest, data)
-    parts.index.add_manifest(manifest)
+    parts.index.write.add_manifest(manifest)
     return manifest
 
 
@@ -83,7 +83,7 @@ def fail(parts: Parts, record: JobRecord, reason: str) -> None:
         trace=None, worker="worker-1", started=now, ended=now, last=True,
     )  # fmt: skip
     put_record(parts.store, names.attempt(task.id, 1), attempt)
-    parts.index.add_attempt(attempt)
+    parts.index.write.add_attempt(attempt)
 
 
 def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> None:
@@ -93,7 +93,7 @@ def add_worker(parts: Parts, name: str = "worker-1", state: str = "idle") -> Non
         name=name, host="here", pid=1, device="cpu", device_name="x86_64, 2 cores", stages=tuple(Stage),
         version="0.1.0", state=state, task_id="", started=now, seen=now,
     )  # fmt: skip
-    parts.index.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
+    parts.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
 
 
 def poses(random: np.random.Generator, count: int) -> NDArray[np.float64]:

@@ -90,7 +90,7 @@ def test_what_was_refused_gets_in_under_its_name_with_the_mend(
     file = ("open_shell.stl", (shared_data / "bad" / "open_shell.stl").read_bytes())
     first = http.post("/v1/objects", files={"file": file}).json()
     asset = load_asset(parts.store, AssetKind.OBJECT, first["digest"])
-    parts.index.add_asset(asset, check(http, parts, AssetKind.OBJECT, file, {}))
+    parts.index.write.add_asset(asset, check(http, parts, AssetKind.OBJECT, file, {}))
     second = http.post("/v1/objects", files={"file": file}, data={"options": '{"allow_open": true}'})
     assert second.status_code == 202, second.text
     assert http.get("/v1/objects/open_shell").json()["digest"] == second.json()["digest"] != first["digest"]

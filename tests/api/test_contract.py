@@ -71,8 +71,8 @@ def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Ite
     fail(parts, add_job(parts, seed=1), "it broke")
     waiting = add_job(parts, seed=2)
     add_worker(parts)
-    parts.index.set_complete()
-    shard = parts.index.shards(job=done.id).items[0].id
+    parts.index.notes.set_complete()
+    shard = parts.index.shards.page(job=done.id).items[0].id
     known = {"job_id": [done.id, waiting.id], "shard_id": [shard], "name": ["allegro", "mug"]}
     schema = schemathesis.openapi.from_asgi("/openapi.json", _addressed(create_app(settings, parts)))
 

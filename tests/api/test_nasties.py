@@ -131,7 +131,7 @@ def test_long_findings_of_a_check_do_not_make_the_list_long(http: TestClient, pa
     found["facts"] = {"faces": 7, "names": ["n" * 1000] * 1000}
     parts.store.put(f"assets/object/{digest}/check.json", json.dumps(found).encode())
     kind = AssetKind.OBJECT
-    parts.index.add_asset(load_asset(parts.store, kind, digest), load_check(parts.store, kind, digest))
+    parts.index.write.add_asset(load_asset(parts.store, kind, digest), load_check(parts.store, kind, digest))
     answer = http.get("/v1/objects/box")
     assert len(answer.content) < 300_000
     assert answer.json()["facts"] == {"faces": 7}

@@ -57,7 +57,7 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Parts, tmp_path
     try:
         assert differences(restored, kept.store) == []
         jobs = {job.id: job.state for job in restored.jobs(limit=10).items}
-        assert jobs == {job.id: job.state for job in kept.index.jobs(limit=10).items}
+        assert jobs == {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
         assert set(jobs.values()) == {State.SUCCEEDED, State.QUEUED}
     finally:
         restored.close()
@@ -82,7 +82,7 @@ def test_a_damaged_copy_is_noticed(kept: Parts, tmp_path: Path) -> None:
 
 
 def test_an_index_goes_back_for_an_older_version_and_forward_again(kept: Parts, tmp_path: Path) -> None:
-    before = {job.id: job.state for job in kept.index.jobs(limit=10).items}
+    before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
     kept.index.close()
     done = page.run("downgrade", tmp_path, {"GRASPD_DATA_DIR": str(kept.settings.data_dir)})
     assert done.returncode == 0, done.stderr
@@ -94,7 +94,7 @@ def test_an_index_goes_back_for_an_older_version_and_forward_again(kept: Parts, 
 
 
 def test_an_empty_index_is_filled_from_the_store(kept: Parts) -> None:
-    before = {job.id: job.state for job in kept.index.jobs(limit=10).items}
+    before = {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
     empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
     try:
         rebuild(empty, kept.store)

@@ -46,9 +46,11 @@ class System:
     def finish(self, *jobs: str, seconds: float) -> list[JobView]:
         """The jobs once all are at their end."""
         self.until(
-            lambda: all(self.parts.index.job(job).state.is_final for job in jobs), seconds, f"{len(jobs)} jobs done"
+            lambda: all(self.parts.index.jobs.get(job).state.is_final for job in jobs),
+            seconds,
+            f"{len(jobs)} jobs done",
         )
-        return [self.parts.index.job(job) for job in jobs]
+        return [self.parts.index.jobs.get(job) for job in jobs]
 
     def kill(self, name: str) -> int:
         """kill -9 a child; returns its pid."""

@@ -44,7 +44,7 @@ PATIENCE_S = 120.0
 
 def running_on(system: System, job: str) -> str | None:
     """Name of the worker that runs the job's first unfinished task."""
-    tasks = system.parts.index.tasks(job=job, state=State.RUNNING).items
+    tasks = system.parts.index.jobs.tasks(job=job, state=State.RUNNING).items
     return tasks[0].worker if tasks else None
 
 
@@ -55,18 +55,18 @@ def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(st
     job = system.submit(wanted(seed=2, scenes=1))
     system.until(lambda: running_on(system, job), 10, "the task runs")
     killed = system.kill("worker-0")
-    system.until(lambda: system.parts.index.attempts(job=job), PATIENCE_S, "the worker is found lost")
+    system.until(lambda: system.parts.index.jobs.attempts(job=job), PATIENCE_S, "the worker is found lost")
     (done,) = system.finish(job, seconds=PATIENCE_S)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32)
     assert untouched.state is State.SUCCEEDED
     assert not alive(killed)
-    (attempt,) = system.parts.index.attempts(job=job)
+    (attempt,) = system.parts.index.jobs.attempts(job=job)
     assert attempt.kind == "WorkerLost"
     settings = system.parts.settings
     assert f"no sign of life for {settings.lease_s:g} s" in attempt.reason
     assert settings.lease_s + settings.keeper_interval_s + settings.retry_backoff_s < RECOVERY_S
-    assert len(system.parts.index.grasps(GraspFilter(job=job), limit=200).items) == 32
-    (base,) = system.parts.index.shards(job=job, kind="base").items
+    assert len(system.parts.index.grasps.page(GraspFilter(job=job), limit=200).items) == 32
+    (base,) = system.parts.index.shards.page(job=job, kind="base").items
     kept = read_shard(system.parts.store.get(base.key))["grasp/joint_positions"]
     undisturbed = fake_synthesize(message_for(seed=2), TaskContext(system.parts.store))
     np.testing.assert_array_equal(kept, undisturbed.arrays["grasp/joint_positions"])
@@ -80,7 +80,7 @@ def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> N
     system.kill("redis")
     done = system.finish(*jobs, seconds=60)
     assert {job.state for job in done} == {State.SUCCEEDED}
-    listed = [system.parts.index.grasps(GraspFilter(job=job), limit=200).items for job in jobs]
+    listed = [system.parts.index.grasps.page(GraspFilter(job=job), limit=200).items for job in jobs]
     assert [len(grasps) for grasps in listed] == [96] * 3
     assert differences(system.parts.index, system.parts.store) == []
 
@@ -90,12 +90,12 @@ def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(start: St
     jobs = [system.submit(wanted(grasps=70, scenes=2, seed=seed)) for seed in range(5)]
     done = system.finish(*jobs, seconds=60)
     assert {(job.state, job.grasps) for job in done} == {(State.SUCCEEDED, 70)}
-    workers = {shard.worker for shard in system.parts.index.shards(limit=200).items}
+    workers = {shard.worker for shard in system.parts.index.shards.page(limit=200).items}
     assert len(workers) == 2, "both took part"
     assert differences(system.parts.index, system.parts.store) == []
-    before = [system.parts.index.job(job) for job in jobs]
+    before = [system.parts.index.jobs.get(job) for job in jobs]
     rebuild(system.parts.index, system.parts.store)
-    assert [system.parts.index.job(job) for job in jobs] == before
+    assert [system.parts.index.jobs.get(job) for job in jobs] == before
 
 
 def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) -> None:
@@ -105,7 +105,7 @@ def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) ->
     bad, good = system.finish(poisoned, healthy, seconds=60)
     assert good.state is State.SUCCEEDED
     assert (bad.state, bad.stages[0].succeeded, bad.stages[0].failed) == (State.FAILED, 1, 1)
-    attempts = system.parts.index.attempts(job=poisoned)
+    attempts = system.parts.index.jobs.attempts(job=poisoned)
     assert [(a.number, a.kind, a.last) for a in attempts] == [(2, "WorkerLost", True), (1, "WorkerLost", False)]
     assert differences(system.parts.index, system.parts.store) == []
 
@@ -116,7 +116,7 @@ def test_a_running_job_is_cancelled_long_before_its_task_would_end(start: Start)
     system.until(lambda: running_on(system, job), PATIENCE_S, "the task runs")
     assert job_actions.cancel(system.parts, job).state is State.CANCELLED
     system.until(lambda: not system.parts.queue.leases(), PATIENCE_S, "the worker let go")
-    assert system.parts.index.attempts(job=job) == []
+    assert system.parts.index.jobs.attempts(job=job) == []
     again = system.submit(wanted(grasps=1, seed=3))
     system.until(lambda: running_on(system, again), 10, "the worker takes the next task")
 
@@ -129,8 +129,10 @@ def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None
     os.kill(system.supervisor.pids["worker-0"], signal.SIGTERM)
     (done,) = system.finish(job, seconds=PATIENCE_S)
     assert done.state is State.SUCCEEDED
-    assert system.parts.index.tasks(job=job).items[0].worker != first, "another worker ran it"
-    assert system.parts.index.attempts(job=job) == [], "nobody waited for the lease to run out, it costs no attempt"
+    assert system.parts.index.jobs.tasks(job=job).items[0].worker != first, "another worker ran it"
+    assert system.parts.index.jobs.attempts(job=job) == [], (
+        "nobody waited for the lease to run out, it costs no attempt"
+    )
 
 
 def test_a_task_that_takes_too_long_is_stopped_with_that_reason(start: Start) -> None:
@@ -242,7 +244,7 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
     assert {job.state for job in done} == {State.SUCCEEDED}
     manifests = [e.key for e in system.parts.store.list(names.SHARDS) if e.key.endswith(".json")]
     assert len(manifests) == batches
-    assert system.parts.index.stats().grasps == 32 * batches
+    assert system.parts.index.overview.stats().grasps == 32 * batches
     system.until(lambda: not differences(system.parts.index, system.parts.store), 10, "index and store agree")
     system.supervisor.stop()
     assert not [pid for pid in everyone if alive(pid)]

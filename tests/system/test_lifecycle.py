@@ -25,7 +25,7 @@ _BEFORE_IT = 60
 
 def makers(system: System) -> set[str]:
     """Names of the workers that made a shard."""
-    return {shard.worker for shard in system.parts.index.shards(limit=200).items}
+    return {shard.worker for shard in system.parts.index.shards.page(limit=200).items}
 
 
 def test_a_worker_makes_room_after_so_many_tasks_and_no_task_is_disturbed(start: Start) -> None:
@@ -33,8 +33,8 @@ def test_a_worker_makes_room_after_so_many_tasks_and_no_task_is_disturbed(start:
     (done,) = system.finish(system.submit(request(grasps=32 * 6)), seconds=60)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 6)
     assert len(makers(system)) == 3
-    assert system.parts.index.attempts() == []
-    assert "lost" not in {worker.state for worker in system.parts.index.workers()}
+    assert system.parts.index.jobs.attempts() == []
+    assert "lost" not in {worker.state for worker in system.parts.index.overview.workers()}
 
 
 def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -> None:
@@ -42,17 +42,17 @@ def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -
     (done,) = system.finish(system.submit(request(grasps=32 * 6)), seconds=60)
     assert done.state is State.SUCCEEDED
     assert len(makers(system)) >= 3, "the second task is one too many for each"
-    assert system.parts.index.attempts() == []
+    assert system.parts.index.jobs.attempts() == []
 
 
 def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
     system = start()
-    system.until(system.parts.index.workers, 10, "the worker is listed")
-    (first,) = system.parts.index.workers()
+    system.until(system.parts.index.overview.workers, 10, "the worker is listed")
+    (first,) = system.parts.index.overview.workers()
     seen: set[str] = set()
 
     def is_gone() -> bool:
-        now = system.parts.index.workers()
+        now = system.parts.index.overview.workers()
         seen.update(worker.state for worker in now)
         return first.name not in {worker.name for worker in now}
 
@@ -63,20 +63,20 @@ def test_a_worker_that_was_stopped_is_not_shown_as_lost(start: Start) -> None:
 
 def test_a_worker_that_was_killed_is_shown_as_lost(start: Start) -> None:
     system = start(lease_s=2.0)
-    system.until(system.parts.index.workers, 10, "the worker is listed")
+    system.until(system.parts.index.overview.workers, 10, "the worker is listed")
     system.kill("worker-0")
-    states = lambda: {worker.state for worker in system.parts.index.workers()}  # noqa: E731
+    states = lambda: {worker.state for worker in system.parts.index.overview.workers()}  # noqa: E731
     system.until(lambda: "lost" in states(), 15, "it is lost")
 
 
 def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
     bulk = job_actions.submit(system.parts, request(grasps=100_000), lane=Lane.BULK)[0].id
-    system.until(lambda: system.parts.index.job(bulk).grasps, 15, "the dataset runs")
+    system.until(lambda: system.parts.index.jobs.get(bulk).grasps, 15, "the dataset runs")
     job = system.submit(request(grasps=32, seed=1))
     (done,) = system.finish(job, seconds=120)
-    assert system.parts.index.job(bulk).state is State.RUNNING
-    batches = system.parts.index.tasks(job=bulk, state=State.SUCCEEDED, limit=200).items
+    assert system.parts.index.jobs.get(bulk).state is State.RUNNING
+    batches = system.parts.index.jobs.tasks(job=bulk, state=State.SUCCEEDED, limit=200).items
     between = [task for task in batches if done.created < (task.finished or "") < (done.finished or "")]
     assert len(between) <= _BEFORE_IT, f"of hundreds of batches that waited before it, {len(between)} went first"
 
@@ -98,7 +98,9 @@ def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     thread = threading.Thread(target=keep_busy)
     thread.start()
     try:
-        system.until(lambda: system.parts.index.job(bulk).grasps >= 5 * 32, 60, "five batches of the dataset are done")
+        system.until(
+            lambda: system.parts.index.jobs.get(bulk).grasps >= 5 * 32, 60, "five batches of the dataset are done"
+        )
     finally:
         ended.set()
         thread.join()

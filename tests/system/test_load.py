@@ -42,6 +42,6 @@ def test_on_a_busy_machine_no_worker_is_lost_though_its_tasks_let_nothing_else_r
     system = start(workers=2, environment={"FAKE_LOCK_S": "3"}, lease_s=2.0, task_attempts=1)
     job = system.submit(request(grasps=32 * 6))
     (done,) = system.finish(job, seconds=150)
-    assert system.parts.index.attempts() == []
+    assert system.parts.index.jobs.attempts() == []
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 6)
-    assert "lost" not in {worker.state for worker in system.parts.index.workers()}
+    assert "lost" not in {worker.state for worker in system.parts.index.overview.workers()}

@@ -37,13 +37,13 @@ def own_postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
 
 
 def messages(system: System, job: str) -> list[str]:
-    return [task.message or "" for task in system.parts.index.tasks(job=job, limit=200).items]
+    return [task.message or "" for task in system.parts.index.jobs.tasks(job=job, limit=200).items]
 
 
 def finish_and_compare(system: System, job: str, grasps: int) -> None:
     (done,) = system.finish(job, seconds=120)
     assert (done.state, done.grasps) == (State.SUCCEEDED, grasps)
-    assert system.parts.index.attempts(job=job) == [], "it costs no attempt"
+    assert system.parts.index.jobs.attempts(job=job) == [], "it costs no attempt"
     system.until(lambda: not differences(system.parts.index, system.parts.store), 10, "index and store agree")
 
 
@@ -51,10 +51,10 @@ def finish_and_compare(system: System, job: str, grasps: int) -> None:
 def test_a_store_killed_in_the_middle_is_waited_for(start: Start, own_s3: S3Server) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.2"}, store_url=own_s3.url, retry_backoff_s=0.2)
     job = system.submit(request(grasps=32 * 20))
-    system.until(lambda: system.parts.index.job(job).grasps, 20, "the first shard is there")
+    system.until(lambda: system.parts.index.jobs.get(job).grasps, 20, "the first shard is there")
     own_s3.kill()
     system.until(lambda: any(m.startswith("waits: the store") for m in messages(system, job)), 40, "tasks say so")
-    assert system.parts.index.job(job).state is State.RUNNING
+    assert system.parts.index.jobs.get(job).state is State.RUNNING
     own_s3.start()
     finish_and_compare(system, job, 32 * 20)
 
@@ -63,7 +63,7 @@ def test_a_store_killed_in_the_middle_is_waited_for(start: Start, own_s3: S3Serv
 def test_an_index_killed_in_the_middle_is_caught_up_with(start: Start, own_postgres: PostgresServer) -> None:
     system = start(environment={"FAKE_SECONDS": "0.1"}, index_url=own_postgres.database())
     job = system.submit(request(grasps=32 * 20))
-    system.until(lambda: system.parts.index.job(job).grasps, 20, "the first shard is indexed")
+    system.until(lambda: system.parts.index.jobs.get(job).grasps, 20, "the first shard is indexed")
     own_postgres.kill()
     made = len(list(system.parts.store.list("shards")))
     system.until(lambda: len(list(system.parts.store.list("shards"))) > made + 4, 20, "workers go on without it")
@@ -89,6 +89,6 @@ def test_a_full_disk_is_waited_for_until_there_is_room(start: Start, small_disk:
     says = "No space left on device"
     system.until(lambda: any(says in message for message in messages(system, job)), 60, "a task says so")
     time.sleep(1.0)  # some more tries
-    assert system.parts.index.job(job).state is State.RUNNING
+    assert system.parts.index.jobs.get(job).state is State.RUNNING
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     finish_and_compare(system, job, 32 * 100)

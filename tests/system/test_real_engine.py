@@ -23,19 +23,19 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     index = system.parts.index
     request = JobRequest(hand="barrett", object="block", grasps=24, fidelity="draft", seed=7)
     system.until(
-        lambda: {a.name for kind in AssetKind for a in index.assets(kind=kind).items} >= {"barrett", "block"},
+        lambda: {a.name for kind in AssetKind for a in index.assets.page(kind=kind).items} >= {"barrett", "block"},
         20, "the built-in assets are published",
     )  # fmt: skip
     job = system.submit(request)
     system.until(
-        lambda: any(0 < task.done < 0.9 * task.total for task in index.tasks(job=job, state=State.RUNNING).items),
+        lambda: any(0 < task.done < 0.9 * task.total for task in index.jobs.tasks(job=job, state=State.RUNNING).items),
         60, "the synthesis is under way",
     )  # fmt: skip
     system.kill("worker-0")
     (done,) = system.finish(job, seconds=90)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 24)
-    assert [attempt.kind for attempt in index.attempts(job=job)] == ["WorkerLost"]
-    (shard,) = index.shards(job=job, kind="base").items
+    assert [attempt.kind for attempt in index.jobs.attempts(job=job)] == ["WorkerLost"]
+    (shard,) = index.shards.page(job=job, kind="base").items
     kept = read_shard(system.parts.store.get(shard.key))
     undisturbed = certified_grasps(
         hand_from_path("barrett"), object_from_path("block", face_error_m=request.knobs.face_error_m), request, count=24

@@ -1,28 +1,31 @@
-"""Every change of the index. Only the API and the keeper call these; each is idempotent."""
+"""What the store says, as rows. Only the API and the keeper call these; each is idempotent."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, delete, select, update
+from sqlalchemy import Connection, select, update
 
 from service.index.changes.rows import asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
 from service.index.changes.states import settle
 from service.index.database import Database, chunks, upsert
-from service.index.tables import assets, attempts, grasps, jobs, shards, tasks, workers
+from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
 from service.model.domain import Asset, State
 from service.model.records import AttemptRecord, JobEvent, JobRecord
-from service.model.worker_beat import WorkerBeat
 from service.store.manifests import ShardManifest
 
 
-class Changes(Database):
-    """Writes of the index. `within` makes a write part of a larger transaction."""
+@dataclass(frozen=True)
+class Changes:
+    """What the store says. `within` makes a write part of a larger transaction."""
+
+    database: Database
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """A job with all its tasks; those whose shard is there already have succeeded."""
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             return self._add_job(connection, record)
 
     def add_manifests(
@@ -34,7 +37,7 @@ class Changes(Database):
             the states of the jobs concerned.
         """
         states: dict[str, State] = {}
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             for manifest in manifests:
                 states |= self._add_manifest(connection, manifest)
         return states
@@ -51,122 +54,18 @@ class Changes(Database):
         Args:
             not_before: `time.time` before which the next attempt must not be queued.
         """
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             return self._add_attempt(connection, attempt, not_before)
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
         """What users did to a job: all its events so far, in order."""
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             return self._set_job_events(connection, job_id, events)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
         """A hand or object, with what ingest found, None while that is to come."""
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
-
-    def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
-        """A check that ended without a finding."""
-        values = {"last_attempt": number, "queued": False, "not_before": not_before}
-        with self.writing() as connection:
-            connection.execute(
-                update(assets).where(assets.c.digest == digest, assets.c.last_attempt < number).values(**values)
-            )
-
-    def set_running(self, task_id: str, worker: str) -> tuple[str, State] | None:
-        """A worker took the task. Returns the job and its state, None if it makes no difference any more."""
-        with self.writing() as connection:
-            job = connection.scalar(
-                update(tasks)
-                .where(tasks.c.id == task_id, tasks.c.state == State.QUEUED.value)
-                .values(
-                    state=State.RUNNING.value,
-                    queued=True,
-                    worker=clean(worker, 128),
-                    progress_done=0.0,
-                    progress_total=0.0,
-                )
-                .returning(tasks.c.job_id)
-            )
-            if job is None:
-                return None
-            # A job that already runs stays so: no need to look at its other tasks.
-            connection.execute(
-                update(jobs)
-                .where(jobs.c.id == job, jobs.c.state == State.QUEUED.value)
-                .values(state=State.RUNNING.value)
-            )
-            return job, State.RUNNING
-
-    def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
-        """How far running tasks are: done, total, and what they do."""
-        with self.writing() as connection:
-            for task_id, (done, total, message) in progress.items():
-                connection.execute(
-                    update(tasks)
-                    .where(tasks.c.id == task_id, tasks.c.state == State.RUNNING.value)
-                    .values(progress_done=done, progress_total=total, progress_message=clean(message))
-                )
-
-    def set_queued(self, task_ids: Sequence[str]) -> None:
-        """Tasks that were put into the queue."""
-        with self.writing() as connection:
-            for some in chunks(task_ids):
-                connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
-
-    def set_waiting(
-        self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
-    ) -> dict[str, State]:
-        """Tasks that are neither in the queue nor with a worker: to be queued again after `not_before`.
-
-        Returns:
-            the states of the jobs concerned.
-        """
-        values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
-        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message and clean(message)}
-        touched: set[str] = set()
-        with self.writing() as connection:
-            for some in chunks(task_ids):
-                statement = update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(**values)
-                touched |= set(connection.scalars(statement.returning(tasks.c.job_id)))
-            return {job: settle(connection, job, []) for job in touched}
-
-    def set_asset_waiting(self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0) -> None:
-        """Checks that no worker holds."""
-        with self.writing() as connection:
-            connection.execute(
-                update(assets).where(assets.c.digest.in_(list(digests))).values(queued=queued, not_before=not_before)
-            )
-
-    def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
-        """The living workers; others turn to lost when last seen before a time, and are forgotten before another."""
-        rows = [
-            {
-                "name": clean(beat.name, 128),
-                "host": clean(beat.host, 128),
-                "pid": beat.pid,
-                "device": clean(beat.device, 64),
-                "device_name": clean(beat.device_name, 128),
-                "stages": [stage.value for stage in beat.stages],
-                "version": clean(beat.version, 32),
-                "state": clean(beat.state, 16),
-                "task_id": clean(beat.task_id, 32) or None,
-                "started": beat.started,
-                "seen": beat.seen,
-                "reason": clean(beat.reason, 300),
-            }
-            for beat in beats
-        ]
-        with self.writing() as connection:
-            upsert(connection, workers, rows)
-            gone = workers.c.name.not_in([beat.name for beat in beats])
-            lost = update(workers).where(gone, workers.c.seen < lost_before)
-            connection.execute(lost.values(state="lost", task_id=None, reason=""))
-            connection.execute(delete(workers).where(gone, workers.c.seen < forget_before))
-
-    def forget_worker(self, name: str) -> None:
-        """A worker that ended as it should."""
-        with self.writing() as connection:
-            connection.execute(delete(workers).where(workers.c.name == name))
 
     def _add_job(self, connection: Connection, record: JobRecord) -> State:
         rows = list(task_rows(record))
@@ -232,7 +131,6 @@ class Changes(Database):
         return settle(connection, job_id)
 
 
-_UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created)
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, exists, or_, select
 
-from service.index.database import Database, chunks
+from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
 from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
 from service.model.domain import AssetKind, Lane, State
 from service.model.errors import NotFoundError
 
 
-class Removals(Database):
+@dataclass(frozen=True)
+class Removals:
     """`within` makes a read or a write part of a larger transaction: what was looked at must still hold."""
+
+    database: Database
 
     def user_of_asset(self, kind: AssetKind, name: str, digest: str, *, within: Connection) -> str:
         """What needs a hand or object, in a few words; empty if nothing does."""
@@ -46,35 +50,26 @@ class Removals(Database):
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
         return tuple((task, number) for task, number in within.execute(query))
 
-    def missing_assets(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:
-        """Of these kinds and digests, those that the index does not know."""
-        digests = sorted({digest for _, digest in wanted})
-        known = set()
-        for some in chunks(digests):
-            query = select(assets.c.kind, assets.c.digest).where(assets.c.digest.in_(some))
-            known |= {(AssetKind(kind), digest) for kind, digest in within.execute(query)}
-        return [f"{kind.value} {digest}" for kind, digest in wanted if (kind, digest) not in known]
-
     def planned_only(self, ids: Sequence[str]) -> list[str]:
         """Of these jobs, those that only a dataset's planner made: nobody submitted them by themselves."""
         query = select(jobs.c.id).where(jobs.c.id.in_(ids), jobs.c.lane == Lane.BULK.value, jobs.c.origin.is_(None))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return list(connection.scalars(query))
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
         """Of these shards, those that are there and that no task of any job makes or reads."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return set(connection.scalars(query))
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
         """A hand or object."""
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             connection.execute(delete(assets).where(assets.c.kind == kind.value, assets.c.digest == digest))
 
     def remove_job(self, job_id: str, *, within: Connection | None = None) -> None:
         """A job, its tasks and their attempts."""
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             of_job = select(tasks.c.id).where(tasks.c.job_id == job_id)
             gone = or_(attempts.c.job_id == job_id, attempts.c.task_id.in_(of_job))
             connection.execute(delete(attempts).where(gone))
@@ -83,7 +78,7 @@ class Removals(Database):
 
     def remove_dataset(self, name: str, *, within: Connection | None = None) -> None:
         """A dataset with its cells and snapshots."""
-        with self.writing(within) as connection:
+        with self.database.writing(within) as connection:
             connection.execute(delete(dataset_snapshots).where(dataset_snapshots.c.dataset == name))
             connection.execute(delete(dataset_cells).where(dataset_cells.c.dataset == name))
             connection.execute(delete(datasets).where(datasets.c.name == name))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
 from sqlalchemy import select
 
 from service.index.database import Database
-from service.index.tables import assets, shards
-from service.model.domain import AssetKind, JobRequest, Stage
+from service.index.tables import shards
+from service.model.domain import JobRequest, Stage
 from service.model.names import SHARD_KINDS
 
 #: Batches looked at of each stage, the newest first: what a machine did long ago says less.
@@ -37,10 +36,13 @@ class BatchCost:
         return self.valid if self.request.counted == "valid" else self.count
 
 
-class CostQueries(Database):
+@dataclass(frozen=True)
+class Costs:
     """Reads on costs."""
 
-    def batch_costs(self, stage: Stage) -> list[BatchCost]:
+    database: Database
+
+    def of_batches(self, stage: Stage) -> list[BatchCost]:
         """The newest finished batches of a stage."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
@@ -49,13 +51,6 @@ class CostQueries(Database):
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(_NEWEST)
         )
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         return [BatchCost(**{**row, "request": JobRequest.model_validate(row["request"])}) for row in rows]
-
-    def asset_sizes(self, kind: AssetKind, wanted: Collection[str]) -> dict[str, int]:
-        """Bytes of the named hands or objects; those that are not known are left out."""
-        names = set(wanted)
-        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value).order_by(assets.c.created)
-        with self.reading() as connection:
-            return {name: size for name, size in connection.execute(query) if name in names}

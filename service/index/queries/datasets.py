@@ -1,16 +1,17 @@
-"""Queries on datasets, their cells and snapshots, and on named sets of objects."""
+"""Queries on datasets, their cells and snapshots."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select, tuple_
 
 from service.index.database import Database
-from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
-from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
+from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets
+from service.index.dataset_views import CellView, DatasetView, SnapshotView
 from service.index.queries import cursors
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import Page
@@ -27,39 +28,42 @@ _SHARE: Final[ColumnElement[float]] = case(
 _IS_BASE: Final = shards.c.stage == Stage.SYNTHESIZE.value
 
 
-class DatasetQueries(Database):
+@dataclass(frozen=True)
+class Datasets:
     """Reads on datasets."""
 
-    def datasets(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+    database: Database
+
+    def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
         """Datasets, newest first."""
         size = cursors.page_size(limit)
         query = select(datasets).order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
         if cursor is not None:
             query = query.where(tuple_(datasets.c.created, datasets.c.name) < cursors.decode(cursor, str, str))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             views = [_dataset_view(connection, row) for row in rows[:size]]
         last = views[-1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last.created, last.name))
 
-    def dataset(self, name: str) -> DatasetView:
+    def get(self, name: str) -> DatasetView:
         """A dataset; NotFoundError if there is none."""
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return _dataset_view(connection, _dataset_row(connection, name))
 
-    def unfinished_datasets(self, names: Collection[str]) -> set[str]:
+    def unfinished(self, names: Collection[str]) -> set[str]:
         """Of these names, those of a dataset that has not ended."""
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
-    def dataset_cells(
+    def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
         """Cells of a dataset by their position."""
         size = cursors.page_size(limit)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             dataset = _dataset_row(connection, name)
             now = _cell_state(dataset["cancelled"])
             query = (
@@ -77,7 +81,7 @@ class DatasetQueries(Database):
             views = _cell_views(connection, rows[:size], JobOptions.model_validate(dataset["options"]))
         return Page(items=views, next=cursors.encode(views[-1].position) if len(rows) > size else None)
 
-    def dataset_shards(self, name: str) -> list[SnapshotShard]:
+    def shards(self, name: str) -> list[SnapshotShard]:
         """All shards of a dataset: cell by cell, batch by batch, stage by stage."""
         query = (
             select(*(shards.c[field] for field in SnapshotShard.model_fields))
@@ -86,7 +90,7 @@ class DatasetQueries(Database):
             .where(dataset_cells.c.dataset == name)
             .order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
         )
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             _dataset_row(connection, name)
             rows = connection.execute(query).mappings().all()
         return [SnapshotShard(**row) for row in rows]
@@ -99,26 +103,11 @@ class DatasetQueries(Database):
         query = query.order_by(*(part.desc() for part in key)).limit(size + 1)
         if cursor is not None:
             query = query.where(tuple_(*key) < cursors.decode(cursor, str, str))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             _dataset_row(connection, name)
             views = [SnapshotView(**row) for row in connection.execute(query).mappings()]
         last = views[size - 1] if len(views) > size else None
         return Page(items=views[:size], next=last and cursors.encode(last.created, last.digest))
-
-    def object_sets(self) -> list[ObjectSetView]:
-        """The newest version of each set of objects, by name."""
-        query = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
-        with self.reading() as connection:
-            newest = {row["name"]: ObjectSetView(**row) for row in connection.execute(query).mappings()}
-        return list(newest.values())
-
-    def object_set(self, name: str) -> ObjectSetView:
-        """The newest version of a set of objects; NotFoundError if there is none of that name."""
-        found = {view.name: view for view in self.object_sets()}
-        if name not in found:
-            known = ", ".join(list(found)[:20]) or "none yet"
-            raise NotFoundError(f"there is no set of objects {name!r}; there are: {known}")
-        return found[name]
 
 
 def _dataset_row(connection: Connection, name: str) -> Any:

@@ -38,8 +38,11 @@ class ReadyCheck:
     last_attempt: int
 
 
-class Feed(Database):
+@dataclass(frozen=True)
+class Feed:
     """Reads of the keeper."""
+
+    database: Database
 
     def waiting_jobs(self, lane: Lane, *, now: float) -> list[WaitingJob]:
         """Jobs with tasks that may be queued, oldest first."""
@@ -50,7 +53,7 @@ class Feed(Database):
             .where(jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.lane == lane.value, waiting)
             .order_by(jobs.c.created, jobs.c.id)
         )
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return [WaitingJob(job, (origin or {}).get("key", "")) for job, origin in connection.execute(query)]
 
     def ready_tasks(self, lane: Lane, turns: Turns, *, now: float, limit: int) -> list[ReadyTask]:
@@ -72,14 +75,14 @@ class Feed(Database):
             .order_by(tasks.c.batch)
             .limit(limit)
         )
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return [_ready(row) for row in connection.execute(query).mappings()]
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
         """Uploads to be checked, oldest first."""
         open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
         query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return [
                 ReadyCheck(AssetKind(row["kind"]), row["name"], row["digest"], row["last_attempt"])
                 for row in connection.execute(query).mappings()
@@ -90,14 +93,14 @@ class Feed(Database):
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
             return set(connection.scalars(of_tasks)), checks
 
     def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
         """Stage and shard id of tasks."""
         query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return {
                 task: (stage, shard)
                 for some in chunks(list(task_ids))
@@ -107,7 +110,7 @@ class Feed(Database):
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
         """Those of the tasks that are cancelled."""
         query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return {
                 task
                 for some in chunks(list(task_ids))
@@ -116,20 +119,20 @@ class Feed(Database):
 
     def has_jobs(self) -> bool:
         """Whether the index knows any job."""
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return connection.scalar(select(jobs.c.id).limit(1)) is not None
 
     def failed_tasks(self, job_id: str) -> dict[str, int]:
         """Failed and cancelled tasks of a job with the number of their last attempt."""
         final = tasks.c.state.in_((State.FAILED.value, State.CANCELLED.value))
         query = select(tasks.c.id, tasks.c.last_attempt).where(tasks.c.job_id == job_id, final)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return {row.id: row.last_attempt for row in connection.execute(query)}
 
     def unfinished_tasks(self, job_id: str) -> list[str]:
         """Tasks of a job that are in the queue or with a worker."""
         query = select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             return list(connection.scalars(query))
 
 

@@ -1,27 +1,29 @@
-"""Queries on grasps and shards."""
+"""Queries on grasps."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Any, Literal
+from dataclasses import dataclass
 
-from sqlalchemy import select, tuple_
+from sqlalchemy import select
 
 from service.index.database import Database
 from service.index.filters import GraspFilter, GraspSort
 from service.index.queries import cursors
 from service.index.queries.grasp_search import search
-from service.index.tables import grasps, shards, tasks
-from service.index.views import GraspView, Page, ShardView
+from service.index.tables import grasps
+from service.index.views import GraspView, Page
 from service.model.errors import NotFoundError
 
 _BEST_FIRST = GraspSort()
 
 
-class GraspQueries(Database):
-    """Reads on grasps and shards."""
+@dataclass(frozen=True)
+class Grasps:
+    """Reads on grasps."""
 
-    def grasps(
+    database: Database
+
+    def page(
         self,
         where: GraspFilter | None = None,
         *,
@@ -32,68 +34,17 @@ class GraspQueries(Database):
         """Grasps in the order of a metric; those without it come last."""
         size = cursors.page_size(limit)
         start = None if cursor is None else cursors.decode(cursor, (float, int, str, type(None)), str, int)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = search(connection, where, sort, size + 1, start)
         views = [GraspView(**{name: row[name] for name in GraspView.model_fields}) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
 
-    def grasp(self, shard_id: str, row: int) -> GraspView:
+    def get(self, shard_id: str, row: int) -> GraspView:
         """One grasp by its shard and row; NotFoundError if there is none."""
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             found = connection.execute(query).mappings().first()
         if found is None:
             raise NotFoundError(f"there is no grasp {row} in shard {shard_id!r}")
         return GraspView(**{name: found[name] for name in GraspView.model_fields})
-
-    def shards(
-        self,
-        *,
-        job: str | None = None,
-        kind: Literal["base", "scene", "views"] | None = None,
-        hand: str | None = None,
-        object: str | None = None,
-        limit: int = 50,
-        cursor: str | None = None,
-    ) -> Page[ShardView]:
-        """Shards, newest first, without their manifests."""
-        size = cursors.page_size(limit)
-        query = select(shards).order_by(shards.c.created.desc(), shards.c.id.desc()).limit(size + 1)
-        for column, wanted in ((shards.c.kind, kind), (shards.c.hand, hand), (shards.c.object, object)):
-            if wanted is not None:
-                query = query.where(column == wanted)
-        if job is not None:
-            query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
-        if cursor is not None:
-            query = query.where(tuple_(shards.c.created, shards.c.id) < cursors.decode(cursor, str, str))
-        with self.reading() as connection:
-            rows = connection.execute(query).mappings().all()
-        views = [_shard_view(row, whole=False) for row in rows[:size]]
-        last = views[-1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last.created, last.id))
-
-    def assets_of_shards(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Digests of hand and object of each of these shards."""
-        query = select(shards.c.id, shards.c.hand_digest, shards.c.object_digest).where(shards.c.id.in_(ids))
-        with self.reading() as connection:
-            return {shard: (hand, obj) for shard, hand, obj in connection.execute(query)}
-
-    def job_of_shard(self, shard_id: str) -> str | None:
-        """A job that wanted this shard; several may, and a pruned index may know none."""
-        with self.reading() as connection:
-            found: str | None = connection.scalar(select(tasks.c.job_id).where(tasks.c.shard_id == shard_id).limit(1))
-        return found
-
-    def shard(self, shard_id: str) -> ShardView:
-        """A shard with its manifest; NotFoundError if there is none."""
-        with self.reading() as connection:
-            row = connection.execute(select(shards).where(shards.c.id == shard_id)).mappings().first()
-        if row is None:
-            raise NotFoundError(f"there is no shard {shard_id!r}")
-        return _shard_view(row, whole=True)
-
-
-def _shard_view(row: Any, *, whole: bool) -> ShardView:
-    values = {name: row[name] for name in ShardView.model_fields if name != "manifest"}
-    return ShardView(**values, manifest=row["manifest"] if whole else {})

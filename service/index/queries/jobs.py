@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, select, tuple_
@@ -17,10 +18,13 @@ from service.model.errors import NotFoundError
 from service.model.planning import CHAIN
 
 
-class JobQueries(Database):
+@dataclass(frozen=True)
+class Jobs:
     """Reads on jobs and what they consist of."""
 
-    def jobs(
+    database: Database
+
+    def page(
         self,
         *,
         state: State | None = None,
@@ -37,24 +41,24 @@ class JobQueries(Database):
                 query = query.where(column == wanted)
         if cursor is not None:
             query = query.where(tuple_(jobs.c.created, jobs.c.id) < cursors.decode(cursor, str, str))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
             views = _job_views(connection, rows[:size])
         last = cursors.encode(views[-1].created, views[-1].id) if len(rows) > size else None
         return Page(items=views, next=last)
 
-    def job(self, job_id: str) -> JobView:
+    def get(self, job_id: str) -> JobView:
         """A job with its progress; NotFoundError if there is none."""
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().all()
             if not rows:
                 raise NotFoundError(f"there is no job {job_id!r}")
             return _job_views(connection, rows)[0]
 
-    def unfinished_of(self, ids: Collection[str]) -> set[str]:
+    def unfinished(self, ids: Collection[str]) -> set[str]:
         """Of these job ids, those whose job has not ended."""
         wanted, found = sorted(ids), set[str]()
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             for start in range(0, len(wanted), 500):
                 some = jobs.c.id.in_(wanted[start : start + 500])
                 found |= set(connection.scalars(select(jobs.c.id).where(some, jobs.c.finished.is_(None))))
@@ -78,7 +82,7 @@ class JobQueries(Database):
                 query = query.where(column == wanted)
         if cursor is not None:
             query = query.where(tuple_(*key) > cursors.decode(cursor, str, int, int))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         views = [_task_view(row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
@@ -86,7 +90,7 @@ class JobQueries(Database):
 
     def task(self, task_id: str) -> TaskView:
         """A task; NotFoundError if there is none."""
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             row = connection.execute(select(tasks).where(tasks.c.id == task_id)).mappings().first()
         if row is None:
             raise NotFoundError(f"there is no task {task_id!r}")
@@ -99,7 +103,7 @@ class JobQueries(Database):
             query = query.where(attempts.c.job_id == job)
         if task is not None:
             query = query.where(attempts.c.task_id == task)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query.limit(cursors.page_size(limit))).mappings().all()
         return [AttemptView(**{name: row[name] for name in AttemptView.model_fields}) for row in rows]
 

@@ -55,17 +55,17 @@ def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[D
     try:
         refuse_pending(parts.store, "dataset", record.name)
         wanted = [(AssetKind.HAND, one.digest) for one in hands] + [(AssetKind.OBJECT, one.digest) for one in objects]
-        with parts.index.writing() as connection:
+        with parts.index.database.writing() as connection:
             if not parts.store.exists(key):
                 raise ConflictError(f"dataset {record.name!r} was deleted just now; create it again")
-            if missing := parts.index.missing_assets(wanted, within=connection):
+            if missing := parts.index.assets.missing(wanted, within=connection):
                 raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
-            parts.index.add_dataset(record, within=connection)
+            parts.index.write_dataset.add(record, within=connection)
     except InputError:
         if new:
             parts.store.delete(key)
         raise
-    return parts.index.dataset(record.name), new
+    return parts.index.datasets.get(record.name), new
 
 
 def cancel(parts: Parts, name: str) -> DatasetView:
@@ -77,7 +77,7 @@ def cancel(parts: Parts, name: str) -> DatasetView:
         NotFoundError: unknown dataset.
         ConflictError: it is finished or cancelled already.
     """
-    dataset = parts.index.dataset(name)
+    dataset = parts.index.datasets.get(name)
     if dataset.cancelled or dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
     return _add_event(parts, name, "cancelled")
@@ -90,7 +90,7 @@ def retry(parts: Parts, name: str) -> DatasetView:
         NotFoundError: unknown dataset.
         ConflictError: no cell failed or was cancelled.
     """
-    dataset = parts.index.dataset(name)
+    dataset = parts.index.datasets.get(name)
     if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
         raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
     return _add_event(parts, name, "retried")
@@ -106,8 +106,8 @@ def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
         NotFoundError: unknown dataset.
         ConflictError: the dataset has no shard yet.
     """
-    dataset = parts.index.dataset(name)
-    held = tuple(parts.index.dataset_shards(name))
+    dataset = parts.index.datasets.get(name)
+    held = tuple(parts.index.datasets.shards(name))
     if not held:
         raise ConflictError(f"dataset {name!r} has no shard yet; wait until a cell is done")
     base = [shard for shard in held if shard.kind == "base"]
@@ -125,7 +125,7 @@ def snapshot(parts: Parts, name: str) -> tuple[Snapshot, bool]:
     new = put_record(parts.store, names.dataset_snapshot(name, taken.digest), taken)
     if not new:
         taken = load_snapshot(parts.store, name, taken.digest)
-    parts.index.add_snapshot(taken)
+    parts.index.write_dataset.add_snapshot(taken)
     return taken, new
 
 
@@ -148,13 +148,13 @@ def add_object_set(
         InputError: an object was refused when it was checked, or there is none.
         ConflictError: a check is still running.
     """
-    assets = [parts.index.asset(AssetKind.OBJECT, one) for one in objects]
+    assets = [parts.index.assets.get(AssetKind.OBJECT, one) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
     after = ""
     with contextlib.suppress(NotFoundError):
-        present = parts.index.object_set(name)
+        present = parts.index.object_sets.get(name)
         if set(present.objects) == set(wanted):
             return present
         after = present.digest
@@ -162,15 +162,15 @@ def add_object_set(
         may_follow(owner)
     found = object_set_of(name, wanted, after=after, owner=owner)
     put_record(parts.store, names.object_set(name, found.digest), found)
-    parts.index.add_object_set(found)
-    return parts.index.object_set(name)
+    parts.index.write_dataset.add_object_set(found)
+    return parts.index.object_sets.get(name)
 
 
 def members(parts: Parts, matrix: Matrix) -> tuple[list[Member], list[Member]]:
     """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
-        objects |= dict.fromkeys(parts.index.object_set(name).objects)
+        objects |= dict.fromkeys(parts.index.object_sets.get(name).objects)
     if len(matrix.hands) * len(objects) > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
     return _members(parts, AssetKind.HAND, matrix.hands), _members(parts, AssetKind.OBJECT, objects)
@@ -184,8 +184,8 @@ def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str]) -> list[Membe
 
 def _add_event(parts: Parts, name: str, what: Literal["cancelled", "retried"]) -> DatasetView:
     add_dataset_event(parts.store, name, what)
-    parts.index.set_dataset_events(name, dataset_events(parts.store, name))
-    return parts.index.dataset(name)
+    parts.index.write_dataset.set_events(name, dataset_events(parts.store, name))
+    return parts.index.datasets.get(name)
 
 
 def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:

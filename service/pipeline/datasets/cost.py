@@ -19,6 +19,7 @@ from typing import Final
 from pydantic import Field
 
 from service.index.index import Index
+from service.index.queries.costs import BatchCost
 from service.index.views import View
 from service.model.dataset_records import request_of
 from service.model.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
@@ -33,6 +34,7 @@ _MESSAGE_BYTES: Final = 19_500
 #: An object of unknown size: a scan of 5000 faces as STL [bytes].
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
+Batches = Callable[[Stage], list[BatchCost]]
 
 
 class WorkersPlan(View):
@@ -99,11 +101,18 @@ def _explicit(request: JobRequest) -> JobRequest:
     return request
 
 
-def estimate(index: Index, matrix: Matrix, resolve: Callable[[JobRequest], JobRequest] = _explicit) -> Estimate:
+def estimate(
+    index: Index,
+    matrix: Matrix,
+    resolve: Callable[[JobRequest], JobRequest] = _explicit,
+    *,
+    costs: Batches | None = None,
+) -> Estimate:
     """The cost of a matrix. Hands and objects need not be known yet.
 
     Args:
         resolve: puts a fidelity in the place of `auto`; not needed where there is none.
+        costs: gives the finished batches of a stage; None: they are read.
 
     Raises:
         NotFoundError: unknown set.
@@ -112,23 +121,25 @@ def estimate(index: Index, matrix: Matrix, resolve: Callable[[JobRequest], JobRe
     """
     objects = list(matrix.objects)
     for name in matrix.sets:
-        objects += [one for one in index.object_set(name).objects if one not in objects]
+        objects += [one for one in index.object_sets.get(name).objects if one not in objects]
     cells = len(matrix.hands) * len(objects)
     if cells > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
     options = matrix.shared
-    devices = {worker.device for worker in index.workers() if worker.state != "lost"}
-    costs = index.batch_costs(Stage.SYNTHESIZE)
+    devices = {worker.device for worker in index.overview.workers() if worker.state != "lost"}
+    costs = costs or index.costs.of_batches
+    batches = costs(Stage.SYNTHESIZE)
     rates: dict[str, Rates] = {}
     sums = _Sums()
     for hand in matrix.hands:
         for obj in objects:
             chosen = resolve(request_of(options, hand, obj))
             if chosen.knobs.name not in rates:
-                rates[chosen.knobs.name] = Rates(costs, chosen, devices)
+                rates[chosen.knobs.name] = Rates(batches, chosen, devices)
             sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
-    return _estimate(index, matrix.hands, objects, options, sums)
+    later = _later_rates(costs, options, sums.machine)
+    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, objects))
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
@@ -153,11 +164,12 @@ def _tries(rate: Rate, options: JobOptions) -> float:
     return min(most, options.grasps / rate.valid_yield) if rate.valid_yield > 0 else most
 
 
-def _estimate(index: Index, hands: Sequence[str], objects: Sequence[str], options: JobOptions, sums: _Sums) -> Estimate:
-    cells = len(hands) * len(objects)
+def _estimate(
+    options: JobOptions, cells: int, sums: _Sums, later: tuple[StageRate, StageRate], known: tuple[float, list[str]]
+) -> Estimate:
     batches = cells * -(-options.grasps // BATCH_SIZE)
     stages = stages_of(options)
-    scene, picture = _later_rates(index, options, sums.machine)
+    scene, picture = later
     pixels = batches * _pictures(options) * options.width * options.height / 1e6
     seconds = {Stage.SYNTHESIZE: sums.seconds}
     ends = {Stage.SYNTHESIZE: (sums.low, sums.high)}
@@ -174,7 +186,7 @@ def _estimate(index: Index, hands: Sequence[str], objects: Sequence[str], option
     low, high = (sum(found) for found in zip(*ends.values(), strict=True))
     read = sum(storage[kind] for kind in list(storage)[:-1])
     network = sum(storage.values()) + read + batches * len(stages) * _MESSAGE_BYTES
-    assets, unknown = _assets(index, hands, objects)
+    assets, unknown = known
     return Estimate(
         cells=cells,
         asked=cells * options.grasps,
@@ -218,9 +230,9 @@ def _plan(
     )
 
 
-def _later_rates(index: Index, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
-    scene = scene_rate(index.batch_costs(Stage.SCENE) if options.scenes else [], machine)
-    return scene, picture_rate(index.batch_costs(Stage.RENDER) if options.views else [], options, machine)
+def _later_rates(costs: Batches, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
+    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], machine)
+    return scene, picture_rate(costs(Stage.RENDER) if options.views else [], options, machine)
 
 
 def _pictures(options: JobOptions) -> int:
@@ -229,8 +241,8 @@ def _pictures(options: JobOptions) -> int:
 
 def _assets(index: Index, hands: Sequence[str], objects: Sequence[str]) -> tuple[float, list[str]]:
     """Bytes of hand and object over all cells; names that are not known."""
-    of_hands = index.asset_sizes(AssetKind.HAND, hands)
-    of_objects = index.asset_sizes(AssetKind.OBJECT, objects)
+    of_hands = index.assets.sizes(AssetKind.HAND, hands)
+    of_objects = index.assets.sizes(AssetKind.OBJECT, objects)
     unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]
     hand_bytes = sum(of_hands.get(name, _ASSET_BYTES) for name in hands) * len(objects)
     object_bytes = sum(of_objects.get(name, _ASSET_BYTES) for name in objects) * len(hands)

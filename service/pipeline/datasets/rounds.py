@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from service.index.changes.datasets import DatasetWork
+from service.index.queries.dataset_feed import DatasetWork
 from service.model.dataset_records import job_of
 from service.model.domain import State
 from service.model.errors import ConflictError
@@ -40,7 +40,7 @@ class DatasetRounds:
             UnavailableError: a part is away; call again later.
         """
         deadline = self._clock() + budget_s
-        for work in self._parts.index.datasets_in_work():
+        for work in self._parts.index.dataset_feed.in_work():
             if not self._pass_on(work, deadline) or not self._plan(work, deadline):
                 return True
         return False
@@ -49,7 +49,7 @@ class DatasetRounds:
         """Make jobs of the cells that have none; whether all are made."""
         after = -1
         while not work.cancelled:
-            cells = self._parts.index.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
+            cells = self._parts.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
             for cell in cells:
                 if self._clock() > deadline:
                     return False
@@ -59,7 +59,7 @@ class DatasetRounds:
                 after = cell.position
             if not cells:
                 break
-        self._parts.index.set_dataset_progress(work.name, planned=True)
+        self._parts.index.write_dataset.set_progress(work.name, planned=True)
         return True
 
     def _pass_on(self, work: DatasetWork, deadline: float) -> bool:
@@ -69,7 +69,7 @@ class DatasetRounds:
         key = (work.name, work.events)
         states = (State.QUEUED, State.RUNNING) if work.cancelled else (State.FAILED, State.CANCELLED)
         while True:
-            found = self._parts.index.cells_in_states(
+            found = self._parts.index.dataset_feed.cells_in_states(
                 work.name, states, after=self._positions.get(key, -1), limit=_CELLS_AT_ONCE, unshared=work.cancelled
             )
             for position, job in found:
@@ -80,7 +80,7 @@ class DatasetRounds:
             if not found:
                 break
         self._positions.pop(key, None)
-        self._parts.index.set_dataset_progress(work.name, applied=work.events)
+        self._parts.index.write_dataset.set_progress(work.name, applied=work.events)
         return True
 
     def _pass_to(self, job: str, work: DatasetWork) -> None:

@@ -21,7 +21,7 @@ def status(index: Index, name: str) -> DatasetStatus:
 
     Each cell tells its job, state, grasps asked, made, valid and tried, tasks done and failed, failed attempts and the
     reason of a failure; `cells[i * len(dataset.objects) + j]` is hand i on object j. For a matrix of thousands of cells
-    take `Index.dataset_cells`, which gives pages and filters by state.
+    take `index.datasets.cells`, which gives pages and filters by state.
 
     Raises:
         NotFoundError: unknown dataset.
@@ -29,8 +29,8 @@ def status(index: Index, name: str) -> DatasetStatus:
     cells: list[CellView] = []
     cursor: str | None = None
     while True:
-        page = index.dataset_cells(name, limit=_PAGE, cursor=cursor)
+        page = index.datasets.cells(name, limit=_PAGE, cursor=cursor)
         cells += page.items
         cursor = page.next
         if cursor is None:
-            return DatasetStatus(dataset=index.dataset(name), cells=cells)
+            return DatasetStatus(dataset=index.datasets.get(name), cells=cells)

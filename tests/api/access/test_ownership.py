@@ -95,7 +95,7 @@ def test_a_job_of_another_key_survives_the_end_of_a_dataset_that_has_it_too(
     assert client.post("/v1/datasets/d/cancel", headers=people["bob"]).status_code == 202
     while DatasetRounds(parts).advance(10):
         pass
-    states = {cell.job_id == job: cell.state for cell in parts.index.dataset_cells("d").items}
+    states = {cell.job_id == job: cell.state for cell in parts.index.datasets.cells("d").items}
     assert states == {True: State.QUEUED, False: State.CANCELLED}
 
 
@@ -103,7 +103,7 @@ def test_jobs_of_a_dataset_belong_to_its_key(client: TestClient, people: dict[st
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
     while DatasetRounds(parts).advance(10):
         pass
-    job = parts.index.dataset_cells("d").items[0].job_id
+    job = parts.index.datasets.cells("d").items[0].job_id
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"]).status_code == 202
 
@@ -155,7 +155,7 @@ def test_owners_are_in_the_store_and_survive_a_lost_index(
     assert added.status_code == 202
     fresh = Index("sqlite://")
     rebuild(fresh, parts.store)
-    found = fresh.job(job).owner, fresh.dataset("d").owner, fresh.asset(AssetKind.OBJECT, "ball").owner
+    found = fresh.jobs.get(job).owner, fresh.datasets.get("d").owner, fresh.assets.get(AssetKind.OBJECT, "ball").owner
     fresh.close()
     assert found == (ann, ann, ann)
 

@@ -26,7 +26,7 @@ def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings,
     fresh = Index(f"sqlite:///{settings.data_dir / 'fresh.sqlite'}")
     lost = Parts(settings, parts.store, fresh, parts.queue)
     app = create_app(settings, lost)
-    fresh.add_job(record)
+    fresh.write.add_job(record)
     assert (found := asked_anew(app))["status"] == 503
     assert not found["ok"]
     assert "keeper" in str(found["detail"])

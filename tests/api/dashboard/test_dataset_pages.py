@@ -46,7 +46,7 @@ def test_chosen_pairs_are_submitted(http: TestClient, parts: Parts) -> None:
     form = {"action": "submit", "cell": ["allegro|mug", "shadow|block"], "grasps": "64", "fidelity": "draft"}
     answer = http.post("/datasets/cells", data=form)
     assert "2 jobs submitted." in answer.text
-    made = parts.index.jobs().items
+    made = parts.index.jobs.page().items
     assert {(job.request.hand, job.request.object, job.request.grasps) for job in made} == {
         ("allegro", "mug", 64),
         ("shadow", "block", 64),
@@ -58,9 +58,9 @@ def test_chosen_pairs_are_cancelled_and_retried(http: TestClient, parts: Parts) 
     fail(parts, failed, "lost")
     pairs = ["allegro|mug", "allegro|block"]
     assert "1 job cancelled." in http.post("/datasets/cells", data={"action": "cancel", "cell": pairs}).text
-    assert parts.index.job(waiting.id).state is State.CANCELLED
+    assert parts.index.jobs.get(waiting.id).state is State.CANCELLED
     assert "2 jobs retried." in http.post("/datasets/cells", data={"action": "retry", "cell": pairs}).text
-    assert parts.index.job(failed.id).state is State.QUEUED
+    assert parts.index.jobs.get(failed.id).state is State.QUEUED
 
 
 @pytest.mark.parametrize(
@@ -82,14 +82,14 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, parts: P
         "1 job cancelled"
         in http.post(
             "/datasets/kitchen/cells",
-            data={"action": "cancel", "cell": [parts.index.dataset_cells("kitchen").items[0].job_id]},
+            data={"action": "cancel", "cell": [parts.index.datasets.cells("kitchen").items[0].job_id]},
         ).text
     )
     assert http.post("/datasets/kitchen/retry").status_code == 200
     finish_all(parts, add_job(parts, fidelity="draft"))
     answer = http.post("/datasets/kitchen/snapshot")
     assert "The snapshot is taken" in answer.text
-    assert len(parts.index.snapshots("kitchen").items) == 1
+    assert len(parts.index.datasets.snapshots("kitchen").items) == 1
 
 
 def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: TestClient) -> None:

@@ -29,7 +29,7 @@ def check(parts: Parts, asset: AssetView, verdict: str) -> None:
     """What a worker would find."""
     found: dict[str, object] = {"verdict": verdict, "message": "a thing of 60 m", "repairs": [], "facts": {}}
     parts.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(found).encode())
-    parts.index.add_asset(load_asset(parts.store, AssetKind.OBJECT, asset.digest), found)
+    parts.index.write.add_asset(load_asset(parts.store, AssetKind.OBJECT, asset.digest), found)
 
 
 def uploaded(http: TestClient, parts: Parts, verdict: str, **options: str) -> AssetView:
@@ -41,7 +41,7 @@ def uploaded(http: TestClient, parts: Parts, verdict: str, **options: str) -> As
 
 def jobs(parts: Parts) -> list[str]:
     """Objects of the jobs there are."""
-    return [job.request.object for job in parts.index.jobs(limit=10).items]
+    return [job.request.object for job in parts.index.jobs.page(limit=10).items]
 
 
 def fields_of(page: str) -> dict[str, str]:
@@ -80,7 +80,7 @@ def test_a_refused_file_is_checked_again_in_other_units_without_being_sent_again
     page = http.post("/submit", data=FORM, files={"file": MESH}).text
     waiting = http.post("/submit", data=fields_of(page) | {"units": "mm"})
     assert waiting.status_code == 409 and "still being checked" in waiting.text
-    meant = parts.index.asset(AssetKind.OBJECT, "part")
+    meant = parts.index.assets.get(AssetKind.OBJECT, "part")
     check(parts, meant, "accept")
     assert http.post("/submit", data=fields_of(waiting.text), follow_redirects=False).status_code == 303
     assert jobs(parts) == ["part"]

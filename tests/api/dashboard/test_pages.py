@@ -9,8 +9,10 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from service.index.index import Index
-from service.index.notes import Damage
+from service.index.damage import Damage
+from service.index.database import Database
+from service.index.queries.jobs import Jobs
+from service.index.queries.overview import Overview
 from service.model.domain import State
 from service.model.errors import IndexUnavailable, QueueUnavailable
 from service.model.planning import plan
@@ -32,7 +34,7 @@ def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some
     http: TestClient, parts: Parts, path: str
 ) -> None:
     assert "graspd store verify" not in http.get(path).text
-    parts.index.set_damage([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
+    parts.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
     page = http.get(path).text
     assert "7 objects of the store are damaged or missing" in page
     assert "graspd store verify --repair" in page
@@ -40,7 +42,7 @@ def test_damage_of_the_store_is_shown_with_its_mend_and_only_while_there_is_some
         assert "shards/base/0.h5" in page
         assert "its &lt;file&gt; is gone" in page
         assert "and 2 more" in page
-    parts.index.replace_damage([])
+    parts.index.damage.replace([])
     assert "damaged or missing" not in http.get(path).text
 
 
@@ -200,8 +202,8 @@ def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatc
     def away(*_: object, **__: object) -> None:
         raise IndexUnavailable("the index does not answer")
 
-    for method in ("ping", "stats", "jobs"):
-        monkeypatch.setattr(Index, method, away)
+    for part, method in ((Database, "ping"), (Overview, "stats"), (Jobs, "page")):
+        monkeypatch.setattr(part, method, away)
     answer = http.get("/", headers={"Accept": "text/html"})
     assert (answer.status_code, answer.headers["content-type"]) == (503, "text/html; charset=utf-8")
     assert "the index does not answer" in answer.text
@@ -213,7 +215,7 @@ def test_an_unforeseen_error_is_a_page_that_gives_nothing_away(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("a secret")
 
-    monkeypatch.setattr(Index, "stats", broken)
+    monkeypatch.setattr(Overview, "stats", broken)
     answer = http.get("/", headers={"Accept": "text/html"})
     assert (answer.status_code, answer.headers["content-type"]) == (500, "text/html; charset=utf-8")
     assert "a secret" not in answer.text

@@ -37,7 +37,7 @@ def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, parts
     asset = http.get(answer.headers["location"]).json()
     assert (asset["name"], asset["verdict"]) == ("My-box-2", None)
     assert load_asset_files(parts.store, AssetKind.OBJECT, asset["digest"])["My box (2).stl"] == STL
-    assert [check.name for check in parts.index.ready_checks(now=1e12, limit=9)] == ["My-box-2"]
+    assert [check.name for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == ["My-box-2"]
 
 
 def test_the_same_upload_twice_is_one_object(http: TestClient) -> None:

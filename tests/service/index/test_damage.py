@@ -54,11 +54,11 @@ def lost(parts: Parts) -> Parts:
 
 
 def shown(index: Index) -> int:
-    return len(index.jobs(limit=99).items)
+    return len(index.jobs.page(limit=99).items)
 
 
 def a_job(parts: Parts) -> str:
-    return parts.index.jobs().items[0].id
+    return parts.index.jobs.page().items[0].id
 
 
 def of_job(parts: Parts) -> str:
@@ -117,7 +117,7 @@ def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(parts: Parts, re
     fresh = lost(parts)
     Keeper(fresh).round()
     assert shown(fresh.index) == GOOD - (record is of_job)
-    made = fresh.index.completeness()
+    made = fresh.index.notes.completeness()
     assert made is not None
     assert (made.left_out, made.names) == (1, (key,))
     fresh.index.close()
@@ -132,15 +132,15 @@ def test_a_record_that_was_mended_is_there_again(parts: Parts) -> None:
     overwrite(parts.store, key, whole)
     Keeper(fresh).round()
     assert shown(fresh.index) == GOOD
-    assert (made := fresh.index.completeness()) is not None
+    assert (made := fresh.index.notes.completeness()) is not None
     assert made.left_out == 0
     fresh.index.close()
 
 
 def test_one_new_job_does_not_make_a_lost_index_whole(parts: Parts) -> None:
     fresh = lost(parts)
-    fresh.index.add_job(read_record(JobRecord, parts.store, of_job(parts)))
-    assert fresh.index.completeness() is None
+    fresh.index.write.add_job(read_record(JobRecord, parts.store, of_job(parts)))
+    assert fresh.index.notes.completeness() is None
     Keeper(fresh).round()
     assert shown(fresh.index) == GOOD
     assert differences(fresh.index, fresh.store) == []
@@ -158,7 +158,7 @@ def test_a_damaged_attempt_fails_its_task_and_stops_no_round(parts: Parts) -> No
         clock.now += 1.0
         keeper.round()
     assert delivery is not None
-    assert sum(job.state is State.FAILED for job in parts.index.jobs().items) <= 1
+    assert sum(job.state is State.FAILED for job in parts.index.jobs.page().items) <= 1
 
 
 class Clock:

@@ -69,12 +69,12 @@ def run_all(parts: Parts, job: str, *, batches: int | None = None, stages: int |
     record = read_record(JobRecord, parts.store, names.job_record(job))
     for task in plan(record):
         if (batches is None or task.batch < batches) and (stages is None or task.stage is Stage.SYNTHESIZE):
-            parts.index.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
+            parts.index.write.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
 
 
 def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None:
     """A failed attempt of the first stage of a batch, in the store and in the index."""
-    task = parts.index.tasks(job=job).items[batch]
+    task = parts.index.jobs.tasks(job=job).items[batch]
     attempt = AttemptRecord(
         task_id=task.id,
         job_id=job,
@@ -87,11 +87,11 @@ def fail(parts: Parts, job: str, batch: int, number: int, *, last: bool) -> None
         last=last,
     )
     put_record(parts.store, names.attempt(task.id, number), attempt)
-    parts.index.add_attempt(attempt)
+    parts.index.write.add_attempt(attempt)
 
 
 def test_the_migrations_make_the_tables_that_the_code_uses(index: Index) -> None:
-    with index.reading() as connection:
+    with index.database.reading() as connection:
         made = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(made, metadata) == []
 
@@ -99,21 +99,21 @@ def test_the_migrations_make_the_tables_that_the_code_uses(index: Index) -> None
 def test_opening_a_migrated_index_again_changes_nothing(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
     again = Index(parts.settings.resolved_index_url)
-    assert again.job(job.id) == parts.index.job(job.id)
+    assert again.jobs.get(job.id) == parts.index.jobs.get(job.id)
     again.close()
 
 
 def test_sqlite_lets_readers_read_while_one_writes(parts: Parts) -> None:
-    with parts.index.writing() as connection:
+    with parts.index.database.writing() as connection:
         connection.execute(update(tables.assets).values(message="half done"))
-        assert {a.message for a in parts.index.assets(AssetKind.HAND).items} == {"fine"}
+        assert {a.message for a in parts.index.assets.page(AssetKind.HAND).items} == {"fine"}
 
 
 def test_a_write_that_breaks_off_leaves_nothing(parts: Parts) -> None:
-    with pytest.raises(RuntimeError), parts.index.writing() as connection:
+    with pytest.raises(RuntimeError), parts.index.database.writing() as connection:
         connection.execute(delete(tables.assets))
         raise RuntimeError
-    assert parts.index.asset(AssetKind.HAND, "gripper").name == "gripper"
+    assert parts.index.assets.get(AssetKind.HAND, "gripper").name == "gripper"
 
 
 def test_a_database_that_cannot_be_opened_is_one_clear_line(tmp_path: Path) -> None:
@@ -125,19 +125,19 @@ def test_a_database_that_cannot_be_opened_is_one_clear_line(tmp_path: Path) -> N
 
 def test_a_job_shows_progress_by_stage(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request(grasps=64, scenes=1))
-    task = parts.index.tasks(job=job.id).items[0]
-    parts.index.set_running(task.id, "w")
-    parts.index.set_progress({task.id: (1.0, 4.0, "descending")})
-    shown = parts.index.job(job.id)
+    task = parts.index.jobs.tasks(job=job.id).items[0]
+    parts.index.live.set_running(task.id, "w")
+    parts.index.live.set_progress({task.id: (1.0, 4.0, "descending")})
+    shown = parts.index.jobs.get(job.id)
     assert shown.state is State.RUNNING
     assert [(s.stage, s.tasks, s.running, s.done) for s in shown.stages] == [
         ("synthesize", 2, 1, 0.25),
         ("scene", 2, 0, 0),
     ]
     run_all(parts, job.id)
-    done = parts.index.job(job.id)
+    done = parts.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 64)
-    assert done.valid == len(parts.index.grasps(GraspFilter(job=job.id, valid=True), limit=200).items)
+    assert done.valid == len(parts.index.grasps.page(GraspFilter(job=job.id, valid=True), limit=200).items)
     assert done.finished is not None
 
 
@@ -149,7 +149,7 @@ def test_jobs_come_newest_first_page_by_page(parts: Parts) -> None:
     seen: list[str] = []
     cursor = None
     for _ in range(3):
-        page = parts.index.jobs(limit=2, cursor=cursor)
+        page = parts.index.jobs.page(limit=2, cursor=cursor)
         seen += [job.id for job in page.items]
         cursor = page.next
     assert seen == ids[::-1]
@@ -158,9 +158,9 @@ def test_jobs_come_newest_first_page_by_page(parts: Parts) -> None:
 
 def test_jobs_are_found_by_state_hand_and_object(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
-    assert parts.index.jobs(state=State.QUEUED, hand="gripper", object="ball").items[0].id == job.id
-    assert parts.index.jobs(state=State.FAILED).items == []
-    assert parts.index.jobs(hand="other").items == []
+    assert parts.index.jobs.page(state=State.QUEUED, hand="gripper", object="ball").items[0].id == job.id
+    assert parts.index.jobs.page(state=State.FAILED).items == []
+    assert parts.index.jobs.page(hand="other").items == []
 
 
 @pytest.mark.parametrize("descending", [True, False])
@@ -168,14 +168,14 @@ def test_jobs_are_found_by_state_hand_and_object(parts: Parts) -> None:
 def test_grasps_page_through_in_the_order_of_any_metric(parts: Parts, by: str, descending: bool) -> None:
     job, _ = job_actions.submit(parts, request(grasps=70))
     run_all(parts, job.id)
-    with parts.index.writing() as connection:  # some without the metric
+    with parts.index.database.writing() as connection:  # some without the metric
         if by != "created":
             connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(**{by: None}))
     sort = GraspSort(by=by, descending=descending)  # type: ignore[arg-type]
     seen: list[GraspView] = []
     cursor = None
     while True:
-        page = parts.index.grasps(sort=sort, limit=16, cursor=cursor)
+        page = parts.index.grasps.page(sort=sort, limit=16, cursor=cursor)
         seen += page.items
         if (cursor := page.next) is None:
             break
@@ -191,12 +191,12 @@ def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
     other, _ = job_actions.submit(parts, request(seed=1))
     run_all(parts, job.id)
     run_all(parts, other.id)
-    everything = [g for start in (None,) for g in parts.index.grasps(limit=200, cursor=start).items]
+    everything = [g for start in (None,) for g in parts.index.grasps.page(limit=200, cursor=start).items]
     where = GraspFilter(
         job=job.id, hand="gripper", valid=True, at_least={"epsilon": 0.3}, at_most={"penetration_depth_mm": 2.0}
     )
-    found = parts.index.grasps(where, limit=200).items
-    of_job = {shard.id for shard in parts.index.shards(job=job.id).items}
+    found = parts.index.grasps.page(where, limit=200).items
+    of_job = {shard.id for shard in parts.index.shards.page(job=job.id).items}
     expected = [
         g
         for g in everything
@@ -209,22 +209,22 @@ def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
 def test_a_cursor_of_another_list_is_refused(parts: Parts) -> None:
     for cursor in ("rubbish", "eyJ4IjoxfQ", "", "W10"):
         with pytest.raises(InputError, match="cursor"):
-            parts.index.jobs(cursor=cursor)
+            parts.index.jobs.page(cursor=cursor)
 
 
 def test_unknown_ids_are_named(parts: Parts) -> None:
-    for call in (parts.index.job, parts.index.shard, parts.index.task):
+    for call in (parts.index.jobs.get, parts.index.shards.get, parts.index.jobs.task):
         with pytest.raises(NotFoundError, match="nothing-here"):
             call("nothing-here")
     with pytest.raises(NotFoundError, match="there are: gripper"):
-        parts.index.asset(AssetKind.HAND, "nothing-here")
+        parts.index.assets.get(AssetKind.HAND, "nothing-here")
 
 
 def test_a_shard_shows_its_manifest(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
     run_all(parts, job.id)
-    (shard,) = parts.index.shards(job=job.id).items
-    whole = parts.index.shard(shard.id)
+    (shard,) = parts.index.shards.page(job=job.id).items
+    whole = parts.index.shards.get(shard.id)
     assert whole.manifest["request"]["hand"] == "gripper"
     assert whole.count == 32
     assert len(parts.store.get(whole.key)) == whole.size_bytes
@@ -235,22 +235,22 @@ def test_failures_are_grouped_by_stage_and_error(parts: Parts) -> None:
     fail(parts, job.id, 0, 1, last=False)
     fail(parts, job.id, 0, 2, last=False)
     fail(parts, job.id, 1, 1, last=False)
-    (group,) = parts.index.failures()
+    (group,) = parts.index.overview.failures()
     assert (group.stage, group.kind, group.attempts, group.tasks) == ("synthesize", "ValueError", 3, 2)
-    assert len(parts.index.attempts(job=job.id)) == 3
+    assert len(parts.index.jobs.attempts(job=job.id)) == 3
 
 
 def test_the_service_in_numbers(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request(grasps=64, scenes=1))
     before = timestamp()
     run_all(parts, job.id, batches=1)
-    stats = parts.index.stats()
+    stats = parts.index.overview.stats()
     assert (stats.grasps, stats.shards) == (32, 2)
     assert stats.tasks[State.SUCCEEDED] == 2
     assert stats.jobs[State.RUNNING] == 1
-    (cell,) = parts.index.matrix()
+    (cell,) = parts.index.overview.matrix()
     assert (cell.hand, cell.object, cell.jobs, cell.grasps, cell.queued) == ("gripper", "ball", 1, 32, 2)
-    made = parts.index.throughput(since=before)
+    made = parts.index.overview.throughput(since=before)
     assert sum(bucket.grasps for bucket in made) == 32
 
 
@@ -259,7 +259,7 @@ def test_the_jobs_of_a_key_are_fed_in_turn_and_each_batch_by_batch(parts: Parts)
     small = Parts(window, parts.store, parts.index, parts.queue)
     for seed in range(2):
         job_actions.submit(small, request(grasps=320, seed=seed), lane=Lane.BULK)
-    ready = parts.index.ready_tasks(Lane.BULK, Turns(), now=time.time(), limit=10)
+    ready = parts.index.feed.ready_tasks(Lane.BULK, Turns(), now=time.time(), limit=10)
     assert len(ready) == 10
     for job in {task.job.id for task in ready}:
         batches = [task.task.batch for task in ready if task.job.id == job]
@@ -275,8 +275,8 @@ def test_a_key_with_many_jobs_gets_no_more_turns_than_one_with_a_single_job(part
     turns = Turns()
     owners: list[str] = []
     for limit in (1, 2, 3, 10, 4):  # room as it comes up, round by round
-        ready = parts.index.ready_tasks(Lane.BULK, turns, now=time.time(), limit=limit)
-        parts.index.set_queued([task.task.id for task in ready])
+        ready = parts.index.feed.ready_tasks(Lane.BULK, turns, now=time.time(), limit=limit)
+        parts.index.live.set_queued([task.task.id for task in ready])
         owners += [task.job.origin.key for task in ready if task.job.origin is not None]
     assert owners.count("greedy") == owners.count("modest") == 10
 
@@ -286,35 +286,35 @@ _PAIR = ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
 
 def _submit_as(parts: Parts, key: str, seed: int) -> None:
     """A bulk job of 20 batches, none of them in the queue yet."""
-    hand, obj = (parts.index.asset(kind, name).digest for kind, name in _PAIR)
+    hand, obj = (parts.index.assets.get(kind, name).digest for kind, name in _PAIR)
     record = JobRecord(
         id=f"{seed:032x}", request=request(grasps=640, seed=seed), revisions=dict(STAGE_REVISIONS), hand_digest=hand,
         object_digest=obj, lane=Lane.BULK, created=timestamp(), origin=Origin(key=key),
     )  # fmt: skip
     put_record(parts.store, names.job_record(record.id), record)
-    parts.index.add_job(record)
+    parts.index.write.add_job(record)
 
 
 def test_a_clock_set_back_does_not_strand_a_task(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
-    task = parts.index.tasks(job=job.id).items[0]
+    task = parts.index.jobs.tasks(job=job.id).items[0]
     a_year = 365 * 86400
-    parts.index.set_waiting([task.id], not_before=time.time() + 60)
-    assert parts.index.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9) == []
-    parts.index.set_waiting([task.id], not_before=time.time() + a_year)
-    assert len(parts.index.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9)) == 1
+    parts.index.live.set_waiting([task.id], not_before=time.time() + 60)
+    assert parts.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9) == []
+    parts.index.live.set_waiting([task.id], not_before=time.time() + a_year)
+    assert len(parts.index.feed.ready_tasks(Lane.INTERACTIVE, Turns(), now=time.time(), limit=9)) == 1
 
 
 def test_two_jobs_that_need_one_shard_both_profit_from_it(parts: Parts) -> None:
     plain, _ = job_actions.submit(parts, request())
     with_scenes, _ = job_actions.submit(parts, request(scenes=1))
     run_all(parts, plain.id)
-    assert parts.index.job(plain.id).state is State.SUCCEEDED
-    stages = parts.index.job(with_scenes.id).stages
+    assert parts.index.jobs.get(plain.id).state is State.SUCCEEDED
+    stages = parts.index.jobs.get(with_scenes.id).stages
     assert [stage.succeeded for stage in stages] == [1, 0]
     later, _ = job_actions.submit(parts, request(scenes=2))
-    assert [stage.succeeded for stage in parts.index.job(later.id).stages] == [1, 0]
-    assert parts.index.stats().grasps == 32, "it is one shard"
+    assert [stage.succeeded for stage in parts.index.jobs.get(later.id).stages] == [1, 0]
+    assert parts.index.overview.stats().grasps == 32, "it is one shard"
 
 
 def build_a_history(parts: Parts) -> None:
@@ -338,27 +338,27 @@ def build_a_history(parts: Parts) -> None:
     job_actions.cancel(parts, again.id)
     job_actions.retry(parts, again.id)
     running, _ = job_actions.submit(parts, request(seed=6))
-    parts.index.set_running(parts.index.tasks(job=running.id).items[0].id, "w")
+    parts.index.live.set_running(parts.index.jobs.tasks(job=running.id).items[0].id, "w")
     shared, _ = job_actions.submit(parts, request(seed=2))
     run_all(parts, shared.id)
 
 
 def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(parts: Parts) -> None:
     build_a_history(parts)
-    states = {job.state for job in parts.index.jobs(limit=99).items}
+    states = {job.state for job in parts.index.jobs.page(limit=99).items}
     assert states == {State.SUCCEEDED, State.RUNNING, State.QUEUED, State.CANCELLED}
     assert differences(parts.index, parts.store) == []
-    before = parts.index.jobs(limit=99), parts.index.grasps(limit=200), parts.index.shards(limit=200)
+    before = parts.index.jobs.page(limit=99), parts.index.grasps.page(limit=200), parts.index.shards.page(limit=200)
     rebuild(parts.index, parts.store)
     assert differences(parts.index, parts.store) == []
-    after = parts.index.jobs(limit=99), parts.index.grasps(limit=200), parts.index.shards(limit=200)
+    after = parts.index.jobs.page(limit=99), parts.index.grasps.page(limit=200), parts.index.shards.page(limit=200)
     assert before[1:] == after[1:]
     assert [job.id for job in before[0].items] == [job.id for job in after[0].items]
 
 
 def test_every_kind_of_damage_to_the_index_is_seen_and_mended(parts: Parts) -> None:
     build_a_history(parts)
-    with parts.index.writing() as connection:
+    with parts.index.database.writing() as connection:
         connection.execute(delete(tables.grasps).where(tables.grasps.c.row == 0))
         connection.execute(update(tables.shards).values(seconds=99.0))
         connection.execute(update(tables.tasks).where(tables.tasks.c.done.is_(True)).values(state="failed"))
@@ -370,7 +370,7 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(parts: Parts) -> N
 
 def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
     build_a_history(parts)
-    jobs = len(parts.index.jobs(limit=99).items)
+    jobs = len(parts.index.jobs.page(limit=99).items)
 
     def away(_store: Store, key: str) -> bytes:
         raise StoreUnavailable("away")
@@ -378,7 +378,7 @@ def test_a_rebuild_that_breaks_off_leaves_the_old_rows(parts: Parts, monkeypatch
     monkeypatch.setattr(Store, "get", away)
     with pytest.raises(StoreUnavailable):
         rebuild(parts.index, parts.store)
-    assert len(parts.index.jobs(limit=99).items) == jobs
+    assert len(parts.index.jobs.page(limit=99).items) == jobs
 
 
 @pytest.mark.parametrize("sorted_at_once", [0, 20_000])
@@ -389,8 +389,8 @@ def test_a_pair_is_found_whichever_way_the_database_goes(
     job, _ = job_actions.submit(parts, request())
     run_all(parts, job.id)
     sort = GraspSort(by="penetration_depth_mm", descending=False)
-    assert len(parts.index.grasps(GraspFilter(hand="gripper", object="ball"), sort=sort).items) == 32
-    assert parts.index.grasps(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []
+    assert len(parts.index.grasps.page(GraspFilter(hand="gripper", object="ball"), sort=sort).items) == 32
+    assert parts.index.grasps.page(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []
 
 
 @pytest.mark.parametrize("where", [
@@ -411,7 +411,7 @@ def test_every_way_of_searching_finds_the_same(
 ) -> None:
     job, _ = job_actions.submit(parts, request(grasps=160))
     run_all(parts, job.id)
-    everything = parts.index.grasps(sort=sort, limit=200).items
+    everything = parts.index.grasps.page(sort=sort, limit=200).items
     passing = [
         grasp
         for grasp in everything
@@ -424,7 +424,7 @@ def test_every_way_of_searching_finds_the_same(
     found: list[GraspView] = []
     cursor = None
     while True:
-        page = parts.index.grasps(where, sort=sort, limit=7, cursor=cursor)
+        page = parts.index.grasps.page(where, sort=sort, limit=7, cursor=cursor)
         found += page.items
         if (cursor := page.next) is None:
             break
@@ -437,11 +437,11 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts, bucket_s
     run_all(parts, job.id)
     hour = "2026-05-01T{:02}:{:02}:{:02}.123Z"
     times = [hour.format(7, 59, 59), hour.format(8, 0, 0), hour.format(8, 0, 44), hour.format(9, 30, 1)]
-    with parts.index.writing() as connection:
-        for number, shard in enumerate(parts.index.shards(job=job.id, limit=9).items):
+    with parts.index.database.writing() as connection:
+        for number, shard in enumerate(parts.index.shards.page(job=job.id, limit=9).items):
             change = update(tables.shards).where(tables.shards.c.id == shard.id)
             connection.execute(change.values(created=times[number % 4]))
-    buckets = parts.index.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
+    buckets = parts.index.overview.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
     assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6)
     starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
     assert starts == sorted({t - t % bucket_s for t in (int(datetime.fromisoformat(x).timestamp()) for x in times)})
@@ -466,37 +466,37 @@ def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts,
         thread.start()
     try:
         for message in messages:
-            parts.index.add_manifest(make_shard(parts.store, message))
+            parts.index.write.add_manifest(make_shard(parts.store, message))
     finally:
         done.set()
         for thread in threads:
             thread.join()
         other.index.close()
-    assert parts.index.stats().tasks[State.SUCCEEDED] == 24
-    assert parts.index.job(job.id).state is State.SUCCEEDED
+    assert parts.index.overview.stats().tasks[State.SUCCEEDED] == 24
+    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(parts.index, parts.store) == []
 
 
 def test_text_that_a_database_would_refuse_stops_nothing(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
-    task = parts.index.tasks(job=job.id).items[0]
+    task = parts.index.jobs.tasks(job=job.id).items[0]
     long = "w" * 200 + "\0"
-    parts.index.set_running(task.id, long)
-    parts.index.set_progress({task.id: (1.0, 2.0, "half\0way")})
-    assert parts.index.task(task.id).message == "halfway"
+    parts.index.live.set_running(task.id, long)
+    parts.index.live.set_progress({task.id: (1.0, 2.0, "half\0way")})
+    assert parts.index.jobs.task(task.id).message == "halfway"
     attempt = AttemptRecord(
         task_id=task.id, job_id=job.id, stage=task.stage, number=1, kind="K" * 100, reason="a\0b", trace="\0",
         worker=long, ended=timestamp(), last=True,
     )  # fmt: skip
     put_record(parts.store, names.attempt(task.id, 1), attempt)
-    parts.index.add_attempt(attempt)
-    assert parts.index.job(job.id).reason == "ab"
+    parts.index.write.add_attempt(attempt)
+    assert parts.index.jobs.get(job.id).reason == "ab"
     assert differences(parts.index, parts.store) == []
 
 
 @pytest.mark.postgres
 def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server: PostgresServer) -> None:
     index = Index(postgres_server.database())
-    with pytest.raises(InputError, match="cannot hold"), index.writing() as connection:
+    with pytest.raises(InputError, match="cannot hold"), index.database.writing() as connection:
         connection.execute(tables.workers.insert().values(name="x" * 999))
     index.close()

@@ -55,8 +55,8 @@ def read(url: str) -> tuple[Stats, list[str], list[float | None]]:
     """What the index answers once it is at the newest revision."""
     index = Index(url)
     try:
-        jobs = [f"{job.id} {job.state} {job.grasps} {job.valid}" for job in index.jobs(limit=50).items]
-        return index.stats(), jobs, [grasp.epsilon for grasp in index.grasps(limit=200).items]
+        jobs = [f"{job.id} {job.state} {job.grasps} {job.valid}" for job in index.jobs.page(limit=50).items]
+        return index.overview.stats(), jobs, [grasp.epsilon for grasp in index.grasps.page(limit=200).items]
     finally:
         index.close()
 
@@ -78,7 +78,7 @@ def test_the_first_revision_can_be_taken_back_too(url: str, engine: Engine) -> N
     downgrade(url, "base")
     assert set(rows(engine)) == {"alembic_version"}
     index = Index(url)
-    assert not index.has_jobs()
+    assert not index.feed.has_jobs()
     index.close()
 
 

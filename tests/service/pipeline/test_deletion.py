@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from service.index.changes.removals import Removals
 from service.index.rebuild import differences
 from service.model import names
 from service.model.domain import AssetKind, State
@@ -27,16 +28,16 @@ def finished(parts: Parts, **changes: Any) -> str:
     """A job whose shards are there."""
     job, _ = job_actions.submit(parts, request(**changes))
     _make_all(parts)
-    assert parts.index.job(job.id).state is State.SUCCEEDED
+    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
     return job.id
 
 
 def _make_all(parts: Parts) -> None:
     queue: Any = parts.queue
     while (delivery := queue.take("w")) is not None:
-        parts.index.add_manifest(make_shard(parts.store, delivery.message))
+        parts.index.write.add_manifest(make_shard(parts.store, delivery.message))
         queue.finish(delivery)
-        for job in parts.index.jobs().items:
+        for job in parts.index.jobs.page().items:
             job_actions._start(parts, job.id)
 
 
@@ -46,7 +47,7 @@ def dataset(parts: Parts, name: str = "d", **changes: Any) -> str:
     actions.create(parts, wanted)
     DatasetRounds(parts).advance()
     _make_all(parts)
-    assert parts.index.dataset(name).state is State.SUCCEEDED
+    assert parts.index.datasets.get(name).state is State.SUCCEEDED
     return name
 
 
@@ -64,7 +65,7 @@ def test_a_deleted_job_is_gone_at_once_and_its_objects_with_the_keeper(parts: Pa
     job = finished(parts)
     delete_job(parts, job)
     with pytest.raises(NotFoundError):
-        parts.index.job(job)
+        parts.index.jobs.get(job)
     assert differences(parts.index, parts.store) == [], "an index made anew knows it as little"
     assert not Sweeper(parts).advance()
     assert keys(parts, "jobs", "tasks", "deletions") == set()
@@ -79,7 +80,7 @@ def test_shards_that_nobody_needs_go_after_the_grace_time(parts: Parts) -> None:
     assert len(keys(parts, "shards")) == 2, "there is grace"
     assert not graceless(parts).collect()
     assert keys(parts, "shards", "released") == set()
-    assert parts.index.stats().grasps == 0
+    assert parts.index.overview.stats().grasps == 0
     assert differences(parts.index, parts.store) == []
 
 
@@ -89,7 +90,7 @@ def test_a_shard_that_another_job_needs_stays(parts: Parts) -> None:
     Sweeper(parts).advance()
     assert not graceless(parts).collect()
     assert len(keys(parts, "shards")) == 4
-    assert parts.index.job(long).grasps == 64
+    assert parts.index.jobs.get(long).grasps == 64
 
 
 def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(parts: Parts) -> None:
@@ -115,7 +116,7 @@ def test_a_job_that_runs_is_in_use(parts: Parts) -> None:
 
 def test_a_job_of_a_dataset_is_in_use(parts: Parts) -> None:
     dataset(parts)
-    (job,) = parts.index.jobs().items
+    (job,) = parts.index.jobs.page().items
     with pytest.raises(ConflictError, match="belongs to dataset 'd'"):
         delete_job(parts, job.id)
 
@@ -132,9 +133,9 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(parts: Parts) -> None:
     while Sweeper(parts).advance():
         pass
     Sweeper(parts).advance()
-    assert {view.name for view in parts.index.datasets().items} == {"other"}
-    assert len(parts.index.jobs().items) == 2
-    assert parts.index.job(own)
+    assert {view.name for view in parts.index.datasets.page().items} == {"other"}
+    assert len(parts.index.jobs.page().items) == 2
+    assert parts.index.jobs.get(own)
     assert keys(parts, "datasets") == {names.dataset_record("other")}
     assert differences(parts.index, parts.store) == []
     dataset(parts, "d", grasps=96)
@@ -163,7 +164,7 @@ def test_an_object_of_a_set_is_in_use(parts: Parts) -> None:
 
 
 def test_a_deleted_object_frees_its_name_and_its_files(parts: Parts) -> None:
-    digest = parts.index.asset(AssetKind.OBJECT, "ball").digest
+    digest = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
     delete_asset(parts, AssetKind.OBJECT, "ball")
     assert differences(parts.index, parts.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
@@ -195,7 +196,7 @@ def test_a_deletion_that_broke_off_is_carried_out_by_the_next_keeper(
     make()
     remove = {"job": "remove_job", "dataset": "remove_dataset", "object": "remove_asset"}[what]
     with monkeypatch.context() as patch:
-        patch.setattr(type(parts.index), remove, _break)
+        patch.setattr(Removals, remove, _break)
         with pytest.raises(KeyboardInterrupt):
             act()
     assert pending(parts.store)
@@ -213,7 +214,7 @@ def test_a_deletion_that_broke_off_is_carried_out_by_the_next_keeper(
 
 
 def _jobs(parts: Parts) -> list[str]:
-    return [job.id for job in parts.index.jobs().items]
+    return [job.id for job in parts.index.jobs.page().items]
 
 
 def _break(*_: object, **__: object) -> None:

@@ -37,7 +37,7 @@ def test_the_same_request_is_the_same_job(parts: Parts) -> None:
 
 
 def test_a_hand_named_by_its_digest_is_the_same_job(parts: Parts) -> None:
-    digest = parts.index.asset(AssetKind.HAND, "gripper").digest
+    digest = parts.index.assets.get(AssetKind.HAND, "gripper").digest
     assert job_actions.submit(parts, request(hand=digest))[0].id == job_actions.submit(parts, request())[0].id
 
 
@@ -50,14 +50,14 @@ def test_an_unknown_hand_or_object_leaves_nothing_behind(parts: Parts) -> None:
 
 def test_a_refused_hand_cannot_be_used_and_says_why(parts: Parts) -> None:
     asset = publish_asset(parts.store, AssetKind.HAND, "broken", HAND_FILES | {"extra": b"1"})
-    parts.index.add_asset(asset, {"verdict": "refuse", "message": "it has no joints"})
+    parts.index.write.add_asset(asset, {"verdict": "refuse", "message": "it has no joints"})
     with pytest.raises(InputError, match="it has no joints"):
         job_actions.submit(parts, request(hand="broken"))
 
 
 def test_an_unchecked_hand_must_wait_for_its_check(parts: Parts) -> None:
     asset = publish_asset(parts.store, AssetKind.HAND, "fresh", HAND_FILES | {"extra": b"2"})
-    parts.index.add_asset(asset, None)
+    parts.index.write.add_asset(asset, None)
     with pytest.raises(ConflictError, match="still being checked"):
         job_actions.submit(parts, request(hand="fresh"))
 
@@ -72,7 +72,7 @@ def test_without_redis_a_submit_is_refused_and_nothing_is_recorded(
     with pytest.raises(QueueUnavailable):
         job_actions.submit(parts, request())
     assert list(parts.store.list(names.JOBS)) == []
-    assert parts.index.jobs().items == []
+    assert parts.index.jobs.page().items == []
 
 
 def test_a_large_job_fills_the_window_and_no_more(parts: Parts) -> None:
@@ -106,7 +106,7 @@ def test_a_retried_job_gets_fresh_attempts_and_keeps_what_is_done(parts: Parts) 
     run_all(parts, job.id, batches=1)
     for number in (1, 2, 3):
         fail(parts, job.id, 1, number, last=number == 3)
-    failed = parts.index.job(job.id)
+    failed = parts.index.jobs.get(job.id)
     assert (failed.state, failed.reason) == (State.FAILED, "attempt 3 went wrong")
     queue = queue_of(parts)
     while queue.take("w") is not None:
@@ -116,7 +116,7 @@ def test_a_retried_job_gets_fresh_attempts_and_keeps_what_is_done(parts: Parts) 
     delivery = queue.take("w")
     assert delivery is not None
     assert (delivery.message.attempt, delivery.message.max_attempt) == (4, 6)
-    assert len(parts.index.attempts(job=job.id)) == 3, "the history stays"
+    assert len(parts.index.jobs.attempts(job=job.id)) == 3, "the history stays"
 
 
 def test_only_what_failed_or_was_cancelled_can_be_retried(parts: Parts) -> None:

@@ -91,7 +91,7 @@ def explode(message: TaskMessage, context: TaskContext) -> None:
 def test_a_job_goes_through_all_its_stages(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.parts, request(grasps=70, scenes=2))
     bench.work_off()
-    done = bench.parts.index.job(job.id)
+    done = bench.parts.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 70)
     assert differences(bench.parts.index, bench.parts.store) == []
 
@@ -110,12 +110,12 @@ def test_a_task_of_a_lost_worker_is_queued_again_with_its_reason_kept(bench: Ben
     bench.pass_time(bench.parts.settings.lease_s + 2)
     again = bench.take()
     assert again.message.attempt == 2
-    (attempt,) = bench.parts.index.attempts(job=job.id)
+    (attempt,) = bench.parts.index.jobs.attempts(job=job.id)
     assert (attempt.kind, attempt.last) == ("WorkerLost", False)
     assert "no sign of life for 6 s" in attempt.reason
     bench.do(again)
     bench.pass_time(1)
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(bench.parts.index, bench.parts.store) == []
 
 
@@ -151,7 +151,7 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
                 bench.keeper.round()
     bench.pass_time(2, beating=held)
     assert [lease.key for lease in bench.queue.leases()] == [held.key]
-    assert bench.parts.index.attempts() == []
+    assert bench.parts.index.jobs.attempts() == []
 
 
 def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) -> None:
@@ -160,12 +160,12 @@ def test_a_worker_that_was_only_slow_changes_nothing_when_it_ends(bench: Bench) 
     bench.pass_time(bench.parts.settings.lease_s + 2)
     bench.do(bench.take())
     bench.pass_time(1)
-    (before,) = bench.parts.index.shards(job=job.id).items
+    (before,) = bench.parts.index.shards.page(job=job.id).items
     bench.do(slow)
     bench.pass_time(1)
-    (after,) = bench.parts.index.shards(job=job.id).items
+    (after,) = bench.parts.index.shards.page(job=job.id).items
     assert after == before
-    assert bench.parts.index.stats().grasps == 32
+    assert bench.parts.index.overview.stats().grasps == 32
 
 
 def test_a_worker_lost_after_its_manifest_was_put_costs_no_attempt(bench: Bench) -> None:
@@ -174,8 +174,8 @@ def test_a_worker_lost_after_its_manifest_was_put_costs_no_attempt(bench: Bench)
     assert isinstance(delivery.message, TaskMessage)
     make_shard(bench.parts.store, delivery.message)
     bench.pass_time(bench.parts.settings.lease_s + 2)
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
-    assert bench.parts.index.attempts(job=job.id) == []
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.attempts(job=job.id) == []
 
 
 def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -> None:
@@ -184,11 +184,11 @@ def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -
         bench.take()
         bench.pass_time(bench.parts.settings.lease_s + 2)
     assert bench.queue.take("w") is None
-    failed = bench.parts.index.job(job.id)
+    failed = bench.parts.index.jobs.get(job.id)
     assert failed.state is State.FAILED
     assert failed.reason is not None
     assert "was lost" in failed.reason
-    assert [a.number for a in bench.parts.index.attempts(job=job.id)] == [3, 2, 1]
+    assert [a.number for a in bench.parts.index.jobs.attempts(job=job.id)] == [3, 2, 1]
     assert differences(bench.parts.index, bench.parts.store) == []
 
 
@@ -199,10 +199,10 @@ def test_a_failing_task_fails_its_job_alone_and_keeps_each_reason(bench: Bench) 
         bench.pass_time(1)
     good, _ = job_actions.submit(bench.parts, request(seed=2))
     bench.work_off()
-    assert bench.parts.index.job(bad.id).state is State.FAILED
-    assert bench.parts.index.job(bad.id).reason == "the planner lost its way"
-    assert bench.parts.index.job(good.id).state is State.SUCCEEDED
-    attempts = bench.parts.index.attempts(job=bad.id)
+    assert bench.parts.index.jobs.get(bad.id).state is State.FAILED
+    assert bench.parts.index.jobs.get(bad.id).reason == "the planner lost its way"
+    assert bench.parts.index.jobs.get(good.id).state is State.SUCCEEDED
+    attempts = bench.parts.index.jobs.attempts(job=bad.id)
     assert [(a.number, a.kind, a.last) for a in attempts] == [
         (3, "ValueError", True),
         (2, "ValueError", False),
@@ -231,11 +231,11 @@ def test_a_store_that_is_away_costs_no_attempt_and_says_so(bench: Bench) -> None
     assert outcome is not None
     assert outcome.kind is EventKind.DEFERRED
     bench.keeper._index_events(0)
-    waiting = bench.parts.index.tasks(job=job.id).items[0]
+    waiting = bench.parts.index.jobs.tasks(job=job.id).items[0]
     assert (waiting.state, waiting.message) == (State.QUEUED, "waits: the store is full")
     bench.work_off()
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
-    assert bench.parts.index.attempts(job=job.id) == []
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.attempts(job=job.id) == []
 
 
 def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,11 +250,11 @@ def test_while_the_store_is_away_what_does_not_need_it_is_known(bench: Bench, mo
         for _ in range(3):
             with pytest.raises(StoreUnavailable, match="1 events wait for it"):
                 bench.pass_time(1)
-        states = [(task.state, task.message) for task in bench.parts.index.tasks(job=job.id).items]
+        states = [(task.state, task.message) for task in bench.parts.index.jobs.tasks(job=job.id).items]
         assert states == [(State.RUNNING, None), (State.QUEUED, "waits: the store does not answer")]
     bench.work_off()
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
-    assert bench.parts.index.attempts(job=job.id) == []
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.attempts(job=job.id) == []
 
 
 def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
@@ -267,7 +267,7 @@ def test_a_task_handed_back_at_shutdown_costs_no_attempt(bench: Bench) -> None:
     bench.pass_time(1)
     again = bench.take()
     assert again.message.attempt == 1
-    assert bench.parts.index.job(job.id).state is State.QUEUED
+    assert bench.parts.index.jobs.get(job.id).state is State.QUEUED
 
 
 def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
@@ -279,7 +279,7 @@ def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
     bench.pass_time(LOST_AFTER_S + 2)
     assert len(empty.waiting()) == 3, "two syntheses, and the scene of the shard whose event was lost"
     bench.work_off()
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(bench.parts.index, bench.parts.store) == []
 
 
@@ -291,7 +291,7 @@ def test_a_lost_failure_event_is_made_good_from_the_store(bench: Bench) -> None:
     bench.queue.finish(delivery)
     bench.pass_time(LOST_AFTER_S + 2)
     assert bench.take().message.attempt == 2
-    assert [a.number for a in bench.parts.index.attempts(job=job.id)] == [1]
+    assert [a.number for a in bench.parts.index.jobs.attempts(job=job.id)] == [1]
 
 
 def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> None:
@@ -304,8 +304,8 @@ def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> N
     good, _ = job_actions.submit(bench.parts, request(seed=2))
     bench.work_off()
     bench.pass_time(LOST_AFTER_S + 2)
-    assert bench.parts.index.job(good.id).state is State.SUCCEEDED
-    failed = bench.parts.index.job(bad.id)
+    assert bench.parts.index.jobs.get(good.id).state is State.SUCCEEDED
+    failed = bench.parts.index.jobs.get(bad.id)
     assert failed.state is State.FAILED
     assert key in (failed.reason or "")
     assert "remove it and retry its job" in (failed.reason or "")
@@ -340,7 +340,7 @@ def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
     bench.pass_time(LOST_AFTER_S + 2)
     assert len(bench.queue.waiting()) == waiting == 2, "what was in the queue is not queued twice"
     bench.work_off()
-    assert fresh.job(job.id).state is State.SUCCEEDED
+    assert fresh.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(fresh, bench.parts.store) == []
     fresh.close()
 
@@ -361,7 +361,7 @@ def test_events_not_yet_in_the_index_come_again_to_the_next_keeper(
     bench.queue.restart_consumer()
     bench = Bench(bench.parts)
     bench.keeper.round()
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
 def test_forged_events_are_left_out_and_stop_nothing(bench: Bench) -> None:
@@ -372,7 +372,7 @@ def test_forged_events_are_left_out_and_stop_nothing(bench: Bench) -> None:
                 forged = {"kind": kind, "at": timestamp(), "task_id": "../x", "stage": stage, "output": output}
                 bench.queue.publish(Event.model_construct(**forged, attempt=1))
     bench.work_off()
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
 def test_a_cancelled_task_that_still_runs_is_stopped(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -400,32 +400,32 @@ def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
         bench.do(delivery)
         bench.pass_time(1)
     assert deepest == 4
-    assert bench.parts.index.job(job.id).state is State.SUCCEEDED
+    assert bench.parts.index.jobs.get(job.id).state is State.SUCCEEDED
 
 
 def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
     asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
-    bench.parts.index.add_asset(asset, None)
+    bench.parts.index.write.add_asset(asset, None)
 
     def check(message: IngestMessage, context: TaskContext) -> None:
         found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
         context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
 
     bench.work_off(ingest=check)
-    view = bench.parts.index.asset(AssetKind.HAND, "upload")
+    view = bench.parts.index.assets.get(AssetKind.HAND, "upload")
     assert (view.verdict, view.repairs, view.facts) == ("repair", ["hole"], {"faces": 12})
     assert differences(bench.parts.index, bench.parts.store) == []
 
 
 def test_an_upload_that_kills_every_worker_is_refused(bench: Bench) -> None:
     asset = publish_asset(bench.parts.store, AssetKind.HAND, "bomb", HAND_FILES | {"extra": b"4"})
-    bench.parts.index.add_asset(asset, None)
+    bench.parts.index.write.add_asset(asset, None)
     bench.pass_time(1)
     for _ in range(bench.parts.settings.task_attempts):
         bench.take()
         bench.pass_time(bench.parts.settings.lease_s + 2)
     assert bench.queue.take("w") is None
-    assert bench.parts.index.asset(AssetKind.HAND, "bomb").verdict == "refuse"
+    assert bench.parts.index.assets.get(AssetKind.HAND, "bomb").verdict == "refuse"
 
 
 def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(

@@ -13,8 +13,8 @@ from sqlalchemy.dialects import sqlite
 
 from api.metrics import Metrics, Snapshot
 from service.index import at_scrape
+from service.index.damage import Damage
 from service.index.index import Index
-from service.index.notes import Damage
 from service.model.domain import Lane, Stage, State, TaskMessage
 from service.pipeline.backends import Parts
 from service.pipeline.job_actions import submit
@@ -58,7 +58,7 @@ def tasks(count: int) -> list[TaskMessage]:
 def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: Any) -> None:
     index = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     text = str(query.compile(dialect=sqlite.dialect(), compile_kwargs={"literal_binds": True}))
-    with index.reading() as connection:
+    with index.database.reading() as connection:
         steps = [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
     index.close()
     tables = [step for step in steps if re.search(r"\b(jobs|shards)\b", step)]
@@ -67,19 +67,19 @@ def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: A
 
 
 def test_damage_of_the_store_is_told(parts: Parts) -> None:
-    assert at_scrape.read_index(parts.index).damaged == 0
-    parts.index.set_damage([Damage("shards/base/a.h5", "its file is gone", "a")])
-    assert at_scrape.read_index(parts.index).damaged == 1
+    assert at_scrape.read_index(parts.index.database).damaged == 0
+    parts.index.damage.mark([Damage("shards/base/a.h5", "its file is gone", "a")])
+    assert at_scrape.read_index(parts.index.database).damaged == 1
     shown = Snapshot()
-    shown.add_index(at_scrape.read_index(parts.index))
+    shown.add_index(at_scrape.read_index(parts.index.database))
     assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
 def test_unfinished_jobs_and_the_yield_of_the_last_minute_are_told(parts: Parts) -> None:
     submit(parts, request(grasps=32))
     manifest = make_shard(parts.store, message_for())
-    parts.index.add_manifest(manifest)
-    found = at_scrape.read_index(parts.index)
+    parts.index.write.add_manifest(manifest)
+    found = at_scrape.read_index(parts.index.database)
     assert found.jobs[State.QUEUED] == 1
     assert 0 <= found.oldest_s[State.QUEUED] < 60
     assert found.grasps_per_s == pytest.approx(manifest.count / 60)

@@ -46,8 +46,8 @@ def shards(parts: Parts) -> list[ShardManifest]:
     """Finished shards, in the order of their batches."""
     job, _ = job_actions.submit(parts, request(grasps=32 * SHARDS))
     work_off(parts)
-    assert parts.index.job(job.id).state is State.SUCCEEDED
-    found = [load_manifest(parts.store, s.stage, s.id) for s in parts.index.shards(job=job.id, limit=99).items]
+    assert parts.index.jobs.get(job.id).state is State.SUCCEEDED
+    found = [load_manifest(parts.store, s.stage, s.id) for s in parts.index.shards.page(job=job.id, limit=99).items]
     return sorted(found, key=lambda manifest: manifest.batch)
 
 
@@ -126,7 +126,7 @@ def test_a_foreign_object_is_found_and_moved_aside(parts: Parts, shards: list[Sh
 
 
 def test_a_damaged_record_is_found_and_said_to_need_a_copy(parts: Parts, shards: list[ShardManifest]) -> None:
-    key = names.job_record(parts.index.jobs().items[0].id)
+    key = names.job_record(parts.index.jobs.page().items[0].id)
     overwrite(parts.store, key, b'{"x": 1}')
     found = [wrong for _, wrong in scan(parts.store) if wrong is not None]
     assert [one.key for one in found] == [key]
@@ -152,7 +152,7 @@ def test_the_command_tells_what_is_damaged_and_exits_with_1(
     said = json.loads(told.stdout.splitlines()[-1])
     assert {one["shard"] for one in said["damaged"]} | set(said["missing"]) == done.keys()
     assert said["missing"] == [shards[2].shard_id]
-    assert parts.index.known_damage()[0] == 5
+    assert parts.index.damage.known()[0] == 5
 
 
 def test_a_check_of_the_index_sees_damaged_shards_too(

@@ -49,17 +49,17 @@ def a_round(parts: Parts, stop: Slept | None = None) -> None:
     for _ in FOLDERS:
         scrubber.advance()
     scrubber.end()
-    assert parts.index.scrub_note().ended
+    assert parts.index.notes.scrub_note().ended
 
 
 def found(parts: Parts) -> dict[str, str]:
-    return {one.shard: one.what for one in parts.index.known_damage()[1]}
+    return {one.shard: one.what for one in parts.index.damage.known()[1]}
 
 
 def test_a_round_notes_what_is_damaged_and_nothing_else(parts: Parts, shards: list[ShardManifest]) -> None:
     a_round(parts)
-    assert parts.index.known_damage() == (0, [])
-    parts.index.set_scrub_note(type(parts.index.scrub_note())())
+    assert parts.index.damage.known() == (0, [])
+    parts.index.notes.set_scrub_note(type(parts.index.notes.scrub_note())())
     flip(parts.store, shards[0].key)
     remove(parts.store, shards[1].key)
     a_round(parts)
@@ -75,7 +75,7 @@ def test_what_is_mended_or_removed_since_is_forgotten(parts: Parts, shards: list
     for manifest in shards[:3]:
         flip(parts.store, manifest.key)
     a_round(parts)
-    assert parts.index.known_damage()[0] == 4
+    assert parts.index.damage.known()[0] == 4
     overwrite(parts.store, shards[0].key, whole)
     remove(parts.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
     remove(parts.store, shards[1].key)
@@ -104,8 +104,8 @@ def test_a_successor_goes_on_where_it_stopped(parts: Parts, shards: list[ShardMa
     for manifest in shards:
         flip(parts.store, manifest.key)
     ordered = sorted(names.shard_manifest(one.stage, one.shard_id) for one in shards)
-    note = parts.index.scrub_note()
-    parts.index.set_scrub_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
+    note = parts.index.notes.scrub_note()
+    parts.index.notes.set_scrub_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
     a_round(parts)
     assert {names.shard_manifest(shards[0].stage, shard) for shard in found(parts)} == set(ordered[2:])
 
@@ -115,8 +115,8 @@ def test_a_small_store_is_not_read_over_and_over(parts: Parts, shards: list[Shar
     flip(parts.store, shards[0].key)
     scrubber = Scrubber(parts, Slept())
     assert not scrubber.advance()
-    note = parts.index.scrub_note()
-    parts.index.set_scrub_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
+    note = parts.index.notes.scrub_note()
+    parts.index.notes.set_scrub_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
     assert scrubber.advance()
     assert found(parts).keys() == {shards[0].shard_id}
 

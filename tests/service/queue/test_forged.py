@@ -102,12 +102,12 @@ def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts
             keeper.round()
     keeper.round()
     job, _ = job_actions.submit(parts, request())
-    (task,) = parts.index.tasks(job=job.id).items
+    (task,) = parts.index.jobs.tasks(job=job.id).items
     assert task.id in queue.waiting(), "feeding goes on"
     assert queue.leases() == [], "what nobody holds is taken off"
     queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=task.id, stage=Stage.SYNTHESIZE))
     keeper.round()
-    assert parts.index.job(job.id).state is State.RUNNING, "events are read"
+    assert parts.index.jobs.get(job.id).state is State.RUNNING, "events are read"
     queue.discard([task.id])
     assert task.id not in queue.waiting()
     page = Snapshot()

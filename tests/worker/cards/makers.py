@@ -81,7 +81,7 @@ def dataset(
     planner = DatasetRounds(parts)
     while planner.advance(5.0):
         pass
-    for cell in parts.index.dataset_cells(NAME, limit=200).items:
+    for cell in parts.index.datasets.cells(NAME, limit=200).items:
         record = read_record(JobRecord, parts.store, names.job_record(cell.job_id))
         if (cell.hand, cell.object) == fails:
             _fail(parts, record)
@@ -97,7 +97,7 @@ def _fail(parts: Parts, record: JobRecord) -> None:
         worker="w", ended=timestamp(), last=True,
     )  # fmt: skip
     put_record(parts.store, names.attempt(task.id, 1), attempt)
-    parts.index.add_attempt(attempt)
+    parts.index.write.add_attempt(attempt)
 
 
 def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[str, Array]], None]) -> None:
@@ -124,7 +124,7 @@ def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[st
             output = Output(_views(scenes * record.request.views), {"scene_shard": task.inputs[0]})
         manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(parts.store, manifest, data)
-        parts.index.add_manifest(manifest)
+        parts.index.write.add_manifest(manifest)
 
 
 _ALLEGRO = tuple(

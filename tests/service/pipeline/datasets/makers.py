@@ -25,7 +25,7 @@ def add_asset(parts: Parts, kind: str, name: str, *, content: str = "", verdict:
     found = {"verdict": verdict, "message": "as it is"} if verdict else None
     if found:
         parts.store.put(names.asset_check(AssetKind(kind), asset.digest), json.dumps(found).encode())
-    parts.index.add_asset(asset, found)
+    parts.index.write.add_asset(asset, found)
     return asset.digest
 
 
@@ -47,7 +47,7 @@ def finish(parts: Parts, job: str, *, batches: int | None = None) -> None:
     record = read_record(JobRecord, parts.store, names.job_record(job))
     for task in plan(record):
         if batches is None or task.batch < batches:
-            parts.index.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
+            parts.index.write.add_manifest(make_shard(parts.store, message_of(record, task, attempt=1, max_attempt=3)))
 
 
 def fail(parts: Parts, job: str, reason: str = "it broke") -> None:
@@ -56,15 +56,15 @@ def fail(parts: Parts, job: str, reason: str = "it broke") -> None:
     for task in plan(record):
         if task.stage is not Stage.SYNTHESIZE:
             continue
-        number = parts.index.task(task.id).attempt
+        number = parts.index.jobs.task(task.id).attempt
         attempt = AttemptRecord(
             task_id=task.id, job_id=job, stage=task.stage, number=number, kind="ValueError", reason=reason,
             worker="w", ended=timestamp(), last=True,
         )  # fmt: skip
         put_record(parts.store, names.attempt(task.id, number), attempt)
-        parts.index.add_attempt(attempt)
+        parts.index.write.add_attempt(attempt)
 
 
 def jobs_of(parts: Parts, name: str) -> list[str]:
     """Jobs of a dataset's cells, in their order."""
-    return [cell.job_id for cell in parts.index.dataset_cells(name, limit=200).items]
+    return [cell.job_id for cell in parts.index.datasets.cells(name, limit=200).items]

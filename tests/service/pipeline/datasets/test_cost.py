@@ -30,8 +30,8 @@ def test_what_was_measured_is_what_it_costs(either: Parts) -> None:
     found = run(either, want="raw")
     assert found.seconds == pytest.approx(4 * FAKE_SECONDS)
     assert (found.cells, found.tasks, found.asked, found.tried) == (4, 4, 128, 128)
-    assert found.storage_bytes == either.index.dataset("grasps").size_bytes
-    assert found.valid == either.index.dataset("grasps").valid
+    assert found.storage_bytes == either.index.datasets.get("grasps").size_bytes
+    assert found.valid == either.index.datasets.get("grasps").valid
     assert found.measured_share == 1 and found.unknown == []
     assert {rate.origin for rate in found.rates} == {
         f"measured here: {hand} on {obj}, cpu" for hand in ("gripper", "claw") for obj in ("ball", "cube")
@@ -41,7 +41,7 @@ def test_what_was_measured_is_what_it_costs(either: Parts) -> None:
 def test_scenes_cost_their_share(parts: Parts) -> None:
     found = run(parts, want="raw", scenes=2)
     assert found.seconds_by_stage == pytest.approx({"synthesize": 4 * FAKE_SECONDS, "scene": 4 * FAKE_SECONDS})
-    assert found.storage_bytes == parts.index.dataset("grasps").size_bytes
+    assert found.storage_bytes == parts.index.datasets.get("grasps").size_bytes
     longer = estimate(parts.index, wanted(want="raw", scenes=4))
     assert longer.seconds_by_stage["scene"] == pytest.approx(8 * FAKE_SECONDS)
 

@@ -25,11 +25,12 @@ def test_a_dataset_has_a_job_for_each_hand_and_object(either: Parts) -> None:
     assert new and (dataset.cells, dataset.asked, dataset.state) == (4, 128, State.QUEUED)
     plan_all(either)
     pairs = [
-        (either.index.job(job).request.hand, either.index.job(job).request.object) for job in jobs_of(either, "grasps")
+        (either.index.jobs.get(job).request.hand, either.index.jobs.get(job).request.object)
+        for job in jobs_of(either, "grasps")
     ]
     assert pairs == [("gripper", "ball"), ("gripper", "cube"), ("claw", "ball"), ("claw", "cube")]
-    assert {either.index.job(job).lane for job in jobs_of(either, "grasps")} == {Lane.BULK}
-    assert {either.index.job(job).request.scenes for job in jobs_of(either, "grasps")} == {1}
+    assert {either.index.jobs.get(job).lane for job in jobs_of(either, "grasps")} == {Lane.BULK}
+    assert {either.index.jobs.get(job).request.scenes for job in jobs_of(either, "grasps")} == {1}
 
 
 def test_the_same_dataset_again_is_the_same_and_repeats_nothing(parts: Parts) -> None:
@@ -41,17 +42,17 @@ def test_the_same_dataset_again_is_the_same_and_repeats_nothing(parts: Parts) ->
     plan_all(parts)
     assert not new and again.states[State.SUCCEEDED] == 1
     assert parts.queue.waiting() == queued
-    assert len(parts.index.jobs().items) == 4
+    assert len(parts.index.jobs.page().items) == 4
 
 
 def test_a_planner_that_was_stopped_is_continued(parts: Parts) -> None:
     actions.create(parts, wanted())
     ticks = iter(range(100))
     assert DatasetRounds(parts, clock=lambda: next(ticks)).advance(2.5)
-    planned = [cell.planned for cell in parts.index.dataset_cells("grasps").items]
+    planned = [cell.planned for cell in parts.index.datasets.cells("grasps").items]
     assert planned.count(True) == 2
     plan_all(parts)
-    assert all(cell.planned for cell in parts.index.dataset_cells("grasps").items)
+    assert all(cell.planned for cell in parts.index.datasets.cells("grasps").items)
     assert not DatasetRounds(parts).advance()
 
 
@@ -60,7 +61,7 @@ def test_two_datasets_share_the_jobs_that_both_want(parts: Parts) -> None:
     actions.create(parts, wanted("two", hands=("gripper",), objects=("cube", "cone")))
     plan_all(parts)
     assert jobs_of(parts, "one")[1] == jobs_of(parts, "two")[0]
-    assert len(parts.index.jobs().items) == 5
+    assert len(parts.index.jobs.page().items) == 5
 
 
 def test_a_job_that_was_submitted_by_itself_is_a_cell(parts: Parts) -> None:
@@ -86,11 +87,11 @@ def test_a_dataset_of_an_older_graspd_with_fewer_options_is_the_same(parts: Part
 
 
 def test_a_dataset_keeps_the_versions_it_was_created_with(parts: Parts) -> None:
-    first = parts.index.asset(AssetKind.OBJECT, "ball").digest
+    first = parts.index.assets.get(AssetKind.OBJECT, "ball").digest
     actions.create(parts, wanted())
     add_asset(parts, "object", "ball", content="other")
     plan_all(parts)
-    assert parts.index.job(jobs_of(parts, "grasps")[0]).object_digest == first
+    assert parts.index.jobs.get(jobs_of(parts, "grasps")[0]).object_digest == first
 
 
 def test_what_cannot_be_used_is_refused_before_anything_is_recorded(parts: Parts) -> None:
@@ -106,7 +107,7 @@ def test_what_cannot_be_used_is_refused_before_anything_is_recorded(parts: Parts
             actions.create(parts, wanted(**changes))
     with pytest.raises(ValueError, match="needs objects"):
         wanted(objects=())
-    assert parts.index.datasets().items == [] and not list(parts.store.list(names.DATASETS))
+    assert parts.index.datasets.page().items == [] and not list(parts.store.list(names.DATASETS))
 
 
 def test_a_matrix_over_the_limit_is_refused(parts: Parts) -> None:
@@ -139,16 +140,16 @@ def test_cells_come_in_pages_and_by_state(either: Parts) -> None:
     plan_all(either)
     for job in jobs_of(either, "grasps")[1:4]:
         finish(either, job)
-    first = either.index.dataset_cells("grasps", state=State.SUCCEEDED, limit=2)
-    rest = either.index.dataset_cells("grasps", state=State.SUCCEEDED, limit=2, cursor=first.next)
+    first = either.index.datasets.cells("grasps", state=State.SUCCEEDED, limit=2)
+    rest = either.index.datasets.cells("grasps", state=State.SUCCEEDED, limit=2, cursor=first.next)
     assert [cell.position for cell in first.items + rest.items] == [1, 2, 3] and rest.next is None
 
 
 def test_datasets_come_newest_first_in_pages(parts: Parts) -> None:
     for name in ("a", "b", "c"):
         actions.create(parts, wanted(name))
-    first = parts.index.datasets(limit=2)
-    rest = parts.index.datasets(limit=2, cursor=first.next)
+    first = parts.index.datasets.page(limit=2)
+    rest = parts.index.datasets.page(limit=2, cursor=first.next)
     assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
 
 
@@ -161,7 +162,7 @@ def test_cancel_stops_what_is_planned_and_what_is_not(parts: Parts) -> None:
     plan_all(parts)
     found = status(parts.index, "grasps")
     assert [cell.state for cell in found.cells] == ["succeeded", "cancelled", "cancelled", "cancelled"]
-    assert found.dataset.state == "cancelled" and parts.index.believed_queued()[0] == set()
+    assert found.dataset.state == "cancelled" and parts.index.feed.believed_queued()[0] == set()
     with pytest.raises(ConflictError, match="nothing to cancel"):
         actions.cancel(parts, "grasps")
 
@@ -195,10 +196,10 @@ def test_retry_starts_failed_and_cancelled_cells_again_and_repeats_nothing(parts
     plan_all(parts)
     found = status(parts.index, "grasps")
     assert [cell.state for cell in found.cells] == ["succeeded", "running", "queued", "queued"]
-    assert len(parts.index.believed_queued()[0]) == 1 + 2 + 2
+    assert len(parts.index.feed.believed_queued()[0]) == 1 + 2 + 2
     for job in jobs:
         finish(parts, job)
-    assert parts.index.dataset("grasps").state == "succeeded" and parts.index.dataset("grasps").finished
+    assert parts.index.datasets.get("grasps").state == "succeeded" and parts.index.datasets.get("grasps").finished
     with pytest.raises(ConflictError, match="nothing to retry"):
         actions.retry(parts, "grasps")
 
@@ -212,7 +213,7 @@ def test_an_event_reaches_a_job_once_however_often_the_planner_runs(parts: Parts
     job_actions.retry(parts, started)
     rebuild(parts.index, parts.store)  # forgets how far the planner was
     plan_all(parts)
-    assert parts.index.job(started).state == "queued"
+    assert parts.index.jobs.get(started).state == "queued"
     assert [event.what for event in job_events(parts.store, started)] == ["cancelled", "retried"]
     assert [event.what for event in job_events(parts.store, jobs_of(parts, "grasps")[1])] == ["cancelled"]
 
@@ -224,7 +225,7 @@ def test_a_large_dataset_leaves_the_queue_to_others(parts: Parts) -> None:
     plan_all(parts)
     assert len(parts.queue.waiting()) == 10
     assert parts.queue.depths()[(Lane.INTERACTIVE, "synthesize")] == 0
-    assert parts.index.dataset("grasps").tasks == 40
+    assert parts.index.datasets.get("grasps").tasks == 40
 
 
 def test_the_store_alone_tells_everything(either: Parts) -> None:
@@ -238,16 +239,16 @@ def test_the_store_alone_tells_everything(either: Parts) -> None:
     actions.cancel(either, "b")
     plan_all(either)
     assert differences(either.index, either.store) == []
-    before = [either.index.dataset(name) for name in ("a", "b")]
+    before = [either.index.datasets.get(name) for name in ("a", "b")]
     counts = rebuild(either.index, either.store)
     assert (counts["datasets"], counts["snapshots"], counts["object_sets"]) == (2, 1, 1)
-    assert [either.index.dataset(name) for name in ("a", "b")] == before
-    assert [view.shards for view in either.index.snapshots("a").items] == [4]
+    assert [either.index.datasets.get(name) for name in ("a", "b")] == before
+    assert [view.shards for view in either.index.datasets.snapshots("a").items] == [4]
 
 
 def test_a_difference_between_index_and_store_is_found(parts: Parts) -> None:
     actions.create(parts, wanted())
-    parts.index.set_dataset_events("grasps", [])
+    parts.index.write_dataset.set_events("grasps", [])
     actions.add_dataset_event(parts.store, "grasps", "cancelled")
     assert differences(parts.index, parts.store) == [
         "datasets grasps: cancelled is False, the store says True",
@@ -259,14 +260,14 @@ def test_a_set_of_objects_is_spelled_out_when_the_dataset_is_created(parts: Part
     actions.add_object_set(parts, "round", ["cone", "ball"])
     actions.create(parts, wanted(objects=("cube",), sets=("round",)))
     actions.add_object_set(parts, "round", ["ball"])
-    assert parts.index.dataset("grasps").objects == ["cube", "ball", "cone"]
+    assert parts.index.datasets.get("grasps").objects == ["cube", "ball", "cone"]
 
 
 def test_a_set_has_versions_and_the_newest_counts(either: Parts) -> None:
     for objects in (["ball", "cone"], ["ball"], ["ball"], ["cone", "ball"]):
         assert set(actions.add_object_set(either, "round", objects).objects) == set(objects)
     assert len(list(either.store.list(names.OBJECT_SETS))) == 3
-    assert [view.objects for view in either.index.object_sets()] == [["ball", "cone"]]
+    assert [view.objects for view in either.index.object_sets.newest()] == [["ball", "cone"]]
     with pytest.raises(NotFoundError, match="there is no object 'moon'"):
         actions.add_object_set(either, "round", ["moon"])
     with pytest.raises(InputError, match="holds no object"):

@@ -81,9 +81,9 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Parts) 
     assert [(r.fidelity, r.target) for r in requests_of(either)] == [
         ("standard", ""), ("draft", ""), ("fine", ""), ("fine", ""),
     ]  # fmt: skip
-    cells = either.index.dataset_cells("grasps").items
+    cells = either.index.datasets.cells("grasps").items
     assert [cell.fidelity for cell in cells] == ["standard", "draft", "fine", "fine"]
-    assert either.index.dataset("grasps").options.target == "gsr>=0.6"
+    assert either.index.datasets.get("grasps").options.target == "gsr>=0.6"
 
 
 def test_a_cell_that_auto_chose_is_the_job_that_names_its_fidelity(parts: Parts) -> None:
@@ -108,7 +108,7 @@ def test_a_rebuilt_index_knows_the_fidelity_of_each_cell(parts: Parts) -> None:
     publish(parts.store, "charts", chart())
     actions.create(parts, wanted(**AUTO))
     rebuild(parts.index, parts.store)
-    assert [cell.fidelity for cell in parts.index.dataset_cells("grasps").items] == [
+    assert [cell.fidelity for cell in parts.index.datasets.cells("grasps").items] == [
         "standard",
         "draft",
         "fine",

@@ -47,15 +47,18 @@ class Distributions:
     metrics: dict[Metric, Distribution]
 
 
-class Summaries(Database):
+@dataclass(frozen=True)
+class Statistics:
     """Reads on all grasps that pass a filter."""
+
+    database: Database
 
     def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
         """Count, mean and range of each metric; those that no grasp has are left out."""
         columns = [
             function(grasps.c[metric]) for metric in metrics for function in (func.count, func.avg, func.min, func.max)
         ]
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             row = connection.execute(select(*columns).where(*sql_conditions(where))).one()
         parts = {metric: row[4 * i : 4 * i + 4] for i, metric in enumerate(metrics)}
         return {
@@ -69,7 +72,7 @@ class Summaries(Database):
         counts = [0] * bins
         value = grasps.c[metric]
         width = (high - low) / bins
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
             if connection.dialect.name == "postgresql":
                 # Its cast rounds where SQLite's cuts off, and not every SQLite knows floor().
@@ -87,7 +90,7 @@ class Summaries(Database):
 
         The id of a shard is a digest, so those below a bound are a fair sample, and they lie side by side in the index.
         """
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             total = _size(connection, where)
             share = min(1.0, at_most / max(1, total))
             sampled = [] if share == 1.0 else [grasps.c.shard_id < f"{round(share * 16**8):08x}"]

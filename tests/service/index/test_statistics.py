@@ -33,40 +33,40 @@ def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
         "created": "2026-01-01T00:00:00Z",
     }
     rows = [plain | {"row": row, "epsilon": value, "valid": row % 2 == 0} for row, value in enumerate(values)]
-    with opened.writing() as connection:
+    with opened.database.writing() as connection:
         connection.execute(insert(grasps), rows)
     yield opened
     opened.close()
 
 
 def test_a_summary_is_the_mean_and_range_of_what_passes_the_filter(index: Index, values: np.ndarray) -> None:
-    found = index.summaries(GraspFilter(valid=True), ("epsilon",))["epsilon"]
+    found = index.statistics.summaries(GraspFilter(valid=True), ("epsilon",))["epsilon"]
     passed = values[::2]
     assert found.count == len(passed)
     assert (found.mean, found.low, found.high) == pytest.approx((passed.mean(), passed.min(), passed.max()))
 
 
 def test_a_metric_that_no_grasp_has_is_left_out(index: Index) -> None:
-    assert set(index.summaries(GraspFilter(), ("epsilon", "contact_area_cm2"))) == {"epsilon"}
+    assert set(index.statistics.summaries(GraspFilter(), ("epsilon", "contact_area_cm2"))) == {"epsilon"}
 
 
 def test_no_grasp_has_no_summary(index: Index) -> None:
-    assert index.summaries(GraspFilter(hand="other"), ("epsilon",)) == {}
+    assert index.statistics.summaries(GraspFilter(hand="other"), ("epsilon",)) == {}
 
 
 def test_a_histogram_counts_as_numpy_does(index: Index, values: np.ndarray) -> None:
     low, high = float(values.min()), float(values.max())
     expected, _ = np.histogram(values, BINS, (low, high))
-    assert index.histogram(GraspFilter(), "epsilon", low, high, BINS) == expected.tolist()
+    assert index.statistics.histogram(GraspFilter(), "epsilon", low, high, BINS) == expected.tolist()
 
 
 def test_values_that_are_all_alike_fall_into_one_bin(index: Index, values: np.ndarray) -> None:
     one = float(values[3])
-    assert index.histogram(GraspFilter(), "epsilon", one, one, BINS) == [1] + [0] * (BINS - 1)
+    assert index.statistics.histogram(GraspFilter(), "epsilon", one, one, BINS) == [1] + [0] * (BINS - 1)
 
 
 def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
-    found = index.distributions(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"), bins=BINS)
+    found = index.statistics.distributions(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"), bins=BINS)
     passed = values[::2]
     counts, _ = np.histogram(passed, BINS)
     assert (found.looked_at, found.share, set(found.metrics)) == (len(passed), 1.0, {"epsilon"})
@@ -75,14 +75,14 @@ def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray)
 
 
 def test_distributions_of_many_grasps_come_from_a_fair_sample_of_shards(index: Index) -> None:
-    with index.writing() as connection:
+    with index.database.writing() as connection:
         for number in range(400):
             shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]
             made = {"shard_id": shard, "hand": "a", "object": "b", "created": "2026-01-01T00:00:00Z", "valid": True}
             rows = [made | {"row": row, "epsilon": number / 400} for row in range(8)]
             connection.execute(insert(grasps), rows)
             connection.execute(insert(shards), _shard(shard, hand="a", object="b", count=8))
-    found = index.distributions(GraspFilter(hand="a", object="b"), ("epsilon",), at_most=800)
+    found = index.statistics.distributions(GraspFilter(hand="a", object="b"), ("epsilon",), at_most=800)
     assert found.share == pytest.approx(0.25)
     # 100 shards are expected; the number drawn has a standard deviation of 9, their mean one of 0.03.
     assert 60 * 8 < found.looked_at < 140 * 8

@@ -1,60 +1,31 @@
-"""Queries on assets, workers and the service as a whole."""
+"""Queries on workers and the service as a whole."""
 
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from sqlalchemy import and_, case, func, select, tuple_
+from sqlalchemy import and_, case, func, select
 
 from service.index.database import Database
 from service.index.queries import cursors
-from service.index.tables import assets, attempts, jobs, shards, tasks, workers
-from service.index.views import AssetView, FailureGroup, MatrixCell, Page, Stats, Throughput, WorkerView
-from service.model.domain import AssetKind, State
-from service.model.errors import NotFoundError
+from service.index.tables import attempts, jobs, shards, tasks, workers
+from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, WorkerView
+from service.model.domain import State
 
 
-class ServiceQueries(Database):
-    """Reads on everything that is neither job nor grasp."""
+@dataclass(frozen=True)
+class Overview:
+    """Reads on the service as a whole."""
 
-    def assets(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
-        """Hands or objects, all versions, newest first."""
-        size = cursors.page_size(limit)
-        query = select(assets).where(assets.c.kind == kind.value)
-        query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
-        if cursor is not None:
-            query = query.where(tuple_(assets.c.created, assets.c.digest) < cursors.decode(cursor, str, str))
-        with self.reading() as connection:
-            rows = connection.execute(query).mappings().all()
-        views = [_asset_view(row) for row in rows[:size]]
-        last = views[-1] if len(rows) > size else None
-        return Page(items=views, next=last and cursors.encode(last.created, last.digest))
-
-    def asset(self, kind: AssetKind, name_or_digest: str) -> AssetView:
-        """A hand or object by its digest, or the newest of its name that was not refused.
-
-        Raises:
-            NotFoundError: there is none; the names that there are follow.
-        """
-        named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
-        by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
-        refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
-        query = select(assets).where(named | by_digest)
-        query = query.order_by(refused_last, assets.c.created.desc(), assets.c.digest.desc()).limit(1)
-        with self.reading() as connection:
-            row = connection.execute(query).mappings().first()
-            if row is None:
-                known = select(assets.c.name).where(assets.c.kind == kind.value).distinct().order_by(assets.c.name)
-                names = ", ".join(connection.scalars(known.limit(20)))
-                raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}; there are: {names or 'none yet'}")
-        return _asset_view(row)
+    database: Database
 
     def workers(self) -> list[WorkerView]:
         """Workers, the living first."""
         query = select(workers).order_by(case((workers.c.state == "lost", 1), else_=0), workers.c.name)
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
         return [WorkerView(**row) for row in rows]
 
@@ -62,7 +33,7 @@ class ServiceQueries(Database):
         """The whole service in a few numbers."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             of_jobs = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
             of_tasks = connection.execute(select(tasks.c.state, func.count()).group_by(tasks.c.state)).all()
             of_shards = {
@@ -89,7 +60,7 @@ class ServiceQueries(Database):
         sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
         query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since).group_by(unit, shards.c.kind)
         made: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             for start, kind, number, count, valid, seconds in connection.execute(query):
                 bucket = made[_bucket(start + _REST_OF_TIME[len(start) :], bucket_s)]
                 bucket["tasks"] += int(number)
@@ -116,7 +87,7 @@ class ServiceQueries(Database):
             .limit(cursors.page_size(limit))
         )
         groups = []
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             for stage, kind, number, of_tasks, seen in connection.execute(query).all():
                 same = and_(attempts.c.stage == stage, attempts.c.kind == kind, attempts.c.ended == seen)
                 example = connection.execute(select(attempts.c.reason, attempts.c.task_id).where(same).limit(1)).one()
@@ -142,7 +113,7 @@ class ServiceQueries(Database):
             .group_by(shards.c.hand, shards.c.object)
         )
         cells: dict[tuple[str, str], dict[str, int]] = {}
-        with self.reading() as connection:
+        with self.database.reading() as connection:
             pairs = {}
             for job, *pair in connection.execute(select(jobs.c.id, jobs.c.hand, jobs.c.object)):
                 cell = cells.setdefault((pair[0], pair[1]), dict.fromkeys(_CELL, 0))
@@ -174,7 +145,3 @@ def _bucket(created: str, bucket_s: int) -> str:
     return (
         datetime.fromtimestamp(seconds - seconds % bucket_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     )
-
-
-def _asset_view(row: Any) -> AssetView:
-    return AssetView(**{name: row[name] for name in AssetView.model_fields})

@@ -1,0 +1,128 @@
+"""Changes that say what goes on at present: what waits, what runs, and who is there. Each is idempotent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import delete, update
+
+from service.index.changes.rows import clean
+from service.index.changes.states import settle
+from service.index.database import Database, chunks, upsert
+from service.index.tables import assets, jobs, tasks, workers
+from service.model.domain import State
+from service.model.worker_beat import WorkerBeat
+
+_UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
+
+
+@dataclass(frozen=True)
+class Live:
+    """Writes of what no store remembers."""
+
+    database: Database
+
+    def set_running(self, task_id: str, worker: str) -> tuple[str, State] | None:
+        """A worker took the task. Returns the job and its state, None if it makes no difference any more."""
+        with self.database.writing() as connection:
+            job = connection.scalar(
+                update(tasks)
+                .where(tasks.c.id == task_id, tasks.c.state == State.QUEUED.value)
+                .values(
+                    state=State.RUNNING.value,
+                    queued=True,
+                    worker=clean(worker, 128),
+                    progress_done=0.0,
+                    progress_total=0.0,
+                )
+                .returning(tasks.c.job_id)
+            )
+            if job is None:
+                return None
+            # A job that already runs stays so: no need to look at its other tasks.
+            connection.execute(
+                update(jobs)
+                .where(jobs.c.id == job, jobs.c.state == State.QUEUED.value)
+                .values(state=State.RUNNING.value)
+            )
+            return job, State.RUNNING
+
+    def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
+        """How far running tasks are: done, total, and what they do."""
+        with self.database.writing() as connection:
+            for task_id, (done, total, message) in progress.items():
+                connection.execute(
+                    update(tasks)
+                    .where(tasks.c.id == task_id, tasks.c.state == State.RUNNING.value)
+                    .values(progress_done=done, progress_total=total, progress_message=clean(message))
+                )
+
+    def set_queued(self, task_ids: Sequence[str]) -> None:
+        """Tasks that were put into the queue."""
+        with self.database.writing() as connection:
+            for some in chunks(task_ids):
+                connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
+
+    def set_waiting(
+        self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
+    ) -> dict[str, State]:
+        """Tasks that are neither in the queue nor with a worker: to be queued again after `not_before`.
+
+        Returns:
+            the states of the jobs concerned.
+        """
+        values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
+        values |= {"progress_done": 0.0, "progress_total": 0.0, "progress_message": message and clean(message)}
+        touched: set[str] = set()
+        with self.database.writing() as connection:
+            for some in chunks(task_ids):
+                statement = update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(**values)
+                touched |= set(connection.scalars(statement.returning(tasks.c.job_id)))
+            return {job: settle(connection, job, []) for job in touched}
+
+    def set_asset_waiting(self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0) -> None:
+        """Checks that no worker holds."""
+        with self.database.writing() as connection:
+            connection.execute(
+                update(assets).where(assets.c.digest.in_(list(digests))).values(queued=queued, not_before=not_before)
+            )
+
+    def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
+        """The living workers; others turn to lost when last seen before a time, and are forgotten before another."""
+        rows = [
+            {
+                "name": clean(beat.name, 128),
+                "host": clean(beat.host, 128),
+                "pid": beat.pid,
+                "device": clean(beat.device, 64),
+                "device_name": clean(beat.device_name, 128),
+                "stages": [stage.value for stage in beat.stages],
+                "version": clean(beat.version, 32),
+                "state": clean(beat.state, 16),
+                "task_id": clean(beat.task_id, 32) or None,
+                "started": beat.started,
+                "seen": beat.seen,
+                "reason": clean(beat.reason, 300),
+            }
+            for beat in beats
+        ]
+        with self.database.writing() as connection:
+            upsert(connection, workers, rows)
+            gone = workers.c.name.not_in([beat.name for beat in beats])
+            lost = update(workers).where(gone, workers.c.seen < lost_before)
+            connection.execute(lost.values(state="lost", task_id=None, reason=""))
+            connection.execute(delete(workers).where(gone, workers.c.seen < forget_before))
+
+    def forget_worker(self, name: str) -> None:
+        """A worker that ended as it should."""
+        with self.database.writing() as connection:
+            connection.execute(delete(workers).where(workers.c.name == name))
+
+    def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
+        """A check that ended without a finding."""
+        values = {"last_attempt": number, "queued": False, "not_before": not_before}
+        with self.database.writing() as connection:
+            connection.execute(
+                update(assets).where(assets.c.digest == digest, assets.c.last_attempt < number).values(**values)
+            )

@@ -1,0 +1,75 @@
+"""Queries on hands and objects."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, and_, case, select, tuple_
+
+from service.index.database import Database, chunks
+from service.index.queries import cursors
+from service.index.tables import assets
+from service.index.views import AssetView, Page
+from service.model.domain import AssetKind
+from service.model.errors import NotFoundError
+
+
+@dataclass(frozen=True)
+class Assets:
+    """Reads on hands and objects."""
+
+    database: Database
+
+    def page(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
+        """Hands or objects, all versions, newest first."""
+        size = cursors.page_size(limit)
+        query = select(assets).where(assets.c.kind == kind.value)
+        query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
+        if cursor is not None:
+            query = query.where(tuple_(assets.c.created, assets.c.digest) < cursors.decode(cursor, str, str))
+        with self.database.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        views = [_asset_view(row) for row in rows[:size]]
+        last = views[-1] if len(rows) > size else None
+        return Page(items=views, next=last and cursors.encode(last.created, last.digest))
+
+    def get(self, kind: AssetKind, name_or_digest: str) -> AssetView:
+        """A hand or object by its digest, or the newest of its name that was not refused.
+
+        Raises:
+            NotFoundError: there is none; the names that there are follow.
+        """
+        named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
+        by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
+        refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
+        query = select(assets).where(named | by_digest)
+        query = query.order_by(refused_last, assets.c.created.desc(), assets.c.digest.desc()).limit(1)
+        with self.database.reading() as connection:
+            row = connection.execute(query).mappings().first()
+            if row is None:
+                known = select(assets.c.name).where(assets.c.kind == kind.value).distinct().order_by(assets.c.name)
+                names = ", ".join(connection.scalars(known.limit(20)))
+                raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}; there are: {names or 'none yet'}")
+        return _asset_view(row)
+
+    def sizes(self, kind: AssetKind, wanted: Collection[str]) -> dict[str, int]:
+        """Bytes of the named hands or objects; those that are not known are left out."""
+        names = set(wanted)
+        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value).order_by(assets.c.created)
+        with self.database.reading() as connection:
+            return {name: size for name, size in connection.execute(query) if name in names}
+
+    def missing(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:
+        """Of these kinds and digests, those that the index does not know."""
+        digests = sorted({digest for _, digest in wanted})
+        known = set()
+        for some in chunks(digests):
+            query = select(assets.c.kind, assets.c.digest).where(assets.c.digest.in_(some))
+            known |= {(AssetKind(kind), digest) for kind, digest in within.execute(query)}
+        return [f"{kind.value} {digest}" for kind, digest in wanted if (kind, digest) not in known]
+
+
+def _asset_view(row: Any) -> AssetView:
+    return AssetView(**{name: row[name] for name in AssetView.model_fields})

@@ -1,0 +1,34 @@
+"""Queries on named sets of objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy import select
+
+from service.index.database import Database
+from service.index.dataset_tables import object_sets
+from service.index.dataset_views import ObjectSetView
+from service.model.errors import NotFoundError
+
+
+@dataclass(frozen=True)
+class ObjectSets:
+    """Reads on named sets of objects."""
+
+    database: Database
+
+    def newest(self) -> list[ObjectSetView]:
+        """The newest version of each set of objects, by name."""
+        query = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
+        with self.database.reading() as connection:
+            newest = {row["name"]: ObjectSetView(**row) for row in connection.execute(query).mappings()}
+        return list(newest.values())
+
+    def get(self, name: str) -> ObjectSetView:
+        """The newest version of a set of objects; NotFoundError if there is none of that name."""
+        found = {view.name: view for view in self.newest()}
+        if name not in found:
+            known = ", ".join(list(found)[:20]) or "none yet"
+            raise NotFoundError(f"there is no set of objects {name!r}; there are: {known}")
+        return found[name]
