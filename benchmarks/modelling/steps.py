@@ -13,8 +13,8 @@ from service.model.transforms import quat_from_axis_angle, quat_to_matrix
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.quality.probe import Probe
+from worker.simulation.model import REFERENCE_POINTS, initial_motions
 from worker.simulation.reference import World, loss
-from worker.simulation.simulation import REFERENCE_POINTS, initial_motions
 
 Floats = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import Closer
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.peers import free_starts, grasp_set, ground_of
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 

@@ -23,9 +23,9 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.selection import posture_of
-from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.planners.fast_graspd.starts import sample_starts
 from worker.quality.postures import pregrasp, squeeze
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 T = TypeVar("T")
@@ -65,9 +65,7 @@ def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
 
 def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
     """A start for each grasp whose palm looks at a random place of the surface, touching nothing (Grasp'D, 2022)."""
-    probe = pair.simulation(pair.coarse, len(indices) * len(RETREATS))
-    model, obj = pair.hand.model, pair.fine.obj.model
-    return sample_starts(model, obj, probe, seed=seed, batch=batch, indices=indices, each=1)
+    return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
 
 def joined(states: list[HandState]) -> HandState:

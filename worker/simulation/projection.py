@@ -10,9 +10,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.transforms import quat_from_axis_angle, quat_multiply
+from worker.simulation.data import Data
 from worker.simulation.kernels import obstacles
 from worker.simulation.kernels import projection as kernels
-from worker.simulation.simulation import HandState, Simulation, still_schedule
+from worker.simulation.model import Model
+from worker.simulation.record import record_placement
+from worker.simulation.state import HandState, still_schedule
 
 Floats = NDArray[np.float64]
 
@@ -61,12 +64,12 @@ def _residuals(capacity: int) -> Any:
 
 
 class Projection:
-    """Moves the hands of a simulation; keeps of each the least penetrating state it saw."""
+    """Moves the hands of a model; keeps of each the least penetrating state it saw."""
 
-    def __init__(self, simulation: Simulation, options: ProjectionOptions) -> None:
-        self.simulation, self.options = simulation, options
-        B, n = simulation.capacity, 6 + simulation.dofs
-        with wp.ScopedDevice(simulation.device):
+    def __init__(self, model: Model, data: Data, options: ProjectionOptions) -> None:
+        self.model, self.data, self.options = model, data, options
+        B, n = data.capacity, 6 + model.dofs
+        with wp.ScopedDevice(model.device):
             self.residuals = _residuals(B)
             self.row = wp.zeros((B, n), dtype=wp.float32)
             self.matrix = wp.zeros((B, n, n), dtype=wp.float32)
@@ -78,16 +81,16 @@ class Projection:
         Returns:
             The best state of each hand, and its deepest penetration (n,) [m].
         """
-        sim = self.simulation
+        data = self.data
         n = len(state.pivot)
-        sim.set_schedule(still_schedule())
-        sim.record_placement()
+        data.set_schedule(still_schedule())
+        placement = record_placement(self.model, data)
         best, depth = state, np.full(n, np.inf)
         current = state
         for step in range(iterations + 1):
-            sim.set_state(current)
-            sim.run()
-            now = sim.depths(n)
+            data.set_state(current)
+            placement.run()
+            now = data.deepest(n)
             better = now < depth - 1e-5
             best = _where(better, current, best)
             depth = np.where(better, now, depth)
@@ -99,12 +102,12 @@ class Projection:
     def _step(self, n: int) -> Floats:
         """Damped Gauss-Newton step (n, 6 + D) for the placement just evaluated."""
         self._assemble()
-        o, sim = self.options, self.simulation
+        o = self.options
         lower = self.matrix.numpy()[:n].astype(float)
         H = lower + np.tril(lower, -1).transpose(0, 2, 1)
         g = self.vector.numpy()[:n].astype(float)
         rows = np.minimum(self.residuals.count.numpy()[:n], CAPACITY)
-        scale = np.repeat(o.scale, [3, 3, sim.dofs])
+        scale = np.repeat(o.scale, [3, 3, self.model.dofs])
         H = H * scale[:, None] * scale[None, :]
         damping = o.damping * np.maximum(rows, 1)
         H[:, np.arange(len(scale)), np.arange(len(scale))] += damping[:, None]
@@ -114,41 +117,40 @@ class Projection:
         return step * scale
 
     def _assemble(self) -> None:
-        sim, o, r = self.simulation, self.options, self.residuals
-        B = sim.capacity
+        m, d, o, r = self.model, self.data, self.options, self.residuals
+        c, pose = d.contacts, [d.body_p, d.body_q]
         r.count.zero_()
         wp.launch(
-            kernels.point_residuals, (B, sim.count),
-            inputs=[sim.active, sim.contacts, sim.contact_body, sim.contact_point, sim.contact_normal,
-                    sim.contact_distance, o.near, o.target, o.hold, o.hold_target, o.hold_weight],
-            outputs=[r], device=sim.device,
+            kernels.point_residuals, (d.capacity, m.count),
+            inputs=[d.active, c.count, c.body, c.point, c.normal, c.distance,
+                    o.near, o.target, o.hold, o.hold_target, o.hold_weight],
+            outputs=[r], device=m.device,
         )  # fmt: skip
         wp.launch(
-            kernels.sample_residuals, (B, len(sim.hand.model.pieces)),
-            inputs=[sim.hand.pieces, sim.obj.bvh.id, sim.obj.samples, sim.active, sim.body_p, sim.body_q,
-                    o.sample_near, o.target],
-            outputs=[r], device=sim.device,
+            kernels.sample_residuals, (d.capacity, m.pieces),
+            inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, o.sample_near, o.target],
+            outputs=[r], device=m.device,
         )  # fmt: skip
         wp.launch(
-            kernels.self_residuals, (B, len(sim.hand.model.pieces)),
-            inputs=[sim.hand.pieces, sim.body_points, sim.active, sim.body_p, sim.body_q, o.self_near, o.self_target],
-            outputs=[r], device=sim.device,
+            kernels.self_residuals, (d.capacity, m.pieces),
+            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target],
+            outputs=[r], device=m.device,
         )  # fmt: skip
-        if sim.obstacles is not None:
+        if m.obstacles is not None:
             wp.launch(
-                obstacles.residuals, (B, sim.obstacles.count),
-                inputs=[sim.obstacles.features, sim.obstacles.solids, sim.active, sim.scene, sim.body_p, sim.body_q,
-                        o.obstacle_near, o.obstacle_target],
-                outputs=[r], device=sim.device,
+                obstacles.residuals, (d.capacity, m.obstacles.count),
+                inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, *pose, o.obstacle_near,
+                        o.obstacle_target],
+                outputs=[r], device=m.device,
             )  # fmt: skip
         wp.launch(
-            kernels.normal_equations, B,
-            inputs=[sim.hand.tree, sim.active, sim.pivot, sim.body_p, sim.axis, r],
-            outputs=[self.row, self.matrix, self.vector], device=sim.device,
+            kernels.normal_equations, d.capacity,
+            inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis, r],
+            outputs=[self.row, self.matrix, self.vector], device=m.device,
         )  # fmt: skip
 
     def _moved(self, state: HandState, step: Floats) -> HandState:
-        hand = self.simulation.hand.model
+        hand = self.model.hand.model
         angle = np.linalg.norm(step[:, 3:6], axis=1)
         axis = step[:, 3:6] / np.maximum(angle, 1e-12)[:, None]
         rotation = quat_multiply(quat_from_axis_angle(axis, angle), state.rotation)

@@ -11,8 +11,11 @@ import warp as wp
 from service.model.domain import Fidelity
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.starts import RETREATS, sample_starts
-from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.planners.fast_graspd.starts import sample_starts
+from worker.simulation.data import Data
+from worker.simulation.model import Model
+from worker.simulation.record import record_iteration
+from worker.simulation.state import HandState, Schedule
 
 #: Iterations timed, launch by launch, from the middle of a phase.
 SAMPLED: Final = 12
@@ -27,8 +30,7 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
         count: grasps at a time, on one thread.
         seed: of the starts.
     """
-    probe = pair.simulation(pair.coarse, count * len(RETREATS))
-    state = sample_starts(pair.hand.model, pair.fine.obj.model, probe, seed=seed, batch=0, indices=range(count), each=1)
+    state = sample_starts(pair.model(pair.coarse), seed=seed, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, side, schedule in (
         ("coarse", pair.coarse, coarse_schedule(fidelity)),
@@ -36,9 +38,10 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
     ):
         if len(schedule) < 2:
             continue
-        simulation = pair.simulation(side, count)
-        used = _iterations_used(simulation, state, schedule, fidelity, name)
-        times, state = _timed(simulation, state, schedule, fidelity)
+        model = pair.model(side)
+        data = Data(model, count)
+        used = _iterations_used(model, data, state, schedule, fidelity, name)
+        times, state = _timed(model, data, state, schedule, fidelity)
         total = sum(times.values())
         phases[name] = {
             "iterations_to_convergence": round(used, 1),
@@ -51,38 +54,38 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int, *, seed: int = 0) 
 
 
 def _iterations_used(
-    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, phase: str
+    model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity, phase: str
 ) -> float:
     """Mean iterations until a hand is switched off; the coarse phase always runs to its end."""
     if phase == "coarse" or not fidelity.patience:
         return float(len(schedule))
-    simulation.set_schedule(schedule)
-    simulation.set_state(state)
-    simulation.record_iteration(fidelity.optimizer, patience=fidelity.patience)
+    data.set_schedule(schedule)
+    data.set_state(state)
+    launches = record_iteration(model, data, fidelity.optimizer, patience=fidelity.patience)
     alive = 0
     for _ in range(len(schedule)):
-        alive += int(simulation.active.numpy().sum())
-        simulation.run()
+        alive += int(data.active.numpy().sum())
+        launches.run()
     return alive / len(state.pivot)
 
 
 def _timed(
-    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity
+    model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
     """Seconds per iteration of each kernel, medians over `SAMPLED` iterations in the middle of the schedule."""
-    simulation.set_schedule(schedule)
-    simulation.set_state(state)
-    simulation.record_iteration(fidelity.optimizer)
+    data.set_schedule(schedule)
+    data.set_state(state)
+    launches = record_iteration(model, data, fidelity.optimizer)
     sampled = min(SAMPLED, len(schedule))
     before = (len(schedule) - sampled) // 2
-    simulation.run(before)
-    wp.synchronize_device(simulation.device)
+    launches.run(before)
+    wp.synchronize_device(data.device)
     found: dict[str, list[float]] = {}
     for _ in range(sampled):
-        for name, command in simulation.commands():
+        for name, command in launches.named():
             began = time.perf_counter()
             command.launch()
-            wp.synchronize_device(simulation.device)
+            wp.synchronize_device(data.device)
             found.setdefault(name, []).append(time.perf_counter() - began)
-    simulation.run(len(schedule) - before - sampled)
-    return {name: float(np.median(values)) for name, values in found.items()}, simulation.state(len(state.pivot))
+    launches.run(len(schedule) - before - sampled)
+    return {name: float(np.median(values)) for name, values in found.items()}, data.state(len(state.pivot))

@@ -14,7 +14,7 @@ from worker.planners.dfc.search import Descent
 from worker.planners.dfc.starts import DISTANCE, sample_starts
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 BOX = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05)))
 WEIGHTS = np.array([1.0, 100.0, 100.0, 10.0, 1.0])

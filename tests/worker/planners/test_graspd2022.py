@@ -15,7 +15,7 @@ from worker.planners.graspd2022 import kernels
 from worker.planners.graspd2022.grid import distance_grid
 from worker.planners.graspd2022.search import FRICTION, LEAK, MISMATCH, STIFFNESS, VISCOUS, Search, _Batch, physics_of
 from worker.planners.peers import ground_of
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 RADIUS = 0.05
 SPHERE = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS))
@@ -99,9 +99,9 @@ def touching_batch() -> _Batch:
     pair = ground_of(two_finger_hand(), BOX, "cpu", kernels)
     start = HandState(np.array([[0.0, 0, -0.025 + 2e-5]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
     batch = _Batch(Search(pair, CELLS), start, 10)
-    batch.simulation.pivot.assign([wp.vec3(*start.pivot[0])])
-    batch.simulation.dilation.zero_()
-    batch.simulation.iteration.fill_(9)
+    batch.data.pivot.assign([wp.vec3(*start.pivot[0])])
+    batch.data.schedule.dilation.zero_()
+    batch.data.iteration.fill_(9)
     batch.physics.warmup = 1.0
     return batch
 
@@ -114,9 +114,9 @@ def settled(pull: float) -> tuple[np.ndarray, np.ndarray]:
     launches["forward"].launch()
     for _ in range(800):
         launches["relax"].launch()
-    s = batch.simulation
-    body, place = s.point_body.numpy(), s.body_p.numpy()[0]
-    points = place[body] + s.point_position.numpy()
+    model, data = batch.model, batch.data
+    body, place = model.point_body.numpy(), data.body_p.numpy()[0]
+    points = place[body] + model.point_position.numpy()
     forces = [probed(points, tuple(v), batch.grid)[1] for v in batch.velocity.numpy()]
     return batch.force.numpy()[0], np.stack(forces, axis=1)
 

@@ -11,10 +11,11 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import build
 from worker.objects.repair import Repaired
 from worker.simulation import kernels
+from worker.simulation.data import Data
 from worker.simulation.device import DeviceHand, DeviceObject
-from worker.simulation.launches import Launches
+from worker.simulation.model import LossOptions, Model
 from worker.simulation.sampling import object_samples
-from worker.simulation.simulation import LossOptions, Schedule, Simulation
+from worker.simulation.state import Schedule
 
 
 def object_of(mesh: trimesh.Trimesh) -> ObjectModel:
@@ -33,23 +34,13 @@ def still(dilation: float = 0.0, weight: float = 0.0) -> Schedule:
 def rig(
     hand: HandModel, obj: ObjectModel, *, capacity: int, points: int = 300, options: LossOptions | None = None,
     cell: float = 0.0, alpha: float = 0.5, schedule: Schedule | None = None,
-) -> Simulation:  # fmt: skip
+) -> tuple[Model, Data]:  # fmt: skip
     kernels.load("cpu")
     device_hand = DeviceHand.create(hand, "cpu")
     device_object = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 1000), phong_alpha=alpha, cell=cell)
-    simulation = Simulation(
-        device_hand, device_object, sample_surface(hand, points), sample_surface(hand, 300),
-        capacity=capacity, options=options or LossOptions(),
-    )  # fmt: skip
-    simulation.set_schedule(schedule or still())
-    return simulation
-
-
-def evaluate(simulation: Simulation) -> None:
-    """Loss and gradient of the state, without a step."""
-    simulation.launches = Launches(simulation.device)
-    simulation._record_kinematics()
-    simulation._record_contact()
-    simulation._record_penalties()
-    simulation._record_gradient()
-    simulation.run()
+    model = Model.create(
+        device_hand, device_object, sample_surface(hand, points), sample_surface(hand, 300), options or LossOptions()
+    )
+    data = Data(model, capacity)
+    data.set_schedule(schedule or still())
+    return model, data

@@ -11,8 +11,8 @@ import warp as wp
 
 from worker.simulation import reference
 from worker.simulation.kernels import contact
+from worker.simulation.model import initial_motions
 from worker.simulation.reference import Contacts, World
-from worker.simulation.simulation import initial_motions
 
 #: float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m.
 END_TOLERANCE = 2e-6

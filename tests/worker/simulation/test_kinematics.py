@@ -16,7 +16,8 @@ from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.simulation.kernels import kinematics
-from worker.simulation.simulation import HandState
+from worker.simulation.record import record_placement
+from worker.simulation.state import HandState
 
 #: float32 positions of a hand 0.2 m large through at most 8 joints.
 FK_TOLERANCE = 3e-7
@@ -46,12 +47,11 @@ def root_poses(hand: HandModel, state: HandState) -> np.ndarray:
 def test_the_kernel_places_bodies_where_float64_kinematics_does(name: str) -> None:
     hand = hand_from_path(name)
     state = random_state(hand, 6)
-    simulation = rig(hand, ball(), capacity=6)
-    simulation.set_state(state)
-    simulation.record_placement()
-    simulation.run()
+    model, data = rig(hand, ball(), capacity=6)
+    data.set_state(state)
+    record_placement(model, data).run()
     expected = body_poses(hand, root_poses(hand, state), hand.expand(state.q))
-    np.testing.assert_allclose(simulation.body_p.numpy(), expected[..., :3], atol=FK_TOLERANCE)
+    np.testing.assert_allclose(data.body_p.numpy(), expected[..., :3], atol=FK_TOLERANCE)
 
 
 @pytest.mark.parametrize("name", REAL_HANDS)
@@ -127,19 +127,18 @@ def test_the_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> 
             (work(state.pivot, state.rotation, state.q + d) - work(state.pivot, state.rotation, state.q - d))
             / (2 * step)
         )
-    simulation = rig(hand, ball(), capacity=1)
-    simulation.set_state(state)
-    simulation.record_placement()
-    simulation.run()
+    model, data = rig(hand, ball(), capacity=1)
+    data.set_state(state)
+    record_placement(model, data).run()
     poses = body_poses(hand, root_poses(hand, state), joints)[0]
     points = apply(poses, local)
-    simulation.force.assign(force[None].astype(np.float32))
-    simulation.torque.assign(np.cross(points, force)[None].astype(np.float32))
+    data.force.assign(force[None].astype(np.float32))
+    data.torque.assign(np.cross(points, force)[None].astype(np.float32))
     wp.launch(
         kinematics.backward, 1,
-        inputs=[simulation.hand.tree, simulation.active, simulation.pivot, simulation.body_p, simulation.axis],
-        outputs=[simulation.force, simulation.torque, simulation.gradient],
+        inputs=[model.hand.tree, data.active, data.pivot, data.body_p, data.axis],
+        outputs=[data.force, data.torque, data.gradient],
         device="cpu",
     )  # fmt: skip
     # Sums of up to 23 float32 products of size 1.
-    np.testing.assert_allclose(simulation.gradient.numpy()[0], expected, atol=2e-5)
+    np.testing.assert_allclose(data.gradient.numpy()[0], expected, atol=2e-5)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from service.model.transforms import quat_rotate
-from tests.worker.simulation.rigs import ball, evaluate, rig, still
+from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.simulation.data import Data
+from worker.simulation.model import LossOptions, Model
 from worker.simulation.obstacles import DeviceObstacles, HandFeatures
 from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.simulation import HandState, LossOptions, Simulation
+from worker.simulation.record import record_evaluation, record_placement
+from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Surroundings
 
 MARGIN = 0.004
@@ -38,15 +43,13 @@ def distances(hand: HandModel, state: HandState, obstacle: Obstacle) -> np.ndarr
     return np.max(per_plane, axis=0)
 
 
-def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> Simulation:
+def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> tuple[Model, Data]:
     obj = ball()
-    simulation = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
+    model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
     up = np.array([0.0, 0, 1])
-    simulation.obstacles = DeviceObstacles.create(
-        hand, [Surroundings(obstacles, up)], obj.centre_of_mass, "cpu", margin=MARGIN
-    )
-    simulation.set_scenes(np.zeros(1, int))
-    return simulation
+    solids = DeviceObstacles.create(hand, [Surroundings(obstacles, up)], obj.centre_of_mass, "cpu", margin=MARGIN)
+    data.set_scenes(np.zeros(1, int))
+    return replace(model, obstacles=solids), data
 
 
 def reaching(hand: HandModel) -> HandState:
@@ -66,14 +69,14 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
         short = [np.minimum(distances(hand, at, o) - MARGIN, 0.0) for o in obstacles]
         return float(sum((s**2).sum() for s in short))
 
-    simulation = simulation_in(hand, obstacles)
+    model, data = simulation_in(hand, obstacles)
     schedule = still()
     schedule.penetration[:] = 1.0
-    simulation.set_schedule(schedule)
-    simulation.set_state(state)
-    evaluate(simulation)
-    assert simulation.point_depth.numpy()[0] == 0.0, "the object pushes nothing here"
-    found = simulation.gradient.numpy()[0]
+    data.set_schedule(schedule)
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    assert data.depths.points.numpy()[0] == 0.0, "the object pushes nothing here"
+    found = data.gradient.numpy()[0]
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-3, "the state is too near"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -82,13 +85,12 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_the_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) -> None:
     hand, obstacles = hand_from_path(name), SCENES["table"]
-    simulation = simulation_in(hand, obstacles)
-    simulation.set_state(reaching(hand))
-    simulation.record_placement()
-    simulation.run()
+    model, data = simulation_in(hand, obstacles)
+    data.set_state(reaching(hand))
+    record_placement(model, data).run()
     expected = max(0.0, MARGIN - distances(hand, reaching(hand), obstacles[0]).min())
     # float32 coordinates of 0.1 m.
-    np.testing.assert_allclose(simulation.depths(1)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(data.deepest(1)[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
@@ -96,16 +98,15 @@ def test_the_projection_brings_a_hand_out_of_an_obstacle(name: str) -> None:
     hand, obstacles = hand_from_path(name), SCENES["table"]
     state = reaching(hand)
     state.pivot += (-0.003 - distances(hand, state, obstacles[0]).min()) * obstacles[0].planes[0, :3]
-    simulation = simulation_in(hand, obstacles)
-    found, _ = Projection(simulation, ProjectionOptions()).run(state, 40)
+    model, data = simulation_in(hand, obstacles)
+    found, _ = Projection(model, data, ProjectionOptions()).run(state, 40)
     assert distances(hand, found, obstacles[0]).min() > MARGIN
 
 
 def test_a_hand_without_a_scene_feels_no_obstacle() -> None:
     hand = hand_from_path("allegro")
-    simulation = simulation_in(hand, SCENES["table"])
-    simulation.set_scenes(np.full(1, -1))
-    simulation.set_state(reaching(hand))
-    simulation.record_placement()
-    simulation.run()
-    assert simulation.obstacle_depth.numpy()[0] == 0.0
+    model, data = simulation_in(hand, SCENES["table"])
+    data.set_scenes(np.full(1, -1))
+    data.set_state(reaching(hand))
+    record_placement(model, data).run()
+    assert data.depths.obstacles.numpy()[0] == 0.0

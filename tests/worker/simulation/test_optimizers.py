@@ -10,16 +10,15 @@ from service.model.domain import Fidelity
 from service.model.errors import InputError
 from tests.worker.simulation.rigs import ball, rig
 from worker.hands.load import hand_from_path
-from worker.simulation.simulation import OPTIMIZERS, LossOptions, still_schedule
+from worker.simulation.model import LossOptions
+from worker.simulation.record import OPTIMIZERS, record_iteration
 
 
 @pytest.mark.parametrize("name", ["lbfgs", "Adam", ""])
 def test_an_optimizer_that_nobody_knows_is_refused_in_one_line(name: str) -> None:
-    simulation = rig(hand_from_path("barrett"), ball(), capacity=1, options=LossOptions())
-    simulation.set_schedule(still_schedule())
+    model, data = rig(hand_from_path("barrett"), ball(), capacity=1, options=LossOptions())
     with pytest.raises(InputError, match=r"unknown optimizer '.*'; choose one of adam, gd$"):
-        simulation.record_iteration(name)
-    assert simulation.commands() == []
+        record_iteration(model, data, name)
 
 
 def test_every_optimizer_of_a_fidelity_is_known() -> None:

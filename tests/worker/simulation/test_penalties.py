@@ -10,14 +10,16 @@ import pytest
 
 from service.model.errors import InputError
 from service.model.transforms import apply, invert, quat_from_axis_angle, quat_multiply
-from tests.worker.simulation.rigs import ball, evaluate, rig, still
+from tests.worker.simulation.rigs import ball, rig, still
 from tests.worker.simulation.test_kinematics import root_poses
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance, sample_surface
+from worker.simulation.model import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
+from worker.simulation.record import record_evaluation, record_iteration
 from worker.simulation.sampling import object_samples
-from worker.simulation.simulation import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, HandState, LossOptions, Schedule
+from worker.simulation.state import HandState, Schedule
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
 #: difference add the rest.
@@ -66,13 +68,13 @@ def test_object_points_inside_links_push_the_hand_along_the_true_gradient(name: 
             total += float((np.maximum(depth, 0) ** 2).sum())
         return total * REFERENCE_SAMPLES / len(samples)
 
-    simulation = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
+    model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
     schedule = still()
     schedule.object_penetration[:] = 1.0
-    simulation.set_schedule(schedule)
-    simulation.set_state(state)
-    evaluate(simulation)
-    found = simulation.gradient.numpy()[0]
+    data.set_schedule(schedule)
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    found = data.gradient.numpy()[0]
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 0.01, "the state penetrates"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -101,13 +103,13 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     state = max(states, key=energy)
 
     options = LossOptions(simulate=False, leak=0.0, range_weight=0.0, self_margin=0.0)
-    simulation = rig(hand, ball(), capacity=1, options=options)
+    model, data = rig(hand, ball(), capacity=1, options=options)
     schedule = still()
     schedule.self_penetration[:] = 1.0
-    simulation.set_schedule(schedule)
-    simulation.set_state(state)
-    evaluate(simulation)
-    found = simulation.gradient.numpy()[0]
+    data.set_schedule(schedule)
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    found = data.gradient.numpy()[0]
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-4, "the links touch"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -118,12 +120,12 @@ def test_the_range_and_limit_penalties_have_their_closed_form_gradient() -> None
     q = hand.upper + 0.1
     state = HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q[None])
     options = LossOptions(simulate=False, leak=0.0, range_weight=0.3, limit_weight=7.0)
-    simulation = rig(hand, ball(), capacity=1, options=options)
-    simulation.set_state(state)
-    evaluate(simulation)
+    model, data = rig(hand, ball(), capacity=1, options=options)
+    data.set_state(state)
+    record_evaluation(model, data).run()
     half = 0.5 * (hand.upper - hand.lower)
     expected = 2 * 0.3 * (half + 0.1) / half**2 + 2 * 7.0 * 0.1
-    np.testing.assert_allclose(simulation.gradient.numpy()[0, 6:], expected, rtol=1e-5)
+    np.testing.assert_allclose(data.gradient.numpy()[0, 6:], expected, rtol=1e-5)
 
 
 PLACES = {
@@ -143,12 +145,12 @@ def test_an_unknown_contact_solver_is_refused_in_a_line() -> None:
 def test_loss_and_gradient_are_finite_wherever_the_hand_is(place: str, solver: str) -> None:
     hand, obj = hand_from_path("allegro"), ball()
     state = HandState(np.array([PLACES[place]]), np.array([[1.0, 0.0, 0.0, 0.0]]), hand.preshape[None])
-    simulation = rig(hand, obj, capacity=1, options=LossOptions(contact_solver=solver))
-    simulation.set_schedule(still(dilation=0.01, weight=1e4))
-    simulation.set_state(state)
-    evaluate(simulation)
-    assert np.all(np.isfinite(simulation.loss.numpy()))
-    assert np.all(np.isfinite(simulation.gradient.numpy()))
+    model, data = rig(hand, obj, capacity=1, options=LossOptions(contact_solver=solver))
+    data.set_schedule(still(dilation=0.01, weight=1e4))
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    assert np.all(np.isfinite(data.loss.numpy()))
+    assert np.all(np.isfinite(data.gradient.numpy()))
 
 
 def test_a_mesh_with_degenerate_normals_gives_finite_gradients() -> None:
@@ -156,11 +158,11 @@ def test_a_mesh_with_degenerate_normals_gives_finite_gradients() -> None:
     obj = ball()
     broken = replace(obj, corner_normals=np.zeros_like(obj.corner_normals))
     hand = hand_from_path("allegro")
-    simulation = rig(hand, broken, capacity=1)
-    simulation.set_schedule(still(dilation=0.01, weight=1e4))
-    simulation.set_state(fist_in_ball(hand))
-    evaluate(simulation)
-    assert np.all(np.isfinite(simulation.gradient.numpy()))
+    model, data = rig(hand, broken, capacity=1)
+    data.set_schedule(still(dilation=0.01, weight=1e4))
+    data.set_state(fist_in_ball(hand))
+    record_evaluation(model, data).run()
+    assert np.all(np.isfinite(data.gradient.numpy()))
 
 
 def test_small_descent_steps_never_raise_the_loss() -> None:
@@ -170,16 +172,14 @@ def test_small_descent_steps_never_raise_the_loss() -> None:
     steps = 30
     ones = np.zeros(steps)
     schedule = Schedule(ones + 0.004, ones, ones, ones, np.tile([1e-10, 1e-8, 1e-8], (steps, 1)))
-    simulation = rig(hand, obj, capacity=1, options=options)
-    simulation.set_schedule(schedule)
-    simulation.set_state(
-        HandState(np.array([[0.037, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), hand.preshape[None])
-    )
-    simulation.record_iteration("gd")
+    model, data = rig(hand, obj, capacity=1, options=options)
+    data.set_schedule(schedule)
+    data.set_state(HandState(np.array([[0.037, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), hand.preshape[None]))
+    launches = record_iteration(model, data, "gd")
     losses = []
     for _ in range(steps):
-        simulation.run()
-        losses.append(float(simulation.loss.numpy().mean()))
+        launches.run()
+        losses.append(float(data.loss.numpy().mean()))
     assert losses[-1] < losses[0]
     # float32 sums of losses of size 1.
     assert max(np.diff(losses)) < 1e-5

@@ -18,8 +18,11 @@ from worker.hands.jacobian import ancestors
 from worker.hands.model import HandModel, JointType, SurfacePoints
 from worker.planners.autograsp import kernels
 from worker.planners.fast_graspd.pairs import Pair
-from worker.simulation.kernels import kinematics
-from worker.simulation.simulation import HandState, Simulation
+from worker.simulation.data import Data
+from worker.simulation.launches import Launches
+from worker.simulation.model import Model
+from worker.simulation.record import add_poses
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 
@@ -78,12 +81,13 @@ class Closer:
     def __init__(self, pair: Pair, capacity: int) -> None:
         self.pair, self.capacity = pair, capacity
         self.hand = pair.hand.model
-        # A simulation holds poses, points and states; only its kinematics is run.
-        self.simulation = Simulation(
-            pair.hand, pair.fine.obj, pair.fine.points, pair.coarse.own, capacity=capacity, options=pair.options
-        )
+        self.model = Model.create(pair.hand, pair.fine.obj, pair.fine.points, pair.coarse.own, pair.options)
+        # Only the kinematics is run.
+        self.data = Data(self.model, capacity)
+        self._poses = Launches(self.model.device)
+        add_poses(self._poses, self.model, self.data)
         self.closing = self._closing()
-        with wp.ScopedDevice(self.simulation.device):
+        with wp.ScopedDevice(self.model.device):
             self.near = wp.zeros((capacity, self.hand.bodies), dtype=wp.float32)
             self.pairs = wp.zeros((capacity, self.hand.bodies, self.hand.bodies), dtype=wp.float32)
             self.stopped = wp.zeros((capacity, self.hand.dofs), dtype=wp.int32)
@@ -93,7 +97,7 @@ class Closer:
         lever = levers(hand, points)
         moves = lever > 0
         out = kernels.Closing()
-        with wp.ScopedDevice(self.simulation.device):
+        with wp.ScopedDevice(self.model.device):
             out.direction = wp.array(hand.closing, dtype=wp.float32)
             out.moves = wp.array(moves.astype(np.int32), dtype=wp.int32)
             out.lever = wp.array(lever, dtype=wp.float32)
@@ -107,25 +111,25 @@ class Closer:
         n = len(state.pivot)
         direction = np.zeros((self.capacity, 3))
         direction[:n] = quat_rotate(state.rotation, self.hand.palm.approach)
-        self.simulation.set_state(state)
-        active, near = self.simulation.active, self.near
-        with wp.ScopedDevice(self.simulation.device):
+        self.data.set_state(state)
+        active, near = self.data.active, self.near
+        with wp.ScopedDevice(self.model.device):
             along = wp.array(direction, dtype=wp.vec3)
         for _ in range(ADVANCES):
             self._measure()
             wp.launch(
                 kernels.advance, self.capacity,
-                inputs=[near, along, standoff, SHARE], outputs=[active, self.simulation.pivot],
-                device=self.simulation.device,
+                inputs=[near, along, standoff, SHARE], outputs=[active, self.data.pivot],
+                device=self.model.device,
             )  # fmt: skip
             if not active.numpy().any():
                 break
-        return self.simulation.state(n)
+        return self.data.state(n)
 
     def close(self, state: HandState) -> Closed:
         """Fingers closed until contact or limits; the root and dofs that do not close (spreads) stay."""
-        n, simulation = len(state.pivot), self.simulation
-        simulation.set_state(state)
+        n, data = len(state.pivot), self.data
+        data.set_state(state)
         idle = np.tile((self.hand.closing == 0).astype(np.int32) * 2, (self.capacity, 1))
         self.stopped.assign(idle)
         for _ in range(STEPS):
@@ -133,44 +137,38 @@ class Closer:
             wp.launch(
                 kernels.close, self.capacity,
                 inputs=[self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST],
-                outputs=[simulation.active, self.stopped, simulation.q],
-                device=simulation.device,
+                outputs=[data.active, self.stopped, data.q],
+                device=data.device,
             )  # fmt: skip
-            if not simulation.active.numpy().any():
+            if not data.active.numpy().any():
                 break
-        return Closed(simulation.state(n), self.stopped.numpy()[:n].astype(np.int32))
+        return Closed(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
 
     def distances(self, state: HandState) -> Floats:
         """(n, L) least distance of each body from the object, at most `REACH_M` [m]."""
-        self.simulation.set_state(state)
+        self.data.set_state(state)
         self._measure()
         return self.near.numpy()[: len(state.pivot)].astype(float)
 
     def _measure(self, *, fingers: bool = False) -> None:
-        s, obj, device = self.simulation, self.pair.fine.obj, self.simulation.device
-        wp.launch(
-            kinematics.forward, self.capacity,
-            inputs=[s.hand.tree, s.active, s.pivot, s.rotation, s.q],
-            outputs=[s.body_p, s.body_q, s.axis, s.force, s.torque, s.contacts, s.point_depth, s.object_depth,
-                     s.self_depth],
-            device=device,
-        )  # fmt: skip
-        pose = [s.body_p, s.body_q]
+        m, d, device = self.model, self.data, self.model.device
+        self._poses.run()
+        pose = [d.body_p, d.body_q]
         wp.launch(kernels.clear, self.near.shape, inputs=[REACH_M], outputs=[self.near, self.pairs], device=device)
         wp.launch(
-            kernels.points_to_object, (self.capacity, s.count),
-            inputs=[obj.surface, REACH_M, s.options.exact_below, s.point_body, s.point_position, s.active, *pose],
+            kernels.points_to_object, (self.capacity, m.count),
+            inputs=[m.obj.surface, REACH_M, m.options.exact_below, m.point_body, m.point_position, d.active, *pose],
             outputs=[self.near], device=device,
         )  # fmt: skip
-        shape = (self.capacity, len(self.hand.pieces))
+        shape = (self.capacity, m.pieces)
         wp.launch(
             kernels.object_to_pieces, shape,
-            inputs=[self.pair.hand.pieces, obj.bvh.id, obj.samples, s.active, *pose, MARGIN_M],
+            inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, MARGIN_M],
             outputs=[self.near], device=device,
         )  # fmt: skip
         if fingers:
             wp.launch(
                 kernels.bodies_to_pieces, shape,
-                inputs=[self.pair.hand.pieces, s.body_points, s.active, *pose, MARGIN_M], outputs=[self.pairs],
+                inputs=[m.hand.pieces, m.body_points, d.active, *pose, MARGIN_M], outputs=[self.pairs],
                 device=device,
             )  # fmt: skip

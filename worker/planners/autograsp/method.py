@@ -16,7 +16,7 @@ from worker.planners.autograsp.closing import Closer
 from worker.planners.peers import free_starts, grasp_set, ground_of, joined
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
 from worker.planners.threads import Steps, cut, run_parts
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 
 class AutograspOptions(Options):

@@ -19,7 +19,7 @@ from worker.planners.dfc.starts import sample_starts
 from worker.planners.peers import grasp_set, ground_of, joined
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
 from worker.planners.threads import Steps, cut, run_parts
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 #: Force closure, distance and penetration that the source lets pass.
 PASSES: Final = (0.3, 0.005, 0.001)

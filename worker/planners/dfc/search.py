@@ -17,9 +17,12 @@ from worker.planners.dfc.schedule import CONTACTS, SELF_GAP_M
 from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.inner_surface import inside_points
 from worker.planners.threads import Steps
-from worker.simulation.kernels import kinematics, optimizers
+from worker.simulation.data import Data
+from worker.simulation.kernels import optimizers
 from worker.simulation.launches import Launches
-from worker.simulation.simulation import HandState, Simulation, still_schedule
+from worker.simulation.model import Model
+from worker.simulation.record import add_poses, add_root_gradient
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -63,10 +66,9 @@ class Descent:
         self.obj = pair.fine.obj.thinned(SAMPLES)
         self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
         # Holds the proposals; only its kinematics is run.
-        self.proposal = Simulation(
-            pair.hand, self.obj, pair.coarse.points, pair.coarse.own, capacity=self.n, options=pair.options
-        )
-        self.device = self.proposal.device
+        self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
+        self.proposal = Data(self.model, self.n)
+        self.device = self.model.device
         generators = [np.random.default_rng([*seed, 1]) for seed in seeds]
         random = np.array([g.integers(2**32, dtype=np.uint32) for g in generators], np.uint32)
         contacts = np.array([g.integers(len(self.candidates), size=CONTACTS) for g in generators], np.int32)
@@ -74,7 +76,6 @@ class Descent:
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
             self._upload(hand)
-        self.proposal.set_schedule(still_schedule())
         self.proposal.set_state(starts)
         for mine, other in zip(self.state, self._proposed(), strict=True):
             wp.copy(mine, other)
@@ -101,37 +102,27 @@ class Descent:
         return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
 
     def _record(self) -> Launches:
-        s, n, out = self.proposal, self.n, Launches(self.device)
-        pose, wrench = [s.body_p, s.body_q], [s.force, s.torque]
-        own = [self.new_terms, *wrench]
+        s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
+        pose, own = [s.body_p, s.body_q], [self.new_terms, s.force, s.torque]
         out.add(
             kernels.propose, n,
             inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],
             outputs=[self.rng, self.moment, *self._proposed(), self.new_contact, self.new_terms],
         )  # fmt: skip
-        out.add(
-            kinematics.forward, n,
-            inputs=[s.hand.tree, s.active, *self._proposed()],
-            outputs=[*pose, s.axis, *wrench, s.contacts, s.point_depth, s.object_depth, s.self_depth],
-        )  # fmt: skip
+        add_poses(out, m, s)
         out.add(
             kernels.force_closure, n,
             inputs=[self.obj.surface, self.candidate_body, self.candidate_position, self.new_contact, *pose],
             outputs=own,
         )  # fmt: skip
         out.add(
-            kernels.penetration, (n, len(s.hand.model.pieces)),
-            inputs=[s.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose], outputs=own,
+            kernels.penetration, (n, m.pieces),
+            inputs=[m.hand.pieces, self.obj.bvh.id, self.obj.samples, *pose], outputs=own,
         )  # fmt: skip
         if self.pairs:
             out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
-        out.add(
-            kinematics.backward, n,
-            inputs=[s.hand.tree, s.active, s.pivot, s.body_p, s.axis], outputs=[*wrench, s.gradient],
-        )  # fmt: skip
-        out.add(
-            kernels.limits, n, inputs=[s.hand.lower, s.hand.upper, s.q], outputs=[self.new_terms, s.gradient]
-        )  # fmt: skip
+        add_root_gradient(out, m, s)
+        out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
         out.add(
             kernels.accept, n,
             inputs=[s.iteration, self.new_terms, s.gradient, *self._proposed(), self.new_contact],

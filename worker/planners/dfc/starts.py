@@ -10,7 +10,7 @@ from service.model.transforms import quat_from_axis_angle, quat_from_matrix, qua
 from worker.hands.model import HandModel
 from worker.objects.distance import sample_faces
 from worker.objects.model import ObjectModel
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 #: Distance of the palm from the hull [m]: the source puts the root, which is a palm's length behind, at 0.2 to 0.3.
 DISTANCE: Final = (0.1, 0.2)

@@ -14,10 +14,13 @@ from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.schedule import loss_options
 from worker.simulation import kernels
+from worker.simulation.data import Data
 from worker.simulation.device import DeviceHand, DeviceObject
+from worker.simulation.launches import Launches
+from worker.simulation.model import LossOptions, Model
 from worker.simulation.obstacles import DeviceObstacles
+from worker.simulation.record import record_iteration
 from worker.simulation.sampling import object_samples
-from worker.simulation.simulation import LossOptions, Simulation
 
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005
@@ -48,10 +51,13 @@ class Pair:
     options: LossOptions
     hand: DeviceHand
 
-    def simulation(self, side: Side, capacity: int, obstacles: DeviceObstacles | None = None) -> Simulation:
-        return Simulation(
-            self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options, obstacles=obstacles
-        )
+    def model(self, side: Side, obstacles: DeviceObstacles | None = None) -> Model:
+        """The hand and the object as a phase sees them."""
+        return Model.create(self.hand, side.obj, side.points, side.own, self.options, obstacles)
+
+    def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
+        """See `record_iteration`."""
+        return record_iteration(model, data, optimizer, patience=patience)
 
 
 _pairs: LRUCache[tuple[str, str, str, str], Pair] = LRUCache(KEPT)

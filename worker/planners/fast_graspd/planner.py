@@ -14,17 +14,19 @@ from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd import scene_starts
 from worker.planners.fast_graspd.pairs import Pair, pair_of
+from worker.planners.fast_graspd.scene_starts import sample_scene_starts
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
 from worker.planners.fast_graspd.selection import best_of_each, merits, posture_of
-from worker.planners.fast_graspd.starts import RETREATS, nearest_distances, sample_starts
+from worker.planners.fast_graspd.starts import Probe, sample_starts
 from worker.planners.port import Cancelled, Progress
 from worker.planners.threads import Steps, cut, run_parts
 from worker.quality.postures import pregrasp, squeeze
+from worker.simulation.data import Data
+from worker.simulation.launches import Launches
 from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.simulation import HandState, Schedule, Simulation
+from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
@@ -122,27 +124,30 @@ def _work(
     finalists = _finalists(fidelity)
     obstacles = _obstacles(pair, placed)
     which: dict[str, Any] = {"seed": seed, "batch": batch, "indices": part.indices, "each": fidelity.starts}
-    if placed is None:
-        probe = pair.simulation(pair.coarse, n * fidelity.starts * len(RETREATS))
-        state = sample_starts(hand, obj, probe, **which)
-    else:
-        probe = pair.simulation(pair.coarse, n * fidelity.starts * len(scene_starts.RETREATS), obstacles)
-        state = scene_starts.sample_scene_starts(hand, obj, probe, placed=placed, **which)
-    touch = nearest_distances(probe, state) / DILATION if fidelity.dilation == "touch" else None
+    coarse, fine = pair.model(pair.coarse, obstacles), pair.model(pair.fine, obstacles)
+    state = sample_starts(coarse, **which) if placed is None else sample_scene_starts(coarse, placed=placed, **which)
+    touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
     steps(n, "starts")
     part.curve = []
-    simulation = _in_scenes(pair.simulation(pair.coarse, n * fidelity.starts, obstacles), placed, fidelity.starts)
-    state = _optimize(simulation, state, coarse_schedule(fidelity), fidelity, steps, "coarse", part.curve, touch)
-    losses = _losses(simulation, state)
+    data = _in_scenes(Data(coarse, n * fidelity.starts), placed, fidelity.starts)
+    data.set_schedule(coarse_schedule(fidelity))
+    data.set_state(state, dilation=touch)
+    # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
+    launches = pair.iteration(coarse, data, fidelity.optimizer, patience=0)
+    state = _descend(launches, data, n * fidelity.starts, fidelity.coarse_iterations, steps, "coarse", part.curve)
+    losses = _losses(data, state)
     if finalists < fidelity.starts:
         chosen = best_of_each(merits(hand, obj, state, losses), n, finalists)
         state, losses = state[chosen], losses[chosen]
-    simulation = _in_scenes(pair.simulation(pair.fine, n * finalists, obstacles), placed, finalists)
-    state = _optimize(simulation, state, fine_schedule(fidelity), fidelity, steps, "fine", part.curve)
+    data = _in_scenes(Data(fine, n * finalists), placed, finalists)
+    data.set_schedule(fine_schedule(fidelity))
+    data.set_state(state)
+    launches = pair.iteration(fine, data, fidelity.optimizer, patience=fidelity.patience)
+    state = _descend(launches, data, n * finalists, fidelity.fine_iterations, steps, "fine", part.curve)
     if fidelity.fine_iterations:
-        losses = _losses(simulation, state)
+        losses = _losses(data, state)
     # Without iterations this only tells how deep each hand is.
-    state, depths = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
+    state, depths = Projection(fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
     if finalists > 1:
         winners = best_of_each(merits(hand, obj, state, losses, depths), n, 1)
         state, losses = state[winners], losses[winners]
@@ -156,37 +161,31 @@ def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:
     return DeviceObstacles.create(pair.hand.model, placed.scenes, centre, pair.hand.device)
 
 
-def _in_scenes(simulation: Simulation, placed: Placed | None, each: int) -> Simulation:
-    """The simulation with the scene of every hand, `each` hands a grasp."""
+def _in_scenes(data: Data, placed: Placed | None, each: int) -> Data:
+    """The data with the scene of every hand, `each` hands a grasp."""
     if placed is not None:
-        simulation.set_scenes(np.repeat(placed.index, each))
-    return simulation
+        data.set_scenes(np.repeat(placed.index, each))
+    return data
 
 
-def _losses(simulation: Simulation, state: HandState) -> Floats:
+def _losses(data: Data, state: HandState) -> Floats:
     """L_stable (n,) of the last iteration."""
-    return simulation.loss.numpy()[: len(state.pivot)].mean(axis=1).astype(float)
+    return data.loss.numpy()[: len(state.pivot)].mean(axis=1).astype(float)
 
 
-def _optimize(
-    simulation: Simulation, state: HandState, schedule: Schedule, fidelity: Fidelity, steps: Steps, name: str,
-    curve: list[float], dilation: Floats | None = None,
-) -> HandState:  # fmt: skip
-    n = len(state.pivot)
-    simulation.set_schedule(schedule)
-    simulation.set_state(state, dilation=dilation)
-    # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
-    patience = fidelity.patience if name == "fine" else 0
-    simulation.record_iteration(fidelity.optimizer, patience=patience)
+def _descend(
+    launches: Launches, data: Data, n: int, iterations: int, steps: Steps, name: str, curve: list[float]
+) -> HandState:
+    """The first n hands after so many iterations."""
     done = 0
-    while done < len(schedule):
-        chunk = min(CHUNK, len(schedule) - done)
-        simulation.run(chunk)
+    while done < iterations:
+        chunk = min(CHUNK, iterations - done)
+        launches.run(chunk)
         done += chunk
         steps(n * chunk, name)
-        if not wp.get_device(simulation.device).is_cuda:
-            curve.append(float(simulation.loss.numpy()[:n].mean()))
-    return simulation.state(n)
+        if not wp.get_device(data.device).is_cuda:
+            curve.append(float(data.loss.numpy()[:n].mean()))
+    return data.state(n)
 
 
 def grasps_of(

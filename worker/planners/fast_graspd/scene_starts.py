@@ -15,8 +15,9 @@ from service.model.errors import InputError
 from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, probe_depths, start_generator
-from worker.simulation.simulation import HandState, Simulation, still_schedule
+from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe, start_generator
+from worker.simulation.model import Model
+from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed, Surroundings
 
 Floats = NDArray[np.float64]
@@ -73,20 +74,16 @@ def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
-def sample_scene_starts(
-    hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range, each: int,
-    placed: Placed,
-) -> HandState:  # fmt: skip
+def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, each: int, placed: Placed) -> HandState:
     """Starts of the grasps `indices` of a batch in their scenes, `each` per grasp, those of one grasp side by side.
 
-    `probe` is a simulation with the scenes' obstacles, of capacity len(indices) * each * len(RETREATS) at least.
+    `model` has the scenes' obstacles.
 
     Raises:
         InputError: a scene leaves no way to the object, or not one draw of some grasp came within 10 mm of being clear.
     """
-    probe.set_schedule(still_schedule())
-    probe.room = ROOM
-    probe.record_placement()
+    hand, obj = model.hand.model, model.obj.model
+    probe = Probe(model, len(indices) * each * len(RETREATS), room=ROOM)
     ways = [free_ways(scene, obj) for scene in placed.scenes]
     scene = np.repeat(placed.index, each)
     count, surface = len(scene), _Surface.of(obj)
@@ -100,8 +97,8 @@ def sample_scene_starts(
         if not len(rows):
             break
         states = _draws(hand, obj, surface, uniform[rows, number], normal[rows, number], [ways[s] for s in scene[rows]])
-        probe.set_scenes(np.repeat(scene[rows], len(RETREATS)))
-        found = probe_depths(probe, states).reshape(len(rows), len(RETREATS))
+        probe.data.set_scenes(np.repeat(scene[rows], len(RETREATS)))
+        found = probe.depths(states).reshape(len(rows), len(RETREATS))
         # The nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import Fidelity
-from worker.simulation.simulation import LossOptions, Schedule
+from worker.simulation.model import LossOptions
+from worker.simulation.state import Schedule
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import hold_forces
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 

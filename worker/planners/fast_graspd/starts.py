@@ -15,7 +15,10 @@ from service.model.errors import InputError
 from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.simulation.simulation import HandState, Simulation, still_schedule
+from worker.simulation.data import Data
+from worker.simulation.model import Model
+from worker.simulation.record import record_placement
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 
@@ -90,25 +93,46 @@ def _retreated(draws: list[_Draw]) -> HandState:
     )
 
 
-def sample_starts(
-    hand: HandModel, obj: ObjectModel, probe: Simulation, *, seed: int, batch: int, indices: range, each: int
-) -> HandState:
-    """Collision-free starts of the grasps `indices` of a batch, `each` per grasp, those of one grasp side by side.
+class Probe:
+    """Places hands and tells how deep they are, and how near the object; `room` as `record_placement` has it."""
 
-    `probe` is a simulation whose capacity is at least len(indices) * each * len(RETREATS).
+    def __init__(self, model: Model, capacity: int, *, room: float = 0.0) -> None:
+        self.data = Data(model, capacity)
+        self.band = model.options.band
+        self._placement = record_placement(model, self.data, room=room)
+
+    def depths(self, states: HandState) -> Floats:
+        """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links,
+        and what it lacks of its distance from obstacles."""
+        self.data.set_state(states)
+        self._placement.run()
+        return self.data.deepest(len(states.pivot)).astype(float)
+
+    def nearest(self, states: HandState) -> Floats:
+        """Distance of each hand's nearest point from the object (n,) [m], at most the model's band."""
+        self.depths(states)
+        n = len(states.pivot)
+        counts = self.data.contacts.count.numpy()[:n]
+        distances = self.data.contacts.distance.numpy()[:n]
+        present = np.arange(distances.shape[1]) < counts[:, None]
+        return np.where(present, distances, self.band).min(axis=1).clip(0.0, self.band).astype(float)
+
+
+def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
+    """Collision-free starts of the grasps `indices` of a batch, `each` per grasp, those of one grasp side by side.
 
     Raises:
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
-    probe.set_schedule(still_schedule())
-    probe.record_placement()
+    hand, obj = model.hand.model, model.obj.model
+    probe = Probe(model, len(indices) * each * len(RETREATS))
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     best: list[tuple[float, HandState] | None] = [None] * len(generators)
     open_ = list(range(len(generators)))
     for _ in range(DRAWS):
         draws = [draw(hand, obj, generators[i]) for i in open_]
         states = _retreated(draws)
-        depth = probe_depths(probe, states).reshape(len(draws), len(RETREATS))
+        depth = probe.depths(states).reshape(len(draws), len(RETREATS))
         for row, i in enumerate(open_):
             # The nearest clear distance, or else the least deep.
             clear = np.flatnonzero(depth[row] <= CLEAR)
@@ -131,22 +155,3 @@ def sample_starts(
         np.concatenate([b[1].rotation for b in chosen]),
         np.concatenate([b[1].q for b in chosen]),
     )
-
-
-def probe_depths(probe: Simulation, states: HandState) -> Floats:
-    """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links,
-    and what it lacks of its distance from obstacles."""
-    n = len(states.pivot)
-    probe.set_state(states)
-    probe.run()
-    return probe.depths(n).astype(float)
-
-
-def nearest_distances(probe: Simulation, states: HandState) -> Floats:
-    """Distance of each hand's nearest point from the object (n,) [m], at most the probe's band."""
-    probe_depths(probe, states)
-    n = len(states.pivot)
-    counts = probe.contacts.numpy()[:n]
-    distances = probe.contact_distance.numpy()[:n]
-    present = np.arange(distances.shape[1]) < counts[:, None]
-    return np.where(present, distances, probe.options.band).min(axis=1).clip(0.0, probe.options.band).astype(float)

@@ -18,7 +18,7 @@ from worker.planners.graspd2022.search import Floats, Search
 from worker.planners.peers import Kept, free_starts, grasp_set, ground_of, joined
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
 from worker.planners.threads import Steps, cut, run_parts
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 
 class Graspd2022Options(Options):

@@ -14,9 +14,11 @@ from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
 from worker.planners.graspd2022.grid import distance_grid
 from worker.planners.threads import Steps
-from worker.simulation.kernels import kinematics, optimizers, pieces
+from worker.simulation.data import Data
 from worker.simulation.launches import Launches
-from worker.simulation.simulation import MAX_DILATION, HandState, Schedule, Simulation
+from worker.simulation.model import MAX_DILATION, Model
+from worker.simulation.record import add_poses, add_root_gradient, add_self_penalty, add_step
+from worker.simulation.state import HandState, Schedule
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +38,7 @@ DAMPING: Final = 1.0
 FORCE_RATE: Final = 1e-2
 #: Rates of Adam: root position [m], root rotation (1e-3 on a quaternion's numbers) [rad], joints [rad].
 RATES: Final = (1e-3, 2e-3, 3e-3)
+BETAS: Final = (0.9, 0.999)
 WARMUP: Final = 200
 #: The dilated object starts this far from the hand [m]; hands start this far behind the nearest free place [m].
 APART_M: Final = 0.01
@@ -79,7 +82,7 @@ class Search:
             count = min(CHUNK, steps - first)
             batch.run(count)
             tell(n * count, "descent")
-        return batch.simulation.state(n), batch.residual()
+        return batch.data.state(n), batch.residual()
 
 
 def _retreated(pair: Pair, starts: HandState) -> HandState:
@@ -93,10 +96,9 @@ class _Batch:
     def __init__(self, search: Search, starts: HandState, steps: int) -> None:
         pair, n = search.pair, len(starts.pivot)
         self.grid, self.n = search.grid, n
-        self.simulation = Simulation(
-            pair.hand, pair.fine.obj, search.points, pair.coarse.own, capacity=n, options=pair.options
-        )
-        self.device = self.simulation.device
+        self.model = Model.create(pair.hand, pair.fine.obj, search.points, pair.coarse.own, pair.options)
+        self.data = Data(self.model, n)
+        self.device = self.model.device
         self.physics = physics_of(pair.fine.obj.model.gyration_radius)
         velocity = SPEED * np.array([[0.0, 0, 0], [1, 1, 1], [-1, -1, -1]])
         wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
@@ -108,60 +110,40 @@ class _Batch:
             self.force, self.first, self.largest = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
             self.total, self.pull = (wp.zeros((n, 3), dtype=kernels.vec6) for _ in range(2))
             self.multiplier, self.gap = (wp.zeros((n, 3), dtype=wp.float32) for _ in range(2))
-        self.simulation.set_schedule(schedule(steps))
-        self.simulation.set_state(starts)
-        self.simulation.dilation_scale.assign(self._first_dilation())
+        self.data.set_schedule(schedule(steps))
+        self.data.set_state(starts)
+        self.data.dilation_scale.assign(self._first_dilation())
         self.launches = self._record()
-
-    def _forward(self) -> dict[str, list[Any]]:
-        s = self.simulation
-        return {
-            "inputs": [s.hand.tree, s.active, s.pivot, s.rotation, s.q],
-            "outputs": [s.body_p, s.body_q, s.axis, s.force, s.torque, s.contacts, s.point_depth, s.object_depth,
-                        s.self_depth],
-        }  # fmt: skip
 
     def _first_dilation(self) -> NDArray[np.float32]:
         """(n,) share of `MAX_DILATION` at which the dilated object is `APART_M` from each hand."""
-        s = self.simulation
+        m, d, poses = self.model, self.data, Launches(self.device)
+        add_poses(poses, m, d)
+        poses.run()
         with wp.ScopedDevice(self.device):
             least = wp.full(self.n, 1e3, dtype=wp.float32)
-            wp.launch(kinematics.forward, self.n, **self._forward())
             wp.launch(
                 kernels.nearest, (self.n, POINTS),
-                inputs=[self.grid, s.point_body, s.point_position, s.body_p, s.body_q], outputs=[least],
+                inputs=[self.grid, m.point_body, m.point_position, d.body_p, d.body_q], outputs=[least],
             )  # fmt: skip
             return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
 
     def _record(self) -> Launches:
-        s, n, out = self.simulation, self.n, Launches(self.device)
-        pose, wrench = [s.body_p, s.body_q], [s.force, s.torque]
-        out.add(kinematics.forward, n, **self._forward())
+        m, d, n, out = self.model, self.data, self.n, Launches(self.device)
+        add_poses(out, m, d)
         out.add(
             kernels.multipliers, (n, 3),
-            inputs=[self.physics, self.task, s.active], outputs=[self.total, self.multiplier, self.pull, self.gap],
+            inputs=[self.physics, self.task, d.active], outputs=[self.total, self.multiplier, self.pull, self.gap],
         )  # fmt: skip
         out.add(
             kernels.relax, (n, POINTS),
-            inputs=[self.physics, self.grid, self.velocity, s.point_body, s.point_position, s.active, s.iteration,
-                    s.dilation, s.dilation_scale, *pose, self.pull],
-            outputs=[self.force, self.first, self.largest, self.total, *wrench],
+            inputs=[self.physics, self.grid, self.velocity, m.point_body, m.point_position, d.active, d.iteration,
+                    d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q, self.pull],
+            outputs=[self.force, self.first, self.largest, self.total, d.force, d.torque],
         )  # fmt: skip
-        out.add(
-            pieces.pieces_in_pieces, (n, len(s.hand.model.pieces)),
-            inputs=[s.hand.pieces, s.body_points, s.self_scale, 0.0, s.active, s.iteration, s.self_weight, *pose],
-            outputs=[*wrench, s.self_depth],
-        )  # fmt: skip
-        out.add(
-            kinematics.backward, n,
-            inputs=[s.hand.tree, s.active, s.pivot, s.body_p, s.axis], outputs=[*wrench, s.gradient],
-        )  # fmt: skip
-        out.add(
-            optimizers.adam, n,
-            inputs=[s.hand.lower, s.hand.upper, s.active, s.iteration, s.rates, s.gradient, 0.9, 0.999],
-            outputs=[s.first, s.second, s.pivot, s.rotation, s.q],
-        )  # fmt: skip
-        out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
+        add_self_penalty(out, m, d, 0.0)
+        add_root_gradient(out, m, d)
+        add_step(out, m, d, "adam", betas=BETAS)
         return out
 
     def run(self, iterations: int) -> None:

@@ -19,7 +19,7 @@ from worker.planners.graspit.search import Search
 from worker.planners.peers import Kept, grasp_set, ground_of, joined
 from worker.planners.port import Cancelled, Method, Options, Planner, Progress
 from worker.planners.threads import Steps, cut, run_parts
-from worker.simulation.simulation import HandState
+from worker.simulation.state import HandState
 
 _searches: Final = Kept(Search)
 

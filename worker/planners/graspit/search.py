@@ -17,8 +17,11 @@ from worker.planners.graspit.contacts import virtual_contacts
 from worker.planners.graspit.eigengrasps import Eigengrasps, eigengrasps
 from worker.planners.graspit.schedule import FIRST_STEP
 from worker.planners.threads import Steps
+from worker.simulation.data import Data
 from worker.simulation.device import to_wxyz, to_xyzw
-from worker.simulation.simulation import HandState, body_points, still_schedule
+from worker.simulation.model import body_points
+from worker.simulation.record import record_placement
+from worker.simulation.state import HandState
 
 Floats = NDArray[np.float64]
 
@@ -48,13 +51,12 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
     amplitudes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     q = eigen.posture(amplitudes, pair.hand.model)
     n = len(q)
-    probe = pair.simulation(pair.coarse, n)
-    probe.set_schedule(still_schedule())
-    probe.record_placement()
+    model = pair.model(pair.coarse)
+    data = Data(model, n)
     # Far from the object only the hand itself can be hit.
-    probe.set_state(HandState(np.tile([9.0, 0, 0], (n, 1)), np.tile([1.0, 0, 0, 0], (n, 1)), q))
-    probe.run()
-    depth = probe.self_depth.numpy()[:n]
+    data.set_state(HandState(np.tile([9.0, 0, 0], (n, 1)), np.tile([1.0, 0, 0, 0], (n, 1)), q))
+    record_placement(model, data).run()
+    depth = data.depths.links.numpy()[:n]
     return (depth > CLASH_M).astype(np.int32).reshape(CLASH_GRID, CLASH_GRID)
 
 

@@ -22,7 +22,7 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
 from worker.quality.referee.decomposition import decompose
-from worker.simulation.simulation import LossOptions
+from worker.simulation.model import LossOptions
 from worker.studies.chart import kernels
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import figures, plain

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from worker.planners.fast_graspd.pairs import Pair, Side
-from worker.simulation.obstacles import DeviceObstacles
-from worker.simulation.simulation import Simulation
+from worker.planners.fast_graspd.pairs import Pair
+from worker.simulation import record
+from worker.simulation.data import Data
+from worker.simulation.launches import Launches
+from worker.simulation.model import Model
 from worker.studies.chart import kernels
 
 
-@dataclass(frozen=True)
-class VariantPair(Pair):
-    """A pair whose simulations are of another kind."""
-
-    kind: type[Simulation]
-
-    def simulation(self, side: Side, capacity: int, obstacles: DeviceObstacles | None = None) -> Simulation:
-        return self.kind(
-            self.hand, side.obj, side.points, side.own, capacity=capacity, options=self.options, obstacles=obstacles
-        )
-
-
-class AskingEach(Simulation):
+class AskingEach(Pair):
     """Every simulated velocity asks for the distances anew; the answers are the same."""
 
-    def _record_kinematics(self) -> None:
-        super()._record_kinematics()
-        for _ in range(self.options.velocities - 1):
-            self.launches.add(kernels.forget, self.capacity, inputs=[self.active], outputs=[self.contacts])
-            self._record_gather()
+    def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
+        out = Launches(model.device)
+        record.add_poses(out, model, data)
+        record.add_distances(out, model, data)
+        for _ in range(model.options.velocities - 1):
+            out.add(kernels.forget, data.capacity, inputs=[data.active], outputs=[data.contacts.count])
+            record.add_distances(out, model, data)
+        record.add_contact(out, model, data)
+        record.add_penalties(out, model, data)
+        record.add_gradient(out, model, data)
+        record.add_step(out, model, data, optimizer, patience=patience)
+        return out
 
 
 def asking_each(pair: Pair) -> Pair:
     """The pair with a query for each velocity."""
-    return VariantPair(pair.coarse, pair.fine, pair.options, pair.hand, AskingEach)
+    return AskingEach(pair.coarse, pair.fine, pair.options, pair.hand)

@@ -17,9 +17,11 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import merits
-from worker.planners.fast_graspd.starts import RETREATS, sample_starts
+from worker.planners.fast_graspd.starts import sample_starts
+from worker.simulation.data import Data
 from worker.simulation.projection import Projection, ProjectionOptions
-from worker.simulation.simulation import HandState, Schedule
+from worker.simulation.record import record_iteration
+from worker.simulation.state import HandState, Schedule
 
 Floats = NDArray[np.float64]
 Say = Callable[[str], None]
@@ -67,18 +69,20 @@ def descend(
     """
     n = len(state.pivot)
     for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
-        simulation = pair.simulation(side, n)
+        model = pair.model(side)
+        data = Data(model, n)
         scaled = _scaled(schedule, rates, weights)
-        simulation.set_schedule(_lengthened(scaled, iterations) if side is pair.fine else scaled)
-        simulation.set_state(state)
-        simulation.record_iteration(optimizer)
-        simulation.run(len(schedule) if side is pair.coarse or iterations is None else iterations)
-        state = simulation.state(n)
+        data.set_schedule(_lengthened(scaled, iterations) if side is pair.fine else scaled)
+        data.set_state(state)
+        record_iteration(model, data, optimizer).run(
+            len(schedule) if side is pair.coarse or iterations is None else iterations
+        )
+        state = data.state(n)
     # The projection divides quaternions by their length: what the descent did to it is told before.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     # No steps: this only tells how deep each hand is.
-    _, depths = Projection(simulation, ProjectionOptions()).run(state, 0)
-    state, _ = Projection(simulation, ProjectionOptions()).run(state, fidelity.polish_iterations)
+    _, depths = Projection(model, data, ProjectionOptions()).run(state, 0)
+    state, _ = Projection(model, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
     return Descent(state, depths, drift)
 
 
@@ -167,9 +171,7 @@ _BOUNDS: Final = (
 
 def starts_of(pair: Pair, count: int) -> HandState:
     """Starts as the planner draws them."""
-    hand, obj = pair.hand.model, pair.fine.obj.model
-    probe = pair.simulation(pair.coarse, count * len(RETREATS))
-    return sample_starts(hand, obj, probe, seed=11, batch=0, indices=range(count), each=1)
+    return sample_starts(pair.model(pair.coarse), seed=11, batch=0, indices=range(count), each=1)
 
 
 def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | str) -> list[MapCell]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from service.model.stability import MapCell, StabilityMap, graded, reachable
 from worker.simulation import reference
 from worker.simulation.kernels import contact
+from worker.simulation.model import initial_motions
 from worker.simulation.reference import Contacts, World
-from worker.simulation.simulation import initial_motions
 
 Floats = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from service.model.stability import MapCell, StabilityMap, graded, reachable, short
 from worker.simulation import reference
+from worker.simulation.model import LossOptions
 from worker.simulation.reference import Contacts, World
-from worker.simulation.simulation import LossOptions
 
 Floats = NDArray[np.float64]
 #: From contacts (of which the distances are the present ones), free motion and world to the motion that is allowed.

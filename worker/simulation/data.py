@@ -1,0 +1,159 @@
+"""The data of a simulation: arrays for a capacity of hands, and the tables that tell what each iteration takes.
+
+All per-iteration values (dilation, weights, rates) lie in tables on the device, read at a counter on the device, so an
+iteration is the same list of launches each time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.simulation.device import to_wxyz, to_xyzw
+from worker.simulation.kernels import contact
+from worker.simulation.model import MAX_DILATION, Model
+from worker.simulation.state import Floats, HandState, Schedule, still_schedule
+
+
+class Tables:
+    """A schedule on the device."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self.dilation = wp.array(schedule.dilation, dtype=wp.float32)
+        self.penetration = wp.array(schedule.penetration, dtype=wp.float32)
+        self.object_penetration = wp.array(schedule.object_penetration, dtype=wp.float32)
+        self.self_penetration = wp.array(schedule.self_penetration, dtype=wp.float32)
+        self.rates = wp.array(schedule.rates, dtype=wp.float32)
+
+
+class Contacts:
+    """Candidate contacts (B, N), those of a hand packed at the front; `gradient` is dL/d distance."""
+
+    def __init__(self, capacity: int, points: int) -> None:
+        shape = (capacity, points)
+        self.count = wp.zeros(capacity, dtype=wp.int32)
+        self.body = wp.zeros(shape, dtype=wp.int32)
+        self.point = wp.zeros(shape, dtype=wp.vec3)
+        self.normal = wp.zeros(shape, dtype=wp.vec3)
+        self.distance = wp.zeros(shape, dtype=wp.float32)
+        self.weight = wp.zeros(shape, dtype=wp.float32)
+        self.gradient = wp.zeros(shape, dtype=wp.float32)
+
+
+class Depths:
+    """Deepest penetrations (B,) at the last evaluation [m]."""
+
+    def __init__(self, capacity: int) -> None:
+        self.points = wp.zeros(capacity, dtype=wp.float32)
+        """Of hand points in the object."""
+        self.object = wp.zeros(capacity, dtype=wp.float32)
+        """Of the object in links."""
+        self.links = wp.zeros(capacity, dtype=wp.float32)
+        """Of links in links."""
+        self.obstacles = wp.zeros(capacity, dtype=wp.float32)
+        """What a hand lacks of its distance from obstacles."""
+
+
+class Data:
+    """Up to `capacity` hands of a model; see `worker.simulation.record` for what is done with them."""
+
+    def __init__(self, model: Model, capacity: int) -> None:
+        self.device, self.capacity = model.device, capacity
+        with wp.ScopedDevice(self.device):
+            self.contacts = Contacts(capacity, model.count)
+            self.depths = Depths(capacity)
+            self.schedule = Tables(still_schedule())
+            self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
+            self.states = _solver_states(model, capacity)
+
+    def _allocate(self, B: int, L: int, D: int, M: int) -> None:
+        self.active = wp.ones(B, dtype=wp.int32)
+        self.iteration = wp.zeros(1, dtype=wp.int32)
+        self.dilation_scale = wp.ones(B, dtype=wp.float32)
+        self.scene = wp.full(B, -1, dtype=wp.int32)
+        self.pivot = wp.zeros(B, dtype=wp.vec3)
+        self.rotation = wp.zeros(B, dtype=wp.quat)
+        self.q = wp.zeros((B, D), dtype=wp.float32)
+        self.body_p = wp.zeros((B, L), dtype=wp.vec3)
+        self.body_q = wp.zeros((B, L), dtype=wp.quat)
+        self.axis = wp.zeros((B, L), dtype=wp.vec3)
+        self.force = wp.zeros((B, L), dtype=wp.vec3)
+        self.torque = wp.zeros((B, L), dtype=wp.vec3)
+        self.loss = wp.zeros((B, M), dtype=wp.float32)
+        self.end = wp.zeros((B, M), dtype=contact.vec6)
+        self.gradient = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.first = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.second = wp.zeros((B, 6 + D), dtype=wp.float32)
+        self.best = wp.zeros(B, dtype=wp.float32)
+        self.waited = wp.zeros(B, dtype=wp.int32)
+
+    def set_state(
+        self, state: HandState, active: NDArray[np.bool_] | None = None, dilation: Floats | None = None
+    ) -> None:
+        """Load up to `capacity` hands; the rest of the capacity is switched off. Optimiser moments are cleared.
+
+        `dilation` (n,) multiplies the schedule's dilation for each hand; 1 where it is not given.
+        """
+        n = len(state.pivot)
+        scale = np.ones(self.capacity, dtype=np.float32)
+        if dilation is not None:
+            scale[:n] = dilation
+        self.dilation_scale.assign(scale)
+        mask = np.zeros(self.capacity, dtype=np.int32)
+        mask[:n] = 1 if active is None else active
+        self._assign(self.pivot, state.pivot)
+        self._assign(self.rotation, to_xyzw(state.rotation))
+        self._assign(self.q, state.q)
+        self.active.assign(mask)
+        self.iteration.zero_()
+        self.first.zero_()
+        self.second.zero_()
+        self.best.fill_(1e9)
+        self.waited.zero_()
+
+    def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
+        """The scene (n,) of each hand, among those of the model's obstacles; -1: none. It stays when states change."""
+        padded = np.full(self.capacity, -1, dtype=np.int32)
+        padded[: len(index)] = index
+        self.scene.assign(padded)
+
+    def set_schedule(self, schedule: Schedule) -> None:
+        """Upload the per-iteration tables; what was recorded before goes on with those it was recorded with.
+
+        Raises:
+            ValueError: a dilation above `MAX_DILATION`.
+        """
+        if len(schedule) and schedule.dilation.max() > MAX_DILATION:
+            raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
+        with wp.ScopedDevice(self.device):
+            self.schedule = Tables(schedule)
+
+    def deepest(self, n: int) -> Floats:
+        """(n,) deepest penetration of each hand at the last evaluation, of all kinds [m]."""
+        kinds = (self.depths.points, self.depths.object, self.depths.links, self.depths.obstacles)
+        return np.max([kind.numpy()[:n] for kind in kinds], axis=0)
+
+    def state(self, n: int) -> HandState:
+        """The first n hands, in float64."""
+        return HandState(
+            self.pivot.numpy()[:n].astype(float),
+            to_wxyz(self.rotation.numpy()[:n].astype(float)),
+            self.q.numpy()[:n].astype(float),
+        )
+
+    def _assign(self, array: Any, values: Floats) -> None:
+        padded = np.zeros((self.capacity, values.shape[1]), dtype=np.float32)
+        padded[: len(values)] = values
+        array.assign(padded)
+
+
+def _solver_states(model: Model, capacity: int) -> Any:
+    """Motions that a contact solver keeps for its reverse sweep; None: it keeps none."""
+    options = model.options
+    if options.contact_solver == "direct":
+        return None
+    kept = model.count if options.contact_solver == "gauss_seidel" else options.passes
+    return wp.zeros((capacity, options.velocities, kept), dtype=contact.vec6)

@@ -1,0 +1,166 @@
+"""The model of a simulation: all that does not change while hands move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from worker.hands.model import SurfacePoints
+from worker.simulation.device import DeviceHand, DeviceObject
+from worker.simulation.kernels import contact, pieces
+from worker.simulation.obstacles import DeviceObstacles
+
+Floats = NDArray[np.float64]
+
+#: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on how many points.
+REFERENCE_POINTS: Final = 800
+#: Weight of one object sample is 1 at this many samples.
+REFERENCE_SAMPLES: Final = 2000
+#: Weight of one hand point against other links is 1 at this many.
+REFERENCE_SELF_POINTS: Final = 1000
+#: Kernels of the contact step by their names.
+SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
+#: Largest dilation a schedule may ask for [m].
+MAX_DILATION: Final = 0.1
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """What is simulated and penalised; see `worker.simulation.kernels.contact` for the symbols."""
+
+    contact_solver: str = "direct"
+    velocities: int = 7
+    friction: float = 0.8
+    stiffness: float = 1.0
+    passes: int = 4
+    step: float = 1e-3
+    """Free motion of the object in one step, v dt [m]."""
+    leak: float = 0.1
+    leak_length: float = 0.02
+    one_sided: bool = True
+    band: float = 0.03
+    """Points farther than dilation + band from the surface take no part [m]."""
+    exact_below: float = 0.004
+    """Nearer than this distances are asked of the mesh, farther of the grid [m]."""
+    range_weight: float = 0.005
+    limit_weight: float = 0.0
+    self_margin: float = 1e-3
+    simulate: bool = True
+    """False: no simulation; every point near the object is drawn to it. A control for benchmarks."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A hand with one set of points and an object on a device, and how they are simulated."""
+
+    hand: DeviceHand
+    obj: DeviceObject
+    options: LossOptions
+    obstacles: DeviceObstacles | None
+    """What the hands must stay clear of; None: nothing."""
+    count: int
+    """Hand points."""
+    point_body: Any
+    point_position: Any
+    point_weight: Any
+    body_points: Any
+    """Points tested against other links."""
+    self_scale: float
+    """Weight of one of them."""
+    physics: Any
+    motions: Any
+    """(M,) free motions of the object."""
+
+    @staticmethod
+    def create(
+        hand: DeviceHand, obj: DeviceObject, points: SurfacePoints, self_points: SurfacePoints, options: LossOptions,
+        obstacles: DeviceObstacles | None = None,
+    ) -> Model:  # fmt: skip
+        """Upload the points to the hand's device.
+
+        Raises:
+            InputError: unknown contact solver.
+        """
+        if options.contact_solver not in SOLVERS:
+            raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(SOLVERS)}")
+        weight = points.area * (REFERENCE_POINTS / points.area.sum())
+        motions = initial_motions(options.velocities, options.step, obj.model.gyration_radius)
+        with wp.ScopedDevice(hand.device):
+            return Model(
+                hand=hand, obj=obj, options=options, obstacles=obstacles, count=len(points),
+                point_body=wp.array(points.body, dtype=wp.int32),
+                point_position=wp.array(points.position, dtype=wp.vec3),
+                point_weight=wp.array(weight, dtype=wp.float32),
+                body_points=body_points(self_points, hand.model.bodies),
+                self_scale=REFERENCE_SELF_POINTS / max(len(self_points), 1),
+                physics=_physics(obj, options), motions=wp.array(motions, dtype=contact.vec6),
+            )  # fmt: skip
+
+    @property
+    def device(self) -> str:
+        return self.hand.device
+
+    @property
+    def dofs(self) -> int:
+        return self.hand.model.dofs
+
+    @property
+    def bodies(self) -> int:
+        return self.hand.model.bodies
+
+    @property
+    def pieces(self) -> int:
+        return len(self.hand.model.pieces)
+
+
+def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
+    """(M, 6) free motions of the object: at rest, then +-x, +-y, +-z, then (13) the same for rotations."""
+    rows = [np.zeros(6)]
+    for axis in range(3 if velocities == 7 else 6):
+        for sign in (1.0, -1.0):
+            motion = np.zeros(6)
+            motion[axis] = sign * (step if axis < 3 else step / gyration)
+            rows.append(motion)
+    return np.array(rows)
+
+
+def body_points(points: SurfacePoints, bodies: int) -> Any:
+    """The points sorted by body, with bounding spheres."""
+    order = np.argsort(points.body, kind="stable")
+    body, position = points.body[order], points.position[order]
+    first = np.searchsorted(body, np.arange(bodies + 1))
+    centre, radius = np.zeros((bodies, 3)), np.zeros(bodies)
+    for k in range(bodies):
+        own = position[first[k] : first[k + 1]]
+        if len(own):
+            centre[k] = (own.min(axis=0) + own.max(axis=0)) / 2
+            radius[k] = np.linalg.norm(own - centre[k], axis=1).max()
+    out = pieces.BodyPoints()
+    out.first = wp.array(first, dtype=wp.int32)
+    out.position = wp.array(position, dtype=wp.vec3)
+    out.centre = wp.array(centre, dtype=wp.vec3)
+    out.radius = wp.array(radius, dtype=wp.float32)
+    return out
+
+
+def _physics(obj: DeviceObject, options: LossOptions) -> Any:
+    mass = np.zeros((6, 6))
+    mass[:3, :3] = np.eye(3)
+    mass[3:, 3:] = obj.model.inertia
+    physics = contact.Physics()
+    physics.mass = contact.mat66(*mass.ravel().tolist())
+    physics.inverse_mass = contact.mat66(*np.linalg.inv(mass).ravel().tolist())
+    physics.gyration = obj.model.gyration_radius
+    physics.friction = options.friction
+    physics.stiffness = options.stiffness
+    physics.leak = options.leak
+    physics.leak_length = options.leak_length
+    physics.one_sided = int(options.one_sided)
+    physics.step = options.step
+    physics.radius = obj.model.radius + options.band + MAX_DILATION
+    return physics

@@ -1,0 +1,172 @@
+"""What is done with hands, as launches: one iteration is the gradient of the loss, then a step.
+
+`record_*` fixes a whole list for the data's present schedule; `add_*` appends one part of it. Nothing leaves
+the device.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from service.model.errors import InputError
+from worker.simulation.data import Data
+from worker.simulation.kernels import kinematics, obstacles, optimizers, penalties, pieces, surface
+from worker.simulation.launches import Launches
+from worker.simulation.model import REFERENCE_SAMPLES, SOLVERS, Model
+
+#: Names that `record_iteration` knows.
+OPTIMIZERS: Final = ("adam", "gd")
+
+
+def record_placement(m: Model, d: Data, *, room: float = 0.0) -> Launches:
+    """Contacts and penetration depths only; `room` is the distance to keep besides each feature's margin [m]."""
+    out = Launches(m.device)
+    add_poses(out, m, d)
+    add_distances(out, m, d)
+    add_penalties(out, m, d, room=room)
+    return out
+
+
+def record_evaluation(m: Model, d: Data) -> Launches:
+    """Loss and gradient of the state, without a step."""
+    out = Launches(m.device)
+    add_poses(out, m, d)
+    add_distances(out, m, d)
+    add_contact(out, m, d)
+    add_penalties(out, m, d)
+    add_gradient(out, m, d)
+    return out
+
+
+def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) -> Launches:
+    """One iteration: gradient and step.
+
+    With a `patience`, a grasp that has not improved for so many iterations is switched off and costs nothing more.
+
+    Raises:
+        InputError: unknown optimizer.
+    """
+    out = record_evaluation(m, d)
+    add_step(out, m, d, optimizer, patience=patience)
+    return out
+
+
+def add_poses(out: Launches, m: Model, d: Data) -> None:
+    """Poses of all bodies; what an iteration accumulates is set to zero."""
+    out.add(
+        kinematics.forward, d.capacity,
+        inputs=[m.hand.tree, d.active, d.pivot, d.rotation, d.q],
+        outputs=[d.body_p, d.body_q, d.axis, d.force, d.torque, d.contacts.count, d.depths.points, d.depths.object,
+                 d.depths.links],
+    )  # fmt: skip
+
+
+def add_distances(out: Launches, m: Model, d: Data) -> None:
+    """Candidate contacts: hand points near the object, their distances and normals."""
+    c = d.contacts
+    out.add(
+        surface.gather, (d.capacity, m.count),
+        inputs=[m.obj.surface, m.options.band, m.options.exact_below, m.point_body, m.point_position, m.point_weight,
+                d.active, d.iteration, d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q],
+        outputs=[c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient],
+    )  # fmt: skip
+
+
+def add_contact(out: Launches, m: Model, d: Data) -> None:
+    """The contact step and its gradient with respect to distances, or what stands in for it."""
+    o, c = m.options, d.contacts
+    if not o.simulate:
+        out.add(
+            penalties.attract, (d.capacity, m.count),
+            inputs=[o.leak, o.leak_length, d.active, c.count, c.distance, c.weight], outputs=[c.gradient],
+        )  # fmt: skip
+        return
+    kept = [] if d.states is None else [d.states]
+    out.add(
+        SOLVERS[o.contact_solver], (d.capacity, o.velocities),
+        inputs=[m.physics, m.motions, o.passes, d.active, d.iteration, d.schedule.dilation, d.dilation_scale,
+                c.count, c.point, c.normal, c.distance, c.weight],
+        outputs=[*kept, d.loss, d.end, c.gradient],
+    )  # fmt: skip
+
+
+def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> None:
+    """Penetrations, and the way of the gradient from points to bodies."""
+    add_object_penalty(out, m, d)
+    add_self_penalty(out, m, d, m.options.self_margin)
+    c, wrench = d.contacts, [d.force, d.torque]
+    out.add(
+        penalties.points_to_bodies, (d.capacity, m.count),
+        inputs=[0.0, d.active, d.iteration, d.schedule.penetration, c.count, c.body, c.point, c.normal, c.distance,
+                c.weight, c.gradient],
+        outputs=[*wrench, d.depths.points],
+    )  # fmt: skip
+    if m.obstacles is not None:
+        out.add(obstacles.clear, d.capacity, inputs=[d.active], outputs=[d.depths.obstacles])
+        out.add(
+            obstacles.penalty, (d.capacity, m.obstacles.count),
+            inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, d.iteration, d.schedule.penetration,
+                    d.body_p, d.body_q, room],
+            outputs=[*wrench, d.depths.obstacles],
+        )  # fmt: skip
+
+
+def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
+    """The object's samples inside links."""
+    samples = m.obj.samples
+    out.add(
+        pieces.object_in_pieces, (d.capacity, m.pieces),
+        inputs=[m.hand.pieces, m.obj.bvh.id, samples, REFERENCE_SAMPLES / len(samples),
+                d.active, d.iteration, d.schedule.object_penetration, d.body_p, d.body_q],
+        outputs=[d.force, d.torque, d.depths.object],
+    )  # fmt: skip
+
+
+def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
+    """Links inside links, or nearer than `margin` [m]."""
+    out.add(
+        pieces.pieces_in_pieces, (d.capacity, m.pieces),
+        inputs=[m.hand.pieces, m.body_points, m.self_scale, margin,
+                d.active, d.iteration, d.schedule.self_penetration, d.body_p, d.body_q],
+        outputs=[d.force, d.torque, d.depths.links],
+    )  # fmt: skip
+
+
+def add_root_gradient(out: Launches, m: Model, d: Data) -> None:
+    """The gradient with respect to root and joints, from what bodies accumulated."""
+    out.add(
+        kinematics.backward, d.capacity,
+        inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis], outputs=[d.force, d.torque, d.gradient],
+    )  # fmt: skip
+
+
+def add_gradient(out: Launches, m: Model, d: Data) -> None:
+    """The whole gradient: of what bodies accumulated, and of the joints' penalties."""
+    add_root_gradient(out, m, d)
+    o = m.options
+    out.add(
+        penalties.joints, (d.capacity, m.dofs),
+        inputs=[m.hand.lower, m.hand.upper, o.range_weight, o.limit_weight, d.active, d.q], outputs=[d.gradient],
+    )  # fmt: skip
+
+
+def add_step(
+    out: Launches, m: Model, d: Data, optimizer: str, *, betas: tuple[float, float] = (0.9, 0.99), patience: int = 0
+) -> None:
+    """A step of the optimizer, and on to the next iteration; see `record_iteration`."""
+    if optimizer not in OPTIMIZERS:
+        raise InputError(f"unknown optimizer {optimizer!r}; choose one of {', '.join(OPTIMIZERS)}")
+    inputs = [m.hand.lower, m.hand.upper, d.active, d.iteration, d.schedule.rates, d.gradient]
+    state = [d.pivot, d.rotation, d.q]
+    if optimizer == "adam":
+        out.add(optimizers.adam, d.capacity, inputs=[*inputs, *betas], outputs=[d.first, d.second, *state])
+    else:
+        clamp = int(m.options.limit_weight == 0.0)
+        out.add(optimizers.gradient_descent, d.capacity, inputs=[*inputs, clamp], outputs=state)
+    if patience:
+        out.add(
+            optimizers.converge, d.capacity,
+            inputs=[d.loss, d.depths.points, d.depths.object, d.depths.links, patience],
+            outputs=[d.best, d.waited, d.active],
+        )  # fmt: skip
+    out.add(optimizers.advance, 1, inputs=[], outputs=[d.iteration])
