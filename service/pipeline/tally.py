@@ -7,28 +7,19 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from typing import Final, Protocol
+from collections.abc import Iterable
+from typing import Final
 
 from pydantic_core import from_json
 
 from service.model.domain import State
 from service.pipeline.series import SERIES, STAGE_BUCKETS_S
+from service.queue.port import Counters
 from service.store.manifests import ShardManifest
 
 #: Names of errors that get a series of their own; more than an engine raises, and a bound if somebody forges them.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
-
-
-class Counters(Protocol):
-    """Sums by name that outlive this process."""
-
-    def count(self, amounts: Mapping[str, float]) -> None:
-        """Add to them."""
-
-    def counted(self) -> dict[str, float]:
-        """All of them."""
 
 
 class Tally:

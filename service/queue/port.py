@@ -1,4 +1,4 @@
-"""The queue as the rest of graspd sees it: tasks in, leases and events out. Adapters: `rq_queue`, `memory`."""
+"""The queue as the rest of graspd sees it: tasks in, leases and events out. Adapter: `rq_queue`."""
 
 from __future__ import annotations
 
@@ -89,14 +89,8 @@ class Lease:
     """What was asked of the worker; None if Redis no longer knows."""
 
 
-class TaskQueue(Protocol):
-    """Carries tasks to workers and their events back. Every method raises QueueUnavailable when Redis is away.
-
-    Nothing here is the truth: whatever is lost is queued again from the index.
-    """
-
-    def ping(self) -> float:
-        """Seconds a round trip takes."""
+class Tasks(Protocol):
+    """Tasks to workers, and who holds which."""
 
     def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
         """Append tasks to a lane. A task (by id and attempt) that already waits or runs is not queued twice.
@@ -123,8 +117,9 @@ class TaskQueue(Protocol):
     def release(self, lease: Lease) -> None:
         """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
 
-    def workers(self) -> list[WorkerBeat]:
-        """Workers that gave a sign of life within the last lease."""
+
+class Events(Protocol):
+    """A bounded stream of what happened: one keeper consumes it, any number of readers follow it."""
 
     def publish(self, event: Event) -> None:
         """Append to the bounded stream of events."""
@@ -137,6 +132,13 @@ class TaskQueue(Protocol):
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Events after an id, for any number of readers (SSE). `"$"`: only what comes from now on; `"0"`: all kept."""
+
+
+class Presence(Protocol):
+    """Who is there, and how much waits for them: workers, and parts of the service."""
+
+    def workers(self) -> list[WorkerBeat]:
+        """Workers that gave a sign of life within the last lease."""
 
     def announce(self, part: str, seconds: float) -> None:
         """Say that a part of the service (the keeper) lives, for that long."""
@@ -151,11 +153,25 @@ class TaskQueue(Protocol):
             lease_s: how long a worker's registration outlives its beat [s].
         """
 
+
+class Counters(Protocol):
+    """Sums by name that outlive the processes that add to them."""
+
     def count(self, amounts: Mapping[str, float]) -> None:
         """Add to sums that outlive this process."""
 
     def counted(self) -> dict[str, float]:
         """All those sums."""
+
+
+class TaskQueue(Tasks, Events, Presence, Counters, Protocol):
+    """All of the queue, and its connections. Every method raises QueueUnavailable when Redis is away.
+
+    Nothing here is the truth: whatever is lost is queued again from the index. Who needs a part of it takes that port.
+    """
+
+    def ping(self) -> float:
+        """Seconds a round trip takes."""
 
     def tidy(self) -> None:
         """Throw away what dead workers and refused entries left behind."""

@@ -18,6 +18,7 @@ import httpx
 from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
 from service.pipeline.keeper import PART as KEEPER
 from service.queue.address import redis_url
+from service.queue.port import Presence
 from service.queue.rq_queue import open_queue
 from service.run.address import forget_address, record_address
 from service.run.children import Child, end_leftovers
@@ -124,10 +125,7 @@ class Supervisor:
             self._thread = None
         self._release()
 
-    def _missing(self, queue: object) -> list[str]:
-        from service.queue.rq_queue import RqQueue
-
-        assert isinstance(queue, RqQueue)
+    def _missing(self, queue: Presence) -> list[str]:
         missing = []
         try:
             if not queue.announced(KEEPER):

@@ -28,7 +28,7 @@ from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob, AllowedQueue
-from service.queue.port import Event, EventKind
+from service.queue.port import Event, EventKind, Events
 from service.queue.rq_queue import RqQueue, open_queue, queue_names, worker_key
 from service.settings import Settings
 from service.store.store import Store, open_store
@@ -243,8 +243,8 @@ class Surroundings:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
-    def context(self, raw: Mapping[str, Any], queue: RqQueue, worker: str) -> TaskContext:
-        """The context of a task, which tells its progress to the queue."""
+    def context(self, raw: Mapping[str, Any], events: Events, worker: str) -> TaskContext:
+        """The context of a task, which tells its progress as events."""
 
         def tell(done: float, total: float, message: str) -> None:
             event = Event(
@@ -261,7 +261,7 @@ class Surroundings:
                 message=message[:200],
             )
             try:
-                queue.publish(event)
+                events.publish(event)
             except QueueUnavailable:
                 log.debug("nobody could be told about the progress of %s", raw["task_id"])
 

@@ -15,7 +15,7 @@ from service.model.clock import timestamp
 from service.model.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.model.worker_beat import WorkerBeat
 from service.queue.allowed import AllowedJob, AllowedQueue
-from service.queue.port import BULK_EVERY, Event, EventKind, TaskQueue
+from service.queue.port import BULK_EVERY, Counters, Event, EventKind, TaskQueue
 from service.queue.rq_queue import RqQueue, queue_names, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
@@ -297,6 +297,25 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) 
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert queue.announced("keeper")
+
+
+def test_sums_add_up_and_each_name_has_its_own(sides: tuple[TaskQueue, Worker]) -> None:
+    counters: Counters = sides[0]
+    counters.count({"a": 1.5, "b": 2.0})
+    counters.count({"a": 1.0})
+    assert counters.counted() == {"a": 2.5, "b": 2.0}
+
+
+def test_what_waits_is_told_by_lane_and_stage(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, _ = sides
+    queue.enqueue([task("x"), task("y"), task("z", stage=Stage.RENDER)], Lane.BULK)
+    shown = queue.now(lease_s=6.0)
+    assert {place: depth for place, depth in shown.depth.items() if depth} == {
+        (Lane.BULK, Stage.SYNTHESIZE): 2,
+        (Lane.BULK, Stage.RENDER): 1,
+    }
+    assert shown.depth == queue.depths()
+    assert not any(shown.running.values())
 
 
 def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redis_server: str) -> None:
