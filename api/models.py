@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.index.views import AttemptView, GraspView, ShardView, StageProgress, WorkerView
 from service.model.domain import JobRequest, Stage, State
+from service.model.metric_fields import OfferedName, filters, means, with_fields
 
 
 class StageStatus(StageProgress):
@@ -42,13 +43,13 @@ class Job(BaseModel):
     stages: list[StageStatus]
 
 
+@with_fields(last=means())
 class MeanMetrics(BaseModel):
     """Means over the valid grasps of a job; absent while there are none."""
 
-    epsilon: float | None = None
-    contact_area_cm2: float | None = None
-    intersection_volume_cm3: float | None = None
-    penetration_depth_mm: float | None = None
+    if TYPE_CHECKING:
+
+        def __getattr__(self, metric: str) -> float | None: ...
 
 
 class Shard(ShardView):
@@ -71,9 +72,7 @@ class JobDetail(Job):
     shards: list[Shard]
 
 
-Bound = Annotated[float | None, Field(ge=0, allow_inf_nan=False)]
-
-
+@with_fields(sort=filters())
 class GraspQuery(BaseModel):
     """Filters and order of a list of grasps. A range leaves out grasps whose metric is unknown."""
 
@@ -84,15 +83,7 @@ class GraspQuery(BaseModel):
     object: str | None = Field(None, max_length=64)
     valid: bool | None = None
     success: bool | None = None
-    min_epsilon: Bound = None
-    max_epsilon: Bound = None
-    min_contact_area_cm2: Bound = None
-    max_contact_area_cm2: Bound = None
-    min_intersection_volume_cm3: Bound = None
-    max_intersection_volume_cm3: Bound = None
-    min_penetration_depth_mm: Bound = None
-    max_penetration_depth_mm: Bound = None
-    sort: Literal["epsilon", "contact_area_cm2", "intersection_volume_cm3", "penetration_depth_mm"] = "epsilon"
+    sort: OfferedName = "epsilon"
     order: Literal["asc", "desc"] = "desc"
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 from api.models import GraspDetail, Posture, Push
 from service.index.views import GraspView, ShardView
 from service.model.errors import InputError, NotFoundError
+from service.model.metrics import GRASP_METRICS
 from service.store.integrity import read_checked
 from service.store.shards import SCHEMAS, Shard, read_shard
 from service.store.store import Store
@@ -17,7 +18,6 @@ from service.store.store import Store
 #: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.
 _KEPT_SHARDS: Final = 64
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-_SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
 _OUTCOME: Final = "quality/verdict_outcome"
 #: What the numbers of the column mean, as its description in the schema says.
 OUTCOMES: Final = {
@@ -49,7 +49,11 @@ class GraspFiles:
             joint_names=_texts(file.attributes.get("joint_names")),
             postures={name: _posture(file, name, row) for name in _POSTURES},
             thresholds_m=_numbers(file["quality/thresholds_m"]),
-            sweep={name: _numbers(file[f"quality/{name}"][row]) for name in _SWEPT},
+            sweep={
+                metric.name: _numbers(file[metric.path][row])
+                for metric in GRASP_METRICS
+                if metric.swept and metric.path in file.arrays
+            },
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
             audit=_verdict(file, "quality/audit", row),

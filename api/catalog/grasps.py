@@ -8,15 +8,11 @@ from api.catalog.grasp_files import GraspFiles
 from api.models import GraspDetail, GraspQuery, Histogram, JobDetail
 from service.index.filters import GraspFilter, GraspSort, Metric
 from service.index.views import GraspView, JobView, Page
+from service.model.metrics import Indexed, indexed
 from service.pipeline.backends import Parts
 
 _KEPT_HISTOGRAMS: Final = 256
-MEAN_METRICS: Final[tuple[Metric, ...]] = (
-    "epsilon",
-    "contact_area_cm2",
-    "intersection_volume_cm3",
-    "penetration_depth_mm",
-)
+MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(Indexed.OFFERED))
 
 
 class Grasps:

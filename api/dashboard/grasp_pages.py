@@ -15,17 +15,15 @@ from api.models import GraspDetail, GraspQuery
 from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, may_read
 from api.routes.paging import next_address
 from service.model.domain import AssetKind
+from service.model.metrics import GRASP_METRICS, Indexed, indexed
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 #: Sort key, label, unit of the metrics that lists of grasps show.
-COLUMNS: Final = (
-    ("epsilon", "ε", ""),
-    ("contact_area_cm2", "Contact area", "cm²"),
-    ("intersection_volume_cm3", "Intersection", "cm³"),
-    ("penetration_depth_mm", "Penetration", "mm"),
-)
+COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(Indexed.OFFERED))
 #: Metrics of which less is better: a first click sorts them upwards.
-_LESS_IS_BETTER: Final = frozenset({"intersection_volume_cm3", "penetration_depth_mm"})
+_LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
+#: Metrics that stand beside the verdict of a grasp.
+_BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness"})
 
 router = APIRouter(include_in_schema=False)
 
@@ -56,6 +54,7 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: As
         rows=rows,
         models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
+        limits={metric.name: metric.limits for metric in indexed(Indexed.OFFERED)},
         sort=query.sort,
         sorts=[(key, label) for key, label, _ in COLUMNS],
         order=query.order,
@@ -81,19 +80,16 @@ def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shar
         shard=shard,
         job=shards.job_of(shard_id),
         metrics=_metrics(grasp),
+        swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
         loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
     )
 
 
 def _metrics(grasp: GraspDetail) -> list[tuple[str, float | None, str]]:
     return [
-        ("ε (Ferrari-Canny)", grasp.epsilon, ""),
-        ("Wrench space volume", grasp.wrench_volume, ""),
-        ("Contact area", grasp.contact_area_cm2, "cm²"),
-        ("Intersection volume", grasp.intersection_volume_cm3, "cm³"),
-        ("Penetration", grasp.penetration_depth_mm, "mm"),
-        ("Self-penetration", grasp.self_penetration_depth_mm, "mm"),
-        ("Stability loss", grasp.stability_loss, ""),
+        (metric.title, getattr(grasp, metric.name), metric.unit)
+        for metric in indexed()
+        if metric.name not in _BESIDE_VERDICT
     ]
 
 

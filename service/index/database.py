@@ -18,6 +18,7 @@ from sqlalchemy import Connection, Engine, Table, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
+from service.index.metric_columns import add_missing
 from service.index.sqlite_file import Identity, SqliteFile
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
@@ -226,6 +227,8 @@ def _migrate(engine: Engine) -> None:
     try:
         with _migrating(engine) as config:
             command.upgrade(config, "head")
+            if added := add_missing(config.attributes["connection"]):
+                log.info("the index has new columns of grasps: %s", ", ".join(added))
     except CommandError as error:
         raise IndexUnavailable(
             f"the index was made by another version of graspd ({_line(error)}); use that version, or run its "

@@ -7,16 +7,9 @@ from typing import Literal
 from pydantic import Field
 
 from service.model.domain import Model
+from service.model.metric_fields import SortedName
 
-Metric = Literal[
-    "epsilon",
-    "wrench_volume",
-    "contact_area_cm2",
-    "intersection_volume_cm3",
-    "penetration_depth_mm",
-    "self_penetration_depth_mm",
-    "stability_loss",
-]
+Metric = SortedName
 
 
 class GraspFilter(Model):

@@ -1,6 +1,7 @@
 """Tables of the index. `LIVE_COLUMNS` hold the present moment (progress, queue marks); the rest follows from the store.
 
-A change here needs a migration in `migrations/versions`; a test compares the two.
+A change here needs a migration in `migrations/versions`; a test compares the two. Metrics of grasps need none: see
+`metric_columns`.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 from typing import Final
 
 from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text
+
+from service.model.metrics import Indexed, indexed
 
 metadata: Final = MetaData()
 
@@ -123,15 +126,8 @@ shards: Final = Table(
     Index("shards_made", "created", "kind", "count", "valid", "seconds"),
 )
 
-METRICS: Final = (
-    "epsilon",
-    "wrench_volume",
-    "contact_area_cm2",
-    "intersection_volume_cm3",
-    "penetration_depth_mm",
-    "self_penetration_depth_mm",
-    "stability_loss",
-)
+#: Metrics by which grasps are bounded and sorted.
+METRICS: Final = tuple(metric.name for metric in indexed(Indexed.SORTED))
 
 grasps: Final = Table(
     "grasps",
@@ -140,12 +136,10 @@ grasps: Final = Table(
     Column("row", Integer, primary_key=True),
     Column("hand", String(64), nullable=False),
     Column("object", String(64), nullable=False),
-    *(Column(name, Float) for name in METRICS),
-    Column("contact_links", Integer),
+    *(Column(metric.name, Integer if metric.whole else Float) for metric in indexed()),
     Column("valid", Boolean, nullable=False),
     Column("success", Boolean),
     Column("verdict_level", String(12)),
-    Column("robustness", Float),
     Column("created", String(32), nullable=False),
     *(Index(f"grasps_{name}", name, "shard_id", "row") for name in (*METRICS, "created")),
     Index("grasps_by_pair", "hand", "object", "epsilon", "shard_id", "row"),

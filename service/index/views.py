@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.model.metric_fields import values, with_fields
 
 T = TypeVar("T")
 
@@ -129,6 +130,7 @@ class ShardView(View):
     manifest: dict[str, Any] = Field(default_factory=dict, description="whole, only in `get_shard`")
 
 
+@with_fields(valid=values(optional=False), created=values(optional=True))
 class GraspView(View):
     """One grasp with the quality that the index holds; the contact thresholds are those of the manifest (5 mm)."""
 
@@ -136,19 +138,14 @@ class GraspView(View):
     row: int
     hand: str
     object: str
-    epsilon: float | None
-    wrench_volume: float | None
-    contact_area_cm2: float | None
-    intersection_volume_cm3: float | None
-    penetration_depth_mm: float | None
-    self_penetration_depth_mm: float | None
-    stability_loss: float | None
-    contact_links: int | None
     valid: bool
     success: bool | None = Field(description="verdict of the referee; None: not tested")
     verdict_level: str | None = Field(description="level of the referee that gave it")
-    robustness: float | None = Field(description="share of verdicts that survive 1 mm and 1 degree of noise")
     created: str
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, metric: str) -> float | None: ...
 
 
 class AssetView(View):

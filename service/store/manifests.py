@@ -14,6 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from service.model import names
 from service.model.clock import timestamp
 from service.model.domain import Digest, JobRequest, Stage, TaskMessage
+from service.model.metric_fields import values, with_fields
+from service.model.metrics import indexed
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.store import standing
 from service.store.integrity import read_checked
@@ -24,38 +26,16 @@ from service.store.store import Store
 #: Contact threshold at which the sweep's metrics enter the index [m]: the widest that the literature reports.
 INDEX_THRESHOLD_M: Final = 0.005
 
-_SWEPT: Final = {
-    "epsilon": "quality/epsilon",
-    "wrench_volume": "quality/wrench_volume",
-    "contact_area_cm2": "quality/contact_area_cm2",
-}
-_PLAIN: Final = {
-    "intersection_volume_cm3": "quality/intersection_volume_cm3",
-    "penetration_depth_mm": "quality/penetration_depth_mm",
-    "self_penetration_depth_mm": "quality/self_penetration_depth_mm",
-    "stability_loss": "quality/stability_loss",
-}
-#: The same for columns that a shard may lack.
-_OPTIONAL: Final = {"robustness": "quality/robustness"}
 
-
+@with_fields(valid=values(optional=False, default=None), last=values(optional=True, default=None))
 class GraspSummary(BaseModel):
     """The quality of one grasp, in the units of the shard's columns; None where the shard says nan."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    epsilon: float | None = None
-    wrench_volume: float | None = None
-    contact_area_cm2: float | None = None
-    intersection_volume_cm3: float | None = None
-    penetration_depth_mm: float | None = None
-    self_penetration_depth_mm: float | None = None
-    stability_loss: float | None = None
-    contact_links: int | None = None
     valid: bool
     success: bool | None = None
     verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
-    robustness: float | None = None
 
 
 class ShardManifest(BaseModel):
@@ -176,10 +156,11 @@ def summarise(
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     count = len(arrays["quality/valid"])
-    columns: dict[str, list[Any]] = {name: _numbers(arrays[path][:, at]) for name, path in _SWEPT.items()}
-    columns |= {name: _numbers(arrays[path]) for name, path in _PLAIN.items()}
-    columns |= {name: _numbers(arrays[path]) for name, path in _OPTIONAL.items() if path in arrays}
-    columns["contact_links"] = [int(v) for v in arrays["quality/contact_links"]]
+    columns: dict[str, list[Any]] = {
+        metric.name: _numbers(arrays[metric.path][:, at] if metric.swept else arrays[metric.path])
+        for metric in indexed()
+        if not metric.optional or metric.path in arrays
+    }
     columns["valid"] = standing.valid(arrays).tolist()
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
     level = (attributes or {}).get("verdict_level")

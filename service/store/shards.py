@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from service.model.clock import timestamp
 from service.model.errors import DamagedShard, InputError
+from service.model.metrics import GRASP_METRICS
 from service.model.version import PACKAGE_VERSION
 from service.store.attributes import Attribute, check_attributes
 from service.store.integrity import check_file
@@ -53,36 +54,28 @@ def _posture(prefix: str, what: str) -> dict[str, Column]:
     }
 
 
+def _measured(*, optional: bool) -> dict[str, Column]:
+    return {
+        metric.path: Column(
+            "N T" if metric.swept else "N",
+            "i4" if metric.whole else "f8",
+            metric.units,
+            "none",
+            metric.meaning,
+            optional,
+        )
+        for metric in GRASP_METRICS
+        if metric.optional == optional
+    }
+
+
 SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
     "base": {
         **_posture("grasp", "posture at contact"),
         **_posture("pregrasp", "posture before contact, fingers clear of the object"),
         **_posture("squeeze", "commanded posture that presses on the object"),
         "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
-        "quality/contact_area_cm2": Column(
-            "N T", "f8", "cm^2", "none", "hand surface closer to the object than the threshold"
-        ),
-        "quality/intersection_volume_cm3": Column("N", "f8", "cm^3", "none", "volume shared by hand and object"),
-        "quality/epsilon": Column(
-            "N T",
-            "f8",
-            "1",
-            "none",
-            "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
-        ),
-        "quality/wrench_volume": Column("N T", "f8", "1", "none", "volume of the L1 grasp wrench space"),
-        "quality/simulated_displacement_cm": Column(
-            "N",
-            "f8",
-            "cm",
-            "none",
-            "object's way in the displacement test; nan: not tested, or it blew up",
-            optional=True,
-        ),
-        "quality/penetration_depth_mm": Column("N", "f8", "mm", "none", "deepest hand-object penetration"),
-        "quality/self_penetration_depth_mm": Column("N", "f8", "mm", "none", "deepest hand-hand penetration"),
-        "quality/contact_links": Column("N", "i4", "1", "none", "hand bodies within 2 mm of the object"),
-        "quality/stability_loss": Column("N", "f8", "1", "none", "planner's L_stable; nan: the planner has none"),
+        **_measured(optional=False),
         "quality/valid": Column(
             "N", "u1", "bool", "none", "1: sound, and the referee judged that it holds; 0 where nobody judged"
         ),
@@ -120,14 +113,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "verdict by the letter of the protocol: 1 held, 0 dropped, -1 not audited",
             optional=True,
         ),
-        "quality/robustness": Column(
-            "N",
-            "f8",
-            "1",
-            "none",
-            "share of verdicts that survive 1 mm and 1 degree of noise on the object",
-            optional=True,
-        ),
+        **_measured(optional=True),
         # Grasps that were planned for a scene say which, and how they are reached and lifted there.
         "scene/object_pose": Column(
             "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up", optional=True

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from service.model.clock import timestamp
 from service.model.domain import AssetKind
+from service.model.metrics import GRASP_METRICS
 from service.model.version import PACKAGE_VERSION
 from worker.cards.contents import AssetFacts, Contents
 from worker.cards.directions import CELLS, ELEVATION_BINS, ENOUGH, cell_counts, evenness
-from worker.cards.tally import QUALITIES, CellTally, Tally
+from worker.cards.tally import CellTally, Tally
 from worker.grasps import Posture
 from worker.quality.diversity import explained_variance
 from worker.quality.intervals import wilson
@@ -159,11 +160,11 @@ def _validity(cells: Iterable[CellTally]) -> Row:
 def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
     """Distribution of each quality over the valid grasps of some cells; a quality that no shard has is left out."""
     found = {}
-    for name in QUALITIES:
-        values = np.concatenate([np.empty(0, np.float32), *(cell.column(name) for cell in cells)])
+    for metric in GRASP_METRICS:
+        values = np.concatenate([np.empty(0, np.float32), *(cell.column(metric.name) for cell in cells)])
         values = values[np.isfinite(values)].astype(float)
         if len(values):
-            found[name] = {
+            found[metric.name] = {
                 "n": len(values),
                 "mean": _six(values.mean()),
                 **{key: _six(np.percentile(values, at)) for key, at in _PERCENTILES.items()},

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from service.model.metrics import GRASP_METRICS
 from worker.cards.directions import cell_counts
 from worker.cards.tally import Tally
 
@@ -20,13 +21,8 @@ _NAMED: Final = 40
 #: Of more hands only the first get a panel of their own.
 _PANELS: Final = 6
 #: Title, column, and whether a long tail is cut at its 99th percentile.
-_QUALITIES: Final = (
-    ("ε", "epsilon", False),
-    ("contact area, cm²", "contact_area_cm2", False),
-    ("intersection volume, cm³", "intersection_volume_cm3", True),
-    ("penetration, mm", "penetration_depth_mm", True),
-    ("simulated displacement, cm", "simulated_displacement_cm", True),
-    ("robustness: verdicts that survive noise", "robustness", False),
+_QUALITIES: Final = tuple(
+    (metric.heading, metric.name, metric.plot == "cut") for metric in GRASP_METRICS if metric.plot != "no"
 )
 _DPI: Final = 110
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from service.model import names
 from service.model.errors import NotFoundError
+from service.model.metrics import GRASP_METRICS
 from service.readers import ShardFile
 from service.store import standing
 from service.store.manifests import ShardManifest, load_manifest
@@ -22,10 +23,8 @@ from worker.cards.contents import Contents
 #: Columns of which a card is made; those that a shard lacks are left out.
 COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "base": (
-        "grasp/hand_pose", "grasp/joint_positions", "quality/thresholds_m", "quality/contact_area_cm2",
-        "quality/intersection_volume_cm3", "quality/epsilon", "quality/wrench_volume",
-        "quality/simulated_displacement_cm", "quality/penetration_depth_mm", "quality/self_penetration_depth_mm",
-        "quality/contact_links", "quality/stability_loss", *standing.COLUMNS, "quality/audit", "quality/robustness",
+        "grasp/hand_pose", "grasp/joint_positions", "quality/thresholds_m", *(metric.path for metric in GRASP_METRICS),
+        *standing.COLUMNS, "quality/audit",
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
     "views": (),

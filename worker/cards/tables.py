@@ -5,19 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from service.model.metrics import GRASP_METRICS
+
 Row = Mapping[str, Any]
 
 #: Column, what it is called, digits.
 QUALITY_NAMES: Final = {
-    "epsilon": ("ε", 2),
-    "wrench_volume": ("Vol", 1),
-    "contact_area_cm2": ("contact area, cm²", 0),
-    "intersection_volume_cm3": ("intersection, cm³", 3),
-    "penetration_depth_mm": ("penetration, mm", 2),
-    "self_penetration_depth_mm": ("self-penetration, mm", 2),
-    "simulated_displacement_cm": ("displacement, cm", 2),
-    "robustness": ("robustness", 2),
-    "contact_links": ("links in contact", 0),
+    metric.name: (metric.heading, metric.digits) for metric in GRASP_METRICS if metric.digits is not None
 }
 _UNITS: Final = ("B", "kB", "MB", "GB", "TB")
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.metrics import GRASP_METRICS
 from service.model.transforms import quat_rotate
 from service.store import standing
 from service.store.manifests import INDEX_THRESHOLD_M
@@ -22,19 +23,6 @@ from worker.grasps import Posture
 Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
 
-#: Qualities of which the card shows the distribution, and whether they depend on the contact threshold.
-QUALITIES: Final[dict[str, bool]] = {
-    "epsilon": True,
-    "wrench_volume": True,
-    "contact_area_cm2": True,
-    "intersection_volume_cm3": False,
-    "penetration_depth_mm": False,
-    "self_penetration_depth_mm": False,
-    "simulated_displacement_cm": False,
-    "robustness": False,
-    "contact_links": False,
-    "stability_loss": False,
-}
 #: Grasps of a cell on which its diversity is measured, the first ones.
 SAMPLED: Final = 512
 #: So many arrays of a cell are packed into one.
@@ -174,10 +162,10 @@ def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> 
     thresholds = np.asarray(columns["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     tally.threshold_m[float(thresholds[at])] += 1
-    for name, swept in QUALITIES.items():
-        if (values := columns.get(f"quality/{name}")) is not None:
-            kept = (values[:, at] if swept else values)[valid].astype(np.float32)
-            cell.columns.setdefault(name, []).append(kept)
+    for metric in GRASP_METRICS:
+        if (values := columns.get(metric.path)) is not None:
+            kept = (values[:, at] if metric.swept else values)[valid].astype(np.float32)
+            cell.columns.setdefault(metric.name, []).append(kept)
     _add_postures(tally, cell, piece, hand, valid)
     cell.pack()
     return valid

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from service.model.cores import available_cores
 from service.model.errors import InputError, TaskCancelled
+from service.model.metrics import GRASP_METRICS
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -58,7 +61,7 @@ def measure(
         cancelled: polled between chunks.
 
     Returns:
-        All `quality/...` datasets of the base schema but `valid`, `success` and `simulated_displacement_cm`.
+        `quality/...` datasets: those of `MEASURES`, the thresholds and the planner's stability loss.
 
     Raises:
         InputError: no thresholds, or one beyond `REACH_M`.
@@ -85,7 +88,7 @@ def measure(
 
     with ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="quality") as pool:
         parts = list(pool.map(work, chunks))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in pair.names} if parts else pair.empty()
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else pair.empty()
     columns["quality/thresholds_m"] = thresholds
     columns["quality/stability_loss"] = np.asarray(grasps.stability_loss, float)
     return columns
@@ -94,16 +97,6 @@ def measure(
 class _Pair:
     """What the chunks of one table share."""
 
-    names: Final = (
-        "quality/contact_area_cm2",
-        "quality/intersection_volume_cm3",
-        "quality/epsilon",
-        "quality/wrench_volume",
-        "quality/penetration_depth_mm",
-        "quality/self_penetration_depth_mm",
-        "quality/contact_links",
-    )
-
     def __init__(self, hand: HandModel, obj: ObjectModel, friction: float, thresholds: Floats, norm: Norm) -> None:
         self.obj, self.friction, self.thresholds, self.norm = obj, friction, thresholds, norm
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
@@ -111,26 +104,15 @@ class _Pair:
 
     def empty(self) -> dict[str, NDArray[np.generic]]:
         """Columns of no grasps."""
-        swept = ("quality/contact_area_cm2", "quality/epsilon", "quality/wrench_volume")
-        return {name: np.zeros((0, len(self.thresholds)) if name in swept else (0,)) for name in self.names}
+        swept = {metric.name for metric in GRASP_METRICS if metric.swept}
+        return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
 
     def columns(self, posture: Posture) -> dict[str, NDArray[np.generic]]:
-        found = self.probe.measure(posture)
-        # An object's face may enter a piece between two object points, half a diagonal of their grid away from either.
-        near = found.piece_distance < self.probe.sample_spacing
-        epsilon, volume = self._spaces(found)
-        columns: tuple[NDArray[np.generic], ...] = (
-            contact_area_cm2(found.distance, self.probe.points.area, self.thresholds),
-            self.volume.of(found.bodies, near),
-            epsilon,
-            volume,
-            penetration_depth(found) * 1e3,
-            found.self_depth * 1e3,
-            contact_links(self.probe.body_distance(found)),
-        )
-        return dict(zip(self.names, columns, strict=True))
+        chunk = _Chunk(self, self.probe.measure(posture))
+        return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
 
-    def _spaces(self, found: Distances) -> tuple[Floats, Floats]:
+    def spaces(self, found: Distances) -> tuple[Floats, Floats]:
+        """(B, T) epsilon and volume of the wrench space of B grasps."""
         shape = (len(found.distance), len(self.thresholds))
         epsilon, volume = np.zeros(shape), np.zeros(shape)
         facing = self.probe.facing(found)
@@ -150,3 +132,34 @@ class _Pair:
                     epsilon[b, t], volume[b, t] = measure_space(edges, norm=self.norm)
                 last = chosen
         return epsilon, volume
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Some grasps of a table, and what was found at them."""
+
+    pair: _Pair
+    found: Distances
+
+    @cached_property
+    def spaces(self) -> tuple[Floats, Floats]:
+        return self.pair.spaces(self.found)
+
+    def shared_volume(self) -> Floats:
+        # An object's face may enter a piece between two object points, half a diagonal of their grid away from either.
+        near = self.found.piece_distance < self.pair.probe.sample_spacing
+        return self.pair.volume.of(self.found.bodies, near)
+
+
+#: What is measured of B grasps: (B, T) if the metric is swept, else (B,). Rows of `GRASP_METRICS` tell their units.
+MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
+    "contact_area_cm2": lambda chunk: contact_area_cm2(
+        chunk.found.distance, chunk.pair.probe.points.area, chunk.pair.thresholds
+    ),
+    "intersection_volume_cm3": _Chunk.shared_volume,
+    "epsilon": lambda chunk: chunk.spaces[0],
+    "wrench_volume": lambda chunk: chunk.spaces[1],
+    "penetration_depth_mm": lambda chunk: penetration_depth(chunk.found) * 1e3,
+    "self_penetration_depth_mm": lambda chunk: chunk.found.self_depth * 1e3,
+    "contact_links": lambda chunk: contact_links(chunk.pair.probe.body_distance(chunk.found)),
+}

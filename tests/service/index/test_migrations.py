@@ -14,6 +14,7 @@ from sqlalchemy import Engine, create_engine, inspect, text
 
 from benchmarks.large_index import fill
 from service.index.database import _MIGRATIONS, downgrade
+from service.index.filters import GraspSort
 from service.index.index import Index
 from service.index.tables import metadata
 from service.index.views import Stats
@@ -92,3 +93,19 @@ def test_an_index_of_a_newer_graspd_is_refused_with_the_ways_out(url: str, engin
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     with pytest.raises(IndexUnavailable, match=r"another version of graspd .*9999.*delete the index"):
         Index(url)
+
+
+def test_a_column_of_a_metric_that_is_missing_is_added_with_its_index_and_no_row_is_lost(
+    url: str, engine: Engine
+) -> None:
+    before = rows(engine)
+    with engine.begin() as connection:
+        connection.execute(text("DROP INDEX grasps_wrench_volume"))
+        connection.execute(text("ALTER TABLE grasps DROP COLUMN wrench_volume"))
+    index = Index(url)
+    found = index.grasps.page(sort=GraspSort(by="wrench_volume"), limit=5).items
+    index.close()
+    assert [grasp.wrench_volume for grasp in found] == [None] * 5
+    assert rows(engine) == before
+    with engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), metadata) == []

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from service.model.errors import InputError, TaskCancelled
+from service.model.metrics import GRASP_METRICS
 from service.model.transforms import compose
 from service.store.shards import SCHEMAS
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -18,7 +19,7 @@ from worker.hands.surface import sample_surface
 from worker.quality.contact import choose_contacts, contact_distance_consistency_mm, finger_of_body
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, Probe
-from worker.quality.table import measure
+from worker.quality.table import MEASURES, measure
 from worker.quality.volume import SharedVolume, VoxelVolume
 
 #: Single precision of coordinates around 0.1 m.
@@ -180,3 +181,17 @@ def test_held_out_points_differ_from_the_planner_s() -> None:
     hand = two_finger_hand()
     ours, theirs = Probe(hand, BOX).points.position, sample_surface(hand, HAND_POINTS).position
     assert not (ours[:, None] == theirs[None]).all(axis=-1).any()
+
+
+def test_a_function_that_is_added_to_the_measures_is_measured_of_every_grasp(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MEASURES, "least_distance_m", lambda chunk: chunk.found.distance.min(axis=1))
+    hand = plate_hand((0.03, 0.03, 0.01))
+    table = measure(hand, BOX, grasp_set(closed_on_box(0.0)), thresholds_m=[0.002])
+    assert table["quality/least_distance_m"] == pytest.approx(0, abs=1e-5)
+    assert measure(hand, BOX, grasp_set(closed_on_box(0.0)).take(np.arange(0)))["quality/least_distance_m"].shape == (
+        0,
+    )
+
+
+def test_every_measure_has_its_row_in_the_table_of_metrics() -> None:
+    assert set(MEASURES) <= {metric.name for metric in GRASP_METRICS}

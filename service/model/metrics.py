@@ -1,0 +1,134 @@
+"""The metrics of a grasp: one table, from which all follows that stores, indexes, filters, shows and documents them.
+
+Shards (`service.store.shards`), manifests, the index, the API, the dashboard, a dataset's card and the docs read this
+table. A new metric is a row here and the function that computes it (`MEASURES` in `worker.quality.table`); make it
+`optional`, since older shards lack it. The index gets its column when it is opened next
+(`service.index.metric_columns`). What says yes or no of a grasp is a verdict and no metric.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, Literal
+
+#: Shorter names than this are symbols: they keep their case.
+_SYMBOL: Final = 4
+
+
+class Indexed(IntEnum):
+    """What the index knows of a metric; each includes those before it."""
+
+    NO = 0
+    KEPT = 1
+    """A column: it is told with the grasp."""
+    SORTED = 2
+    """A database index as well: grasps can be bounded and sorted by it."""
+    OFFERED = 3
+    """The API and the dashboard offer that, and means and distributions of a job's grasps."""
+
+
+@dataclass(frozen=True)
+class GraspMetric:
+    """One number of each grasp."""
+
+    name: str
+    """Its dataset in a base shard is `quality/{name}`; everywhere else it is called by this name."""
+    units: str
+    """As the shard says it: `cm^2`; `1`: none."""
+    meaning: str
+    title: str
+    short: str = ""
+    """Heading where there is little room; the title, if not given."""
+    swept: bool = False
+    """A value at each contact threshold; the index holds the one at `INDEX_THRESHOLD_M`."""
+    whole: bool = False
+    """A count."""
+    optional: bool = False
+    """A shard may lack it."""
+    indexed: Indexed = Indexed.NO
+    bounds: tuple[float, float] = (0, math.inf)
+    """Least and largest value that a filter may name."""
+    less_is_better: bool = False
+    digits: int | None = None
+    """After the point, in a card's table; None: not in the table."""
+    plot: Literal["no", "whole", "cut"] = "no"
+    """Whether a card draws its distribution, and whether a long tail is cut."""
+
+    @property
+    def path(self) -> str:
+        """Dataset of a base shard."""
+        return f"quality/{self.name}"
+
+    @property
+    def limits(self) -> tuple[float | None, float | None]:
+        """The bounds; None: there is none."""
+        low, high = (bound if math.isfinite(bound) else None for bound in self.bounds)
+        return low, high
+
+    @property
+    def unit(self) -> str:
+        """As people read it; empty: none."""
+        return "" if self.units == "1" else self.units.replace("^2", "²").replace("^3", "³")
+
+    @property
+    def column_title(self) -> str:
+        """Heading of a column."""
+        return self.short or self.title
+
+    @property
+    def heading(self) -> str:
+        """The same within a text, with the unit."""
+        words = self.column_title if len(self.column_title) < _SYMBOL else self.column_title.lower()
+        return f"{words}, {self.unit}" if self.unit else words
+
+
+GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
+    GraspMetric(
+        "epsilon", "1", "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
+        title="ε (Ferrari-Canny)", short="ε", swept=True, indexed=Indexed.OFFERED, digits=2, plot="whole",
+    ),
+    GraspMetric(
+        "wrench_volume", "1", "volume of the L1 grasp wrench space",
+        title="Wrench space volume", short="Vol", swept=True, indexed=Indexed.SORTED, digits=1,
+    ),
+    GraspMetric(
+        "contact_area_cm2", "cm^2", "hand surface closer to the object than the threshold",
+        title="Contact area", swept=True, indexed=Indexed.OFFERED, digits=0, plot="whole",
+    ),
+    GraspMetric(
+        "intersection_volume_cm3", "cm^3", "volume shared by hand and object", title="Intersection volume",
+        short="Intersection", indexed=Indexed.OFFERED, less_is_better=True, digits=3, plot="cut",
+    ),
+    GraspMetric(
+        "penetration_depth_mm", "mm", "deepest hand-object penetration", title="Penetration",
+        indexed=Indexed.OFFERED, less_is_better=True, digits=2, plot="cut",
+    ),
+    GraspMetric(
+        "self_penetration_depth_mm", "mm", "deepest hand-hand penetration", title="Self-penetration",
+        indexed=Indexed.SORTED, less_is_better=True, digits=2,
+    ),
+    GraspMetric(
+        "simulated_displacement_cm", "cm", "object's way in the displacement test; nan: not tested, or it blew up",
+        title="Simulated displacement", short="Displacement", optional=True, less_is_better=True, digits=2, plot="cut",
+    ),
+    GraspMetric(
+        "robustness", "1", "share of verdicts that survive 1 mm and 1 degree of noise on the object",
+        title="Verdicts that survive noise", short="Robustness", optional=True, indexed=Indexed.KEPT,
+        bounds=(0, 1), digits=2, plot="whole",
+    ),
+    GraspMetric(
+        "contact_links", "1", "hand bodies within 2 mm of the object", title="Links in contact", whole=True,
+        indexed=Indexed.KEPT, digits=0,
+    ),
+    GraspMetric(
+        "stability_loss", "1", "planner's L_stable; nan: the planner has none", title="Stability loss",
+        indexed=Indexed.SORTED, bounds=(-math.inf, math.inf), less_is_better=True,
+    ),
+)  # fmt: skip
+
+
+def indexed(least: Indexed = Indexed.KEPT) -> tuple[GraspMetric, ...]:
+    """Metrics of which the index knows that much."""
+    return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)

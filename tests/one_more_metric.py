@@ -1,0 +1,78 @@
+"""What is found of a metric where the table has one row more than ours: `python -m tests.one_more_metric`.
+
+A process of its own: what follows from the table is made when the modules that need it are imported. Arguments: a
+folder, and the URL of an index that was made without the metric. Prints the findings as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.model import metrics
+
+NAME, TITLE, MEANING = "finger_force_n", "Finger force", "largest force of a finger"
+ROW = metrics.GraspMetric(
+    NAME, "N", MEANING, title=TITLE, optional=True, indexed=metrics.Indexed.OFFERED, bounds=(0, 50), digits=1
+)
+
+
+def main(folder: Path, older_index: str) -> None:
+    """Print what is found of the metric, by place."""
+    metrics.GRASP_METRICS = (*metrics.GRASP_METRICS, ROW)  # type: ignore[misc]
+    from fastapi.testclient import TestClient
+    from sqlalchemy import inspect
+
+    from api.app import create_app
+    from service.docs import schema_table
+    from service.index.index import Index
+    from service.model.domain import Stage
+    from service.store.manifests import load_manifest
+    from service.store.shards import SCHEMAS
+    from tests.api.conftest import BASE_URL
+    from tests.worker.cards.conftest import case
+    from worker.cards.tables import quality_table
+
+    def measured(hand: str, obj: str, columns: dict[str, Any]) -> None:
+        columns[ROW.path] = np.linspace(0, 20, len(columns["quality/valid"]))
+
+    index = Index(older_index)
+    before = [getattr(grasp, NAME) for grasp in index.grasps.page().items]
+    index.close()
+    made = case(folder, drawn=False, change=measured)
+    parts = made.made.parts
+    shard = next(shard.id for shard in made.made.snapshot.shards if shard.kind == "base")
+    engine = parts.index.database._engine
+    with TestClient(create_app(parts.settings, parts), base_url=BASE_URL) as http:
+        query = {f"min_{NAME}": 5, f"max_{NAME}": 10, "sort": NAME, "order": "asc"}
+        page = http.get("/v1/grasps", params=query).json()["items"]
+        job = http.get("/v1/jobs").json()["items"][0]["id"]
+        detail = http.get(f"/v1/grasps/{shard}/0").json()
+        found = {
+            "older index": before,
+            "schema": SCHEMAS["base"][ROW.path].description,
+            "manifest": [getattr(one, NAME) for one in load_manifest(parts.store, Stage.SYNTHESIZE, shard).grasps],
+            "index columns": [column["name"] for column in inspect(engine).get_columns("grasps")],
+            "index indexes": [one["name"] for one in inspect(engine).get_indexes("grasps")],
+            "answer": [grasp[NAME] for grasp in page],
+            "out of bounds": http.get("/v1/grasps", params={f"min_{NAME}": 51}).status_code,
+            "mean": http.get(f"/v1/jobs/{job}").json()["mean"],
+            "one grasp": detail[NAME],
+            "openapi": http.get("/openapi.json").text,
+            "list": http.get("/grasps", params={"view": "table"}).text,
+            "grasp page": http.get(f"/grasps/{shard}/0").text,
+            "job page": http.get(f"/jobs/{job}").text,
+            "card": made.card["quality"],
+            "card's table": quality_table(made.card),
+            "docs": schema_table("base"),
+        }
+    parts.close()
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2])
