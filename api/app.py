@@ -9,6 +9,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.routing import iter_route_contexts
 from fastapi.staticfiles import StaticFiles
 
 from api import problems
@@ -79,9 +80,17 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         app.include_router(router)
     pages.install(app, opened)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    _build_routes(app)
     _add_middleware(app, settings, keys, rates)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
+
+
+def _build_routes(app: FastAPI) -> None:
+    """Build what FastAPI would build at the first request. It silences warnings meanwhile, for the whole process and so
+    not safely where two applications build at once; and the first request should wait for nothing."""
+    for _ in iter_route_contexts(app.routes):
+        pass
 
 
 def check_exposure(host: str, keys: KeyFile) -> None:

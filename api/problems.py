@@ -15,28 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from service.model.errors import (
-    BusyError,
-    ConflictError,
-    DamagedError,
-    DamagedShard,
-    GraspdError,
-    HandError,
-    IndexDamaged,
-    IndexUnavailable,
-    InputError,
-    LimitError,
-    MeshError,
-    NotFoundError,
-    QueueUnavailable,
-    QuotaError,
-    RateError,
-    StoreUnavailable,
-    TaskCancelled,
-    TaskError,
-    TaskRefused,
-    UnavailableError,
-)
+from service.model.errors import GraspdError, InputError, RateError, StoreUnavailable
 
 MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
@@ -46,16 +25,6 @@ _LONGEST_POINTER: Final = 200
 _MOST_ERRORS: Final = 100
 
 _log = logging.getLogger("graspd.api")
-
-#: Domain errors by problem type, for the client and the reference page.
-ERRORS: Final[dict[str, type[GraspdError]]] = {
-    error.slug: error
-    for error in (
-        InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
-        QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError, DamagedError,
-        DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
-    )
-}  # fmt: skip
 
 #: Problem types of answers that HTTP itself defines.
 HTTP_SLUGS: Final[dict[int, str]] = {

@@ -14,10 +14,9 @@ import httpx
 
 from api.hosts import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
-from api.problems import ERRORS
 from service.index.views import AssetView, GraspView, Page
 from service.model.domain import AssetKind, JobRequest, State
-from service.model.errors import GraspdError, InputError, RateError, UnavailableError
+from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError
 
 _TIMEOUT: Final = httpx.Timeout(30.0, connect=5.0)
 #: The server sends a sign of life every 15 s.

@@ -23,7 +23,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 from service.index.dataset_views import DatasetView
 from service.model.domain import State
 from service.model.errors import InputError, TaskError
-from service.pipeline.datasets.cost import Estimate
+from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.export import FORMATS
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
 from service.store.object_sets import Objects, files_of_set

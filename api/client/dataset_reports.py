@@ -13,7 +13,7 @@ from api.client.datasets import DatasetClient
 from api.formatting import count, duration, metric, percent, size
 from service.index.dataset_views import CellView, DatasetView
 from service.model.domain import State
-from service.pipeline.datasets.cost import Estimate
+from service.pipeline.datasets.estimate import Estimate
 
 #: A table with more hands does not fit a terminal: then each cell has a line.
 _MOST_COLUMNS: Final = 6

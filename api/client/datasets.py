@@ -13,7 +13,7 @@ from service.index.dataset_views import CellView, DatasetView, ObjectSetView, Sn
 from service.index.views import Page
 from service.model.dataset_records import Snapshot, SnapshotShard
 from service.model.domain import State
-from service.pipeline.datasets.cost import Estimate
+from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
 
 _PAGE: Final = 200

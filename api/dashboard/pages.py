@@ -14,8 +14,8 @@ from api.dashboard import dataset_pages, forms, grasp_pages, job_pages, service_
 from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
-from api.problems import ERRORS
 from api.routes.dependencies import OverviewOf, may_read
+from service.model.errors import ERRORS
 from service.pipeline.backends import Parts
 
 router = APIRouter(include_in_schema=False)

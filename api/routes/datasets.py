@@ -14,7 +14,7 @@ from service.index.dataset_views import CellView, DatasetView, ObjectSetView, Sn
 from service.index.views import Page
 from service.model.dataset_records import Snapshot
 from service.model.domain import Name, State
-from service.pipeline.datasets.cost import Estimate
+from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])

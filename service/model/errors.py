@@ -27,7 +27,7 @@ exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Final
 
 
 class GraspdError(Exception):
@@ -155,3 +155,14 @@ class TaskRefused(TaskError):
     """The task must not run here: unknown schema, unknown function. Never retried."""
 
     slug, title = "task-refused", "The task was refused"
+
+
+#: Domain errors by problem type, for the client and the reference page.
+ERRORS: Final[dict[str, type[GraspdError]]] = {
+    error.slug: error
+    for error in (
+        InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
+        QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError, DamagedError,
+        DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
+    )
+}  # fmt: skip

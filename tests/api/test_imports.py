@@ -26,6 +26,14 @@ def test_a_command_line_needs_no_templates_and_no_server(statement: str) -> None
     assert modules_after(statement).isdisjoint({"jinja2", "uvicorn", "worker"})
 
 
+CLIENTS = ("client", "commands", "add_commands", "dataset_commands", "key_commands")
+
+
+@pytest.mark.parametrize("module", CLIENTS)
+def test_a_command_that_talks_http_needs_no_web_framework_and_no_database(module: str) -> None:
+    assert modules_after(f"import api.client.{module}").isdisjoint({"fastapi", "starlette", "sqlalchemy", "redis"})
+
+
 OVERVIEW = """
 import contextlib, io, sys
 import graspd

@@ -16,15 +16,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from pydantic import Field
-
 from service.index.index import Index
 from service.index.queries.costs import BatchCost
-from service.index.views import View
 from service.model.dataset_records import request_of
 from service.model.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
 from service.model.errors import LimitError
 from service.model.planning import stages_of
+from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from service.pipeline.datasets.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix
 
@@ -35,53 +33,6 @@ _MESSAGE_BYTES: Final = 19_500
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
 Batches = Callable[[Stage], list[BatchCost]]
-
-
-class WorkersPlan(View):
-    """The same dataset on a number of workers."""
-
-    workers: int
-    seconds: float = Field(description="expected time until the dataset is done [s]")
-    seconds_low: float = Field(description="the same if all goes quickly [s]")
-    seconds_high: float = Field(description="the same if all goes slowly [s]")
-    network_bytes: int = Field(description="between workers, store and Redis, if these are other machines")
-    network_bytes_per_s: float = Field(description="the same, on average over that time")
-
-
-class RateUsed(View):
-    """A rate of the estimate, and how many cells it stands for."""
-
-    hand: str
-    cells: int
-    seconds_per_valid: float | None = Field(description="None: no try is expected to give a valid grasp")
-    seconds_per_try: float
-    valid_yield: float
-    origin: str
-    batches: int = Field(description="finished batches it was measured on; 0: a stored default")
-
-
-class Estimate(View):
-    """What a dataset will cost. Seconds are of one worker."""
-
-    cells: int
-    asked: int = Field(description="grasps asked for, over all cells")
-    tried: int = Field(description="grasps to be computed for these")
-    valid: int = Field(description="valid grasps to be expected")
-    tasks: int
-    seconds: float
-    seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
-    seconds_high: float = Field(description="its upper end [s]")
-    machine_factor: float | None = Field(
-        description="this machine's seconds over the stored ones, which scales these; None: nothing was measured here"
-    )
-    seconds_by_stage: dict[Stage, float]
-    seconds_per_valid: float | None
-    storage_bytes: int
-    storage_by_kind: dict[str, int]
-    plans: list[WorkersPlan]
-    rates: list[RateUsed] = Field(description="the first of them, those of most cells first")
-    measured_share: float = Field(description="share of the cells with a rate that was measured here")
-    unknown: list[str] = Field(description="hands and objects that the service does not know yet")
 
 
 @dataclass

@@ -9,7 +9,8 @@ from service.model.domain import JobRequest
 from service.model.errors import LimitError, NotFoundError
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.cost import Estimate, estimate
+from service.pipeline.datasets.cost import estimate
+from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, machine_of
 from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
 
