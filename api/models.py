@@ -34,6 +34,9 @@ class Job(BaseModel):
     grasps: int = Field(description="grasps kept so far")
     valid: int = Field(description="of these, past the geometric gate and judged to hold; 0 where nobody judges")
     tried: int = Field(0, description="grasps planned for them, kept or not")
+    standing: Literal["valid", "sound", "kept"] = Field(
+        "valid", description="what its kept grasps can be: sound where nobody judges, or merely kept if raw were wanted"
+    )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
     created: str

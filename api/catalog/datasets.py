@@ -17,7 +17,8 @@ from service.model.domain import State
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.cost import Estimate, estimate
+from service.pipeline.datasets.cost import estimate
+from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
 from service.pipeline.fidelity_choice import Resolver
 from service.store.datasets import load_snapshot

@@ -124,11 +124,11 @@ def list_datasets(
     if json:
         emit({"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next})
         return
-    table = Table("dataset", "state", "cells", "progress", "valid", "size", "created", box=None, header_style="bold")
+    table = Table("dataset", "state", "cells", "progress", "grasps", "size", "created", box=None, header_style="bold")
     for one in page.items:
-        valid = f"{count(one.valid)} of {count(one.asked)}"
+        made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
         cells = count(one.cells)
-        table.add_row(one.name, one.state, cells, percent(one.progress), valid, size(one.size_bytes), one.created)
+        table.add_row(one.name, one.state, cells, percent(one.progress), made, size(one.size_bytes), one.created)
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
     Console().print(table if page.items else empty)
 
@@ -141,7 +141,7 @@ def status(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """The matrix: each hand and object with its state, valid yield and failures."""
+    """The matrix: each hand and object with its state, yield and failures."""
     with open_client(url) as client:
         datasets = DatasetClient(client)
         dataset, cells = datasets.dataset(name), list(datasets.cells(name, state=state))
@@ -192,8 +192,8 @@ def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) 
         return
     whole = "complete" if taken.complete else "the dataset is not complete"
     typer.echo(
-        f"{taken.digest}  {count(taken.shards)} shards, {count(taken.valid)} valid grasps, "
-        f"{size(taken.size_bytes)}; {whole}"
+        f"{taken.digest}  {count(taken.shards)} shards, {count(taken.grasps)} grasps of which {count(taken.valid)} "
+        f"are valid, {size(taken.size_bytes)}; {whole}"
     )
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 from api.client.datasets import DatasetClient
 from api.formatting import count, duration, metric, percent, size
 from service.index.dataset_views import CellView, DatasetView
-from service.model.domain import State
+from service.model.domain import JobOptions, State
 from service.pipeline.datasets.estimate import Estimate
 
 #: A table with more hands does not fit a terminal: then each cell has a line.
@@ -31,7 +31,7 @@ def print_estimate(found: Estimate, console: Console) -> None:
     """Time for some numbers of workers, storage, network, and what the rates are known from."""
     console.print(
         f"{count(found.cells)} cells, {count(found.asked)} grasps asked for: about {count(found.tried)} tries, "
-        f"{count(found.valid)} valid, {count(found.tasks)} tasks",
+        f"{count(found.valid)} {found.counted}, {count(found.tasks)} tasks",
         markup=False,
         soft_wrap=True,
     )
@@ -45,10 +45,10 @@ def print_estimate(found: Estimate, console: Console) -> None:
     console.print(f"storage {size(found.storage_bytes)} ({kinds})", markup=False)
     width = max(len(used.hand) for used in found.rates[:_SHOWN_RATES])
     for used in found.rates[:_SHOWN_RATES]:
-        each = "no valid grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
+        each = f"no {found.counted} grasp" if used.seconds_per_valid is None else f"{metric(used.seconds_per_valid)} s"
         batches = f", {count(used.batches)} batches" if used.batches else ""
         console.print(
-            f"  {used.hand:<{width}} {each} per valid grasp, yield {percent(used.valid_yield)} "
+            f"  {used.hand:<{width}} {each} per {found.counted} grasp, yield {percent(used.valid_yield)} "
             f"({used.origin}{batches}) for {count(used.cells)} cells",
             markup=False,
             highlight=False,
@@ -68,7 +68,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     console.print(f"cells: {states}", markup=False, highlight=False)
     tried = f" of {count(dataset.tried)} tried" if dataset.tried else ""
     console.print(
-        f"grasps: {count(dataset.valid)} valid{tried}, {count(dataset.asked)} asked for; "
+        f"grasps: {count(dataset.counted)} {dataset.options.standing}{tried}, {count(dataset.asked)} asked for; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         markup=False,
         highlight=False,
@@ -77,17 +77,19 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
 
 
 def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Console) -> None:
-    """Objects as rows and hands as columns, each cell with its state, valid yield and failures."""
+    """Objects as rows and hands as columns, each cell with its state, yield and failures."""
     if len(dataset.hands) > _MOST_COLUMNS:
         table = Table("hand", "object", "job", "", box=None, header_style="bold")
         for cell in cells:
-            table.add_row(cell.hand, cell.object, cell.job_id[:12], _words(cell), style=_STYLES[cell.state])
+            table.add_row(
+                cell.hand, cell.object, cell.job_id[:12], _words(cell, dataset.options), style=_STYLES[cell.state]
+            )
     else:
         table = Table("", *dataset.hands, box=None, header_style="bold")
         at = {(cell.hand, cell.object): cell for cell in cells}
         for obj in dataset.objects:
             found = [at.get((hand, obj)) for hand in dataset.hands]
-            table.add_row(obj, *(_styled(cell) if cell else "" for cell in found))
+            table.add_row(obj, *(_styled(cell, dataset.options) if cell else "" for cell in found))
     console.print(table)
     for cell in [cell for cell in cells if cell.reason][:5]:
         console.print(f"{cell.hand} on {cell.object}: {cell.reason}", markup=False, soft_wrap=True)
@@ -103,7 +105,8 @@ def watch_dataset(client: DatasetClient, name: str, console: Console) -> Dataset
         bar = progress.add_task(name, total=1.0, rate="", left="")
         said = -1.0
         for dataset in client.watch(name):
-            rate = f"{metric(dataset.valid / dataset.seconds)} valid/s per worker" if dataset.seconds else ""
+            pace = metric(dataset.counted / dataset.seconds) if dataset.seconds else None
+            rate = f"{pace} {dataset.options.standing}/s per worker" if pace is not None else ""
             left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
             progress.update(bar, completed=dataset.progress, rate=rate, left=left)
             if not console.is_terminal and dataset.progress - said >= 0.05:
@@ -112,16 +115,17 @@ def watch_dataset(client: DatasetClient, name: str, console: Console) -> Dataset
     return dataset
 
 
-def _styled(cell: CellView) -> str:
-    return f"[{_STYLES[cell.state]}]{_words(cell)}[/]"
+def _styled(cell: CellView, options: JobOptions) -> str:
+    return f"[{_STYLES[cell.state]}]{_words(cell, options)}[/]"
 
 
-def _words(cell: CellView) -> str:
+def _words(cell: CellView, options: JobOptions) -> str:
     words = [cell.state.value]
     if cell.state is State.RUNNING:
         words.append(percent(cell.progress))
-    if cell.valid_yield is not None:
-        words.append(f"{count(cell.valid)}/{count(cell.asked)} at {percent(cell.valid_yield)}")
+    if cell.tried:
+        made = cell.counted(options)
+        words.append(f"{count(made)}/{count(cell.asked)} at {percent(made / cell.tried)}")
     if cell.tasks_failed:
         words.append(f"{cell.tasks_failed} failed")
     return " ".join(words)

@@ -36,6 +36,11 @@ class DatasetView(View):
     finished: str | None
     cancelled: bool = Field(description="cancelled by its user; `retry` lifts it")
 
+    @property
+    def counted(self) -> int:
+        """Grasps of the standing that its options can give."""
+        return self.valid if self.options.standing == "valid" else self.grasps
+
 
 class CellView(View):
     """One hand x object of a dataset: an ordinary job, or one that is still to be planned."""
@@ -60,6 +65,10 @@ class CellView(View):
     seconds: float = Field(description="time that workers spent on it [s]")
     reason: str | None = Field(description="why it failed")
 
+    def counted(self, options: JobOptions) -> int:
+        """Grasps of the standing that its dataset's options can give."""
+        return self.valid if options.standing == "valid" else self.grasps
+
 
 class SnapshotView(View):
     """A snapshot of a dataset, without its list of shards."""
@@ -72,6 +81,10 @@ class SnapshotView(View):
     grasps: int
     valid: int
     size_bytes: int
+
+    def counted(self, options: JobOptions) -> int:
+        """Grasps of the standing that its dataset's options can give."""
+        return self.valid if options.standing == "valid" else self.grasps
 
 
 class ObjectSetView(View):

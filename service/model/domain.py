@@ -209,6 +209,12 @@ class JobOptions(Model):
         """What the kept grasps are of a job that does not want raw ones: valid, or sound where nobody judges."""
         return "sound" if self.referee == "none" else "valid"
 
+    @property
+    def standing(self) -> Literal["valid", "sound", "kept"]:
+        """What tables and pages count of what was made: valid grasps; where nobody judges all that were kept, which are
+        sound unless raw ones were wanted."""
+        return "kept" if self.counted == "sound" and self.want == "raw" else self.counted
+
     def audits_of(self, batch: int) -> int:
         """Grasps of a batch that are audited: the first batches share the job's audits, so that a longer job has the
         same first batches as a shorter one."""

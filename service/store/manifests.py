@@ -66,7 +66,7 @@ class ShardManifest(BaseModel):
     device: str
     seconds: float
     worker: str
-    valid: int = Field(0, description="rows that passed their stage's gate")
+    valid: int = Field(0, description="base: valid grasps; scene: pairs of grasp and scene in which the hand is clear")
     tried: int = Field(0, ge=0, description="grasps planned for this base shard, kept or not")
     audited: int = Field(0, ge=0, description="certified grasps that were tested again by the letter")
     audit_held: int = Field(0, ge=0, description="of these, grasps that held")

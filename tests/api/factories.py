@@ -118,6 +118,8 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
         arrays[f"quality/{name}"] = random.gamma(2.0, scale / 2, count)
     arrays["quality/contact_links"] = random.integers(2, 9, count).astype(np.int32)
     arrays["quality/valid"] = (random.random(count) < 0.8).astype(np.uint8)
+    if request.referee == "none":
+        return arrays | {"quality/sound": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}
     arrays["quality/success"] = arrays["quality/valid"].astype(np.int8)
     return arrays
 

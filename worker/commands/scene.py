@@ -55,14 +55,14 @@ def scene(
         attributes |= {"neighbours": [o.name for o in others], "neighbour_digests": [o.digest for o in others]}
         attributes["neighbour_sources"] = [str(Path(n).resolve()) if Path(n).is_file() else "" for n in with_ or []]
     output.write_bytes(write_shard("scene", result, attributes))
-    valid, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
+    clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     reasons = count_rejections(result["grasp/rejection"])
     if json:
         emit(
-            {"file": str(output), "scenes": scenes, "grasps": total, "valid": valid, "rejected": reasons}
+            {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
             | {"seconds": round(seconds, 2)}
         )
         return
-    typer.echo(f"{output}: {scenes} scenes, {valid} of {total} grasps stay clear, {seconds:.1f} s")
+    typer.echo(f"{output}: {scenes} scenes, {clear} of {total} grasps stay clear, {seconds:.1f} s")
     if any(reasons.values()):
         typer.echo("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))

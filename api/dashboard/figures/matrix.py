@@ -1,4 +1,4 @@
-"""The hand x object matrix as the pages show it: a cell's state, its valid yield as number and colour."""
+"""The hand x object matrix as the pages show it: a cell's state, its yield as number and colour."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ _ROWS: Final = 60
 
 @dataclass(frozen=True)
 class Tile:
-    """One hand on one object. `value` is what its checkbox sends, `href` where it leads."""
+    """One hand on one object. `made` counts grasps of its `standing`; `value` is what its checkbox sends, `href` where
+    it leads."""
 
     hand: str
     object: str
     value: str
     href: str
     state: str
-    valid: int
+    made: int
     tried: int
+    standing: str = "valid"
     jobs: int = 0
     progress: float | None = None
     note: str = ""
 
     @property
     def share(self) -> float | None:
-        return self.valid / self.tried if self.tried else None
+        return self.made / self.tried if self.tried else None
 
     @property
     def shade(self) -> str:
@@ -59,8 +61,9 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             value=cell.job_id,
             href=f"/jobs/{cell.job_id}" if cell.planned else "",
             state=cell.state.value,
-            valid=cell.valid,
+            made=cell.counted(dataset.options),
             tried=cell.tried,
+            standing=dataset.options.standing,
             progress=cell.progress if cell.state is State.RUNNING else None,
             note=cell.reason or "",
         )
@@ -78,7 +81,7 @@ def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Seque
             value=f"{cell.hand}|{cell.object}",
             href=f"/grasps?hand={cell.hand}&object={cell.object}",
             state=_state(cell),
-            valid=cell.valid,
+            made=cell.valid,
             tried=cell.tried,
             jobs=cell.jobs,
         )

@@ -143,6 +143,7 @@ def _estimate(
         asked=cells * options.grasps,
         tried=round(sums.tried),
         valid=round(sums.valid),
+        counted=options.counted,
         tasks=batches * len(stages),
         seconds=total,
         seconds_low=low,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from service.index.views import View
@@ -37,7 +39,8 @@ class Estimate(View):
     cells: int
     asked: int = Field(description="grasps asked for, over all cells")
     tried: int = Field(description="grasps to be computed for these")
-    valid: int = Field(description="valid grasps to be expected")
+    valid: int = Field(description="grasps to be expected of the standing in `counted`")
+    counted: Literal["valid", "sound"] = Field("valid", description="what `valid` counts: sound ones if nobody judges")
     tasks: int
     seconds: float
     seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")

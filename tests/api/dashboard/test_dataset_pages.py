@@ -105,3 +105,27 @@ def test_cells_of_one_state_are_a_list(http: TestClient, parts: Parts) -> None:
     actions.create(parts, wanted)
     assert http.get("/datasets/k", params={"state": "queued"}).text.count('name="cell"') == 2
     assert "No cell is failed" in http.get("/datasets/k", params={"state": "failed"}).text
+
+
+@pytest.mark.parametrize(
+    ("options", "shown"),
+    [
+        ({"referee": "none"}, "32 sound"),
+        ({"referee": "none", "want": "raw"}, "32 kept"),
+    ],
+)
+def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
+    http: TestClient, parts: Parts, options: dict[str, str], shown: str
+) -> None:
+    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
+    actions.create(parts, DatasetRequest.model_validate(given | options))
+    DatasetRounds(parts).advance()
+    finish_all(parts, add_job(parts, **options))
+    http.post("/datasets/k/snapshot")
+    word = shown.partition(" ")[2]
+    matrix_page, list_page = http.get("/datasets/k").text, http.get("/datasets/k", params={"state": "succeeded"}).text
+    assert shown in matrix_page and f">{word.capitalize()} grasps<" in matrix_page and "Valid" not in matrix_page
+    assert f">{word.capitalize()}</th>" in list_page and ">32</td>" in list_page
+    assert f"<dt>{word.capitalize()}</dt><dd>32" in http.get("/datasets").text
+    home = http.get("/").text
+    assert f"32 of 32 {word}" in home and f'32<span class="sub">{word}' in home

@@ -181,3 +181,8 @@ def test_what_is_not_known_yet_is_named_and_estimated(parts: Parts) -> None:
         estimate(parts.index, wanted(sets=("none",)))
     with pytest.raises(LimitError):
         estimate(parts.index, wanted(objects=[f"o{i}" for i in range(60_000)]))
+
+
+@pytest.mark.parametrize(("referee", "word"), [("none", "sound"), ("certificate", "valid")])
+def test_an_estimate_says_what_it_counts(parts: Parts, referee: str, word: str) -> None:
+    assert estimate(parts.index, wanted(referee=referee)).counted == word

@@ -1,0 +1,41 @@
+"""Estimates and datasets on a terminal."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from api.client.dataset_reports import print_cells, print_dataset, print_estimate
+from service.model.domain import JobOptions
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.cost import estimate
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.datasets.spec import DatasetRequest
+from tests.api.factories import add_job, finish_all
+
+
+@pytest.mark.parametrize("referee", ["none", "certificate"])
+def test_a_report_names_the_standing_of_what_it_counts(parts: Parts, referee: str) -> None:
+    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "referee": referee}
+    wanted = DatasetRequest.model_validate(given)
+    actions.create(parts, wanted)
+    DatasetRounds(parts).advance()
+    finish_all(parts, add_job(parts, referee=referee))
+    out = io.StringIO()
+    console = Console(file=out, width=200)
+    dataset = parts.index.dataset("k")
+    print_estimate(estimate(parts.index, wanted), console)
+    print_dataset(dataset, console)
+    print_cells(dataset, parts.index.dataset_cells("k").items, console)
+    made = 32 if referee == "none" else dataset.valid
+    word, other = ("sound", "valid") if referee == "none" else ("valid", "sound")
+    assert f"grasps: {made} {word} of 32 tried" in out.getvalue()
+    assert f"per {word} grasp" in out.getvalue() and f"{made}/32 at" in out.getvalue()
+    assert other not in out.getvalue()
+
+
+def test_raw_grasps_that_nobody_judges_are_merely_kept() -> None:
+    assert JobOptions(want="raw", referee="none").standing == "kept"
