@@ -26,10 +26,10 @@ def test_a_report_names_the_standing_of_what_it_counts(parts: Parts, referee: st
     finish_all(parts, add_job(parts, referee=referee))
     out = io.StringIO()
     console = Console(file=out, width=200)
-    dataset = parts.index.dataset("k")
+    dataset = parts.index.datasets.get("k")
     print_estimate(estimate(parts.index, wanted), console)
     print_dataset(dataset, console)
-    print_cells(dataset, parts.index.dataset_cells("k").items, console)
+    print_cells(dataset, parts.index.datasets.cells("k").items, console)
     made = 32 if referee == "none" else dataset.valid
     word, other = ("sound", "valid") if referee == "none" else ("valid", "sound")
     assert f"grasps: {made} {word} of 32 tried" in out.getvalue()
