@@ -25,6 +25,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("status", "api.client.commands", "Jobs", "Stages, progress and quality of a job."),
     ("cancel", "api.client.commands", "Jobs", "Stop a job; what is written stays."),
     ("retry", "api.client.commands", "Jobs", "Run again what failed or was cancelled."),
+    ("delete", "api.client.commands", "Jobs", "Remove an ended job; its grasps go where no other job has them."),
     ("logs", "api.client.commands", "Jobs", "Failed attempts of a job, with their reasons."),
     ("hands", "api.client.commands", "Jobs", "Check, add, list and show hands."),
     ("objects", "api.client.commands", "Jobs", "Check, add, list and show objects."),

@@ -138,7 +138,8 @@ def answer(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, HTTPException) and status == 405:
         detail = f"{request.method} is not possible on {request.url.path}"
     headers = dict(getattr(error, "headers", None) or {})
-    if status == 405 and "Allow" not in headers and (allowed := _allowed_methods(request)):
+    # The router names the methods of the first route that it met at this path; our own word on it stands.
+    if status == 405 and not isinstance(error, ApiError) and (allowed := _allowed_methods(request)):
         headers["Allow"] = ", ".join(allowed)
     return problem_response(
         request.url.path, request_id_of(request), slug=slug, title=title, status=status, detail=detail, headers=headers

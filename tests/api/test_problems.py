@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 import pytest
@@ -95,7 +96,7 @@ def test_a_body_that_grows_over_the_limit_is_refused_while_it_arrives(http: Test
     [
         ("queue", "ping", QueueUnavailable("Redis does not answer"), "queue-unavailable"),
         ("store", "put", StoreUnavailable("the store cannot be written"), "store-unavailable"),
-        ("index", "add_job", IndexUnavailable("the index does not answer"), "index-unavailable"),
+        ("index.write", "add_job", IndexUnavailable("the index does not answer"), "index-unavailable"),
     ],
 )
 def test_a_part_that_is_away_is_503_and_worth_another_try(
@@ -104,7 +105,7 @@ def test_a_part_that_is_away_is_503_and_worth_another_try(
     def away(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(type(getattr(parts, part)), method, away)
+    monkeypatch.setattr(type(attrgetter(part)(parts)), method, away)
     answer = http.post("/v1/jobs", json=JOB)
     assert problem(answer, 503, slug)["detail"] == str(error)
     assert int(answer.headers["retry-after"]) > 0

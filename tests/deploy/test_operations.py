@@ -88,7 +88,7 @@ def test_an_index_goes_back_for_an_older_version_and_forward_again(kept: Parts, 
     assert done.returncode == 0, done.stderr
     again = Index(kept.settings.resolved_index_url)
     try:
-        assert {job.id: job.state for job in again.jobs(limit=10).items} == before
+        assert {job.id: job.state for job in again.jobs.page(limit=10).items} == before
     finally:
         again.close()
 
@@ -98,7 +98,7 @@ def test_an_empty_index_is_filled_from_the_store(kept: Parts) -> None:
     empty = Index(f"sqlite:///{kept.settings.data_dir / 'older.sqlite'}")
     try:
         rebuild(empty, kept.store)
-        assert {job.id: job.state for job in empty.jobs(limit=10).items} == before
+        assert {job.id: job.state for job in empty.jobs.page(limit=10).items} == before
     finally:
         empty.close()
 

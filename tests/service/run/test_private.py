@@ -33,7 +33,7 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path, was_open: boo
     assert modes[folder] == 0o700
 
 
-@pytest.mark.parametrize("room", ["api/client/commands.py", "service/run/commands.py", "worker/commands/worker.py"])
+@pytest.mark.parametrize("room", ["api/server_command.py", "service/run/commands.py", "worker/commands/worker.py"])
 def test_every_service_command_is_private(room: str) -> None:
     text = (Path(__file__).parents[3] / room).read_text()
     assert text.count('log_to_stderr(settings, "') == text.count("keep_private(settings)") > 0
