@@ -56,7 +56,7 @@ def test_a_back_up_restored_elsewhere_gives_the_same_index(kept: Parts, tmp_path
     restored = Index(Settings(data_dir=fresh).resolved_index_url)
     try:
         assert differences(restored, kept.store) == []
-        jobs = {job.id: job.state for job in restored.jobs(limit=10).items}
+        jobs = {job.id: job.state for job in restored.jobs.page(limit=10).items}
         assert jobs == {job.id: job.state for job in kept.index.jobs.page(limit=10).items}
         assert set(jobs.values()) == {State.SUCCEEDED, State.QUEUED}
     finally:
