@@ -24,6 +24,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import Level
 
@@ -67,11 +68,9 @@ class Cell:
                 info: dict[str, object] = {"cpu_seconds": float(stored["cpu_seconds"])}
                 return GraspSet(*parts, stored["loss"], seconds=float(stored["seconds"]), info=info)
         # Kernels are loaded before the clock starts.
-        synthesize(self.hand, self.obj, count=1, fidelity=FIDELITIES["draft"], seed=1, device="cpu")
+        synthesize(self.hand, self.obj, Wanted(count=1, fidelity=FIDELITIES["draft"], seed=1))
         began, cpu = time.perf_counter(), time.process_time()
-        found = synthesize(
-            self.hand, self.obj, count=self.count, fidelity=FIDELITIES["standard"], seed=SEED, device="cpu"
-        )
+        found = synthesize(self.hand, self.obj, Wanted(count=self.count, fidelity=FIDELITIES["standard"], seed=SEED))
         found.seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
         found.info = {"cpu_seconds": cpu}
         arrays: dict[str, Any] = {

@@ -18,9 +18,11 @@ from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from worker.quality.table import DEFAULT_THRESHOLDS_M, measure
 from worker.quality.volume import SharedVolume
+from worker.run import Run
 
 SAMPLE = 64
 
@@ -38,9 +40,9 @@ def main() -> None:
     args = parser.parse_args()
     fidelity = FIDELITIES["standard"]
     hand, obj = hand_from_path(args.hand), object_from_path(args.object, face_error_m=fidelity.face_error_m)
-    grasps = synthesize(hand, obj, count=args.grasps, fidelity=fidelity, seed=1, device="cpu", progress=show)
+    grasps = synthesize(hand, obj, Wanted(count=args.grasps, fidelity=fidelity, seed=1), Run(progress=show))
     wall, cpu = time.perf_counter(), time.process_time()
-    table = measure(hand, obj, grasps, progress=show)
+    table = measure(hand, obj, grasps, run=Run(progress=show))
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     sys.stderr.write("\n")
     probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)

@@ -16,6 +16,7 @@ from service.model.domain import FIDELITIES, Fidelity
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.referee.judge import judge
 
 OBJECTS = ("003_cracker_box", "011_banana", "006_mustard_bottle", "048_hammer", "077_rubiks_cube", "035_power_drill")
@@ -52,7 +53,7 @@ def main(data: Path) -> None:
         rates, seconds = [], 0.0
         for obj in objects:
             began = time.perf_counter()
-            found = synthesize(hand, obj, count=GRASPS, fidelity=fidelity, seed=SEED, device="cpu")
+            found = synthesize(hand, obj, Wanted(count=GRASPS, fidelity=fidelity, seed=SEED))
             seconds += time.perf_counter() - began
             rates.append(float(judge(hand, obj, found).success.mean()))
         sys.stdout.write(f"| {name} | {np.mean(rates):.2f} | {seconds / len(objects):.1f} |\n")

@@ -19,6 +19,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
 
@@ -46,7 +47,7 @@ class Results:
 
     def add(self, hand: HandModel, obj: ObjectModel, count: int) -> str:
         """Grasps of one more object; the cells of its row."""
-        found = synthesize(hand, obj, count=count, fidelity=FIDELITIES["standard"], seed=SEED, device="cpu")
+        found = synthesize(hand, obj, Wanted(count=count, fidelity=FIDELITIES["standard"], seed=SEED))
         self.seconds += found.seconds
         self.success.append(judge(hand, obj, found).success)
         self.hard.append(judge(hand, obj, found, hard=True).success)

@@ -21,7 +21,7 @@ from service.model.domain import BATCH_SIZE, JobOptions
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import Cancelled, Progress, synthesize
+from worker.planners import Wanted, synthesize
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
@@ -31,6 +31,7 @@ from worker.quality.referee.lifting import judge_lifts, lift_key
 from worker.quality.referee.protocol import DIRECTIONS
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
+from worker.run import ALONE, Run
 from worker.scenes.verdicts import lift_level, scene_verdicts
 from worker.simulation.surroundings import Scenes
 
@@ -90,12 +91,9 @@ def certified_grasps(
     *,
     count: int,
     batch: int = 0,
-    threads: int = 0,
-    device: str = "cpu",
     scenes: Scenes | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
-    progress: Progress = lambda done, total, message: None,
-    cancelled: Cancelled = lambda: False,
+    run: Run = ALONE,
 ) -> Certified:
     """A batch of a job: `count` valid grasps (sound ones where nobody judges), or as many as the budget finds; or
     `count` grasps of any kind.
@@ -106,18 +104,15 @@ def certified_grasps(
         request: method, fidelity, seed, friction; whether valid grasps are wanted, at which level, and the budget.
         count: grasps wanted.
         batch: number of the batch within its job.
-        threads: 0: all cores.
-        device: of the planner.
         scenes: where the grasps are to be used, in turn; valid then means lifted out of its scene. None: free.
         pieces: gives the object's convex pieces; runs beside the first round's planning.
-        progress: called with the share that is done.
-        cancelled: polled often.
+        run: told of the share that is done; asked often whether to stop. Its device is the planner's.
 
     Raises:
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
     """
-    work = _Work(hand, obj, request, batch, threads, device, progress, cancelled)
+    work = _Work(hand, obj, request, batch, run)
     work.scenes = scenes
     with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
         work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
@@ -131,18 +126,16 @@ def scored(
     grasps: GraspSet,
     request: JobOptions,
     *,
-    threads: int = 0,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
-    progress: Progress = lambda done, total, message: None,
-    cancelled: Cancelled = lambda: False,
+    run: Run = ALONE,
 ) -> Certified:
     """Grasps that are there already, judged and measured as `request` says; all of them are kept.
 
     Raises:
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
     """
-    work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, threads, "cpu", progress, cancelled)
+    work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, run)
     with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
         work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
         work.tried = len(grasps)
@@ -172,18 +165,14 @@ def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
 class _Work:
     """One batch in the making."""
 
-    def __init__(
-        self, hand: HandModel, obj: ObjectModel, request: JobOptions, batch: int, threads: int, device: str,
-        progress: Progress, cancelled: Cancelled,
-    ) -> None:  # fmt: skip
+    def __init__(self, hand: HandModel, obj: ObjectModel, request: JobOptions, batch: int, run: Run) -> None:
         self.hand, self.obj, self.request, self.batch = hand, obj, request, batch
-        self.threads, self.device, self.cancelled = threads, device, cancelled
         self.pieces: Future[ConvexPieces] | None = None
         self.scenes: Scenes | None = None
         self.tried = 0
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
-        self._progress = progress
-        self._span = (0.0, 1.0)
+        self._run = run
+        self._round_run = run.part(0.0, 1.0)
 
     def until(self, count: int) -> list[_Round]:
         """Rounds until `count` grasps are there or the budget is used up."""
@@ -195,7 +184,7 @@ class _Work:
         while size := next_round(count, valid := sum(len(part.grasps) for part in rounds), self.tried, budget):
             # A round brings the batch as far as the rate so far lets hope.
             begun = valid / count
-            self._span = (begun, begun + (1 - begun) * min(1.0, size / max(1, count - valid)) * 0.9)
+            self._round_run = self._run.part(begun, begun + (1 - begun) * min(1.0, size / max(1, count - valid)) * 0.9)
             rounds.append(self._round(len(rounds), size))
         return rounds
 
@@ -242,10 +231,9 @@ class _Work:
         request = self.request
         index = None if self.scenes is None else (self.tried + np.arange(size)) % len(self.scenes.object_pose)
         placed = self.scenes.placed(index) if self.scenes is not None and index is not None else None
+        wanted = Wanted(size, request.knobs, request.seed, self.batch + number * ROUND_STRIDE, placed)
         planned = synthesize(
-            self.hand, self.obj, count=size, method=request.method, fidelity=request.knobs, seed=request.seed,
-            batch=self.batch + number * ROUND_STRIDE, options=request.options, threads=self.threads, device=self.device,
-            progress=self._part(0), cancelled=self.cancelled, placed=placed,
+            self.hand, self.obj, wanted, self._part(0), method=request.method, options=request.options
         )  # fmt: skip
         planned = replace(planned, scene=index)
         self.tried += size
@@ -286,7 +274,7 @@ class _Work:
         began = time.perf_counter()
         grasps, columns, counts = scene_verdicts(
             self.hand, self.obj, grasps, scenes, level=lift_level(self.request.referee), pieces=pieces,
-            threads=self.threads, progress=self._part(1), cancelled=self.cancelled,
+            run=self._part(1),
         )  # fmt: skip
         self.seconds["referee"] += time.perf_counter() - began
         return grasps, columns, counts
@@ -295,8 +283,7 @@ class _Work:
         if self.pieces is None:
             return {}
         verdicts = judge(
-            self.hand, self.obj, grasps, level=self._level, threads=self.threads, pieces=self.pieces.result(),
-            progress=self._part(1), cancelled=self.cancelled,
+            self.hand, self.obj, grasps, level=self._level, pieces=self.pieces.result(), run=self._part(1)
         )  # fmt: skip
         self.seconds["referee"] += verdicts.seconds
         return {
@@ -307,10 +294,7 @@ class _Work:
 
     def _measured(self, grasps: GraspSet) -> Arrays:
         began = time.perf_counter()
-        columns = measure(
-            self.hand, self.obj, grasps, friction=self.request.friction, threads=self.threads,
-            progress=self._part(2), cancelled=self.cancelled,
-        )  # fmt: skip
+        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=self._part(2))
         self.seconds["quality"] += time.perf_counter() - began
         return dict(columns)
 
@@ -319,10 +303,10 @@ class _Work:
         assert self.pieces is not None
         columns: Arrays = {
             "quality/simulated_displacement_cm": simulated_displacement_cm(
-                self.hand, self.obj, grasps.grasp, pieces=self.pieces.result(), threads=self.threads
+                self.hand, self.obj, grasps.grasp, pieces=self.pieces.result(), run=self._run
             )
         }
-        common: dict[str, Any] = {"threads": self.threads, "pieces": self.pieces.result(), "cancelled": self.cancelled}
+        common: dict[str, Any] = {"pieces": self.pieces.result(), "run": self._run.quiet()}
         began = time.perf_counter()
         audited = np.flatnonzero(valid)[: self.request.audits_of(self.batch)]
         audit = np.full(len(grasps), -1, np.int8)
@@ -344,16 +328,9 @@ class _Work:
         placed = self.scenes.placed(grasps.scene)
         return judge_lifts(self.hand, self.obj, grasps, placed, level="letter", **common).success
 
-    def _part(self, number: int) -> Progress:
-        """Progress of one part of the present round within the whole batch."""
-        first, last = self._span
-        low, high = (0.0, *_PARTS)[number], _PARTS[number]
-
-        def tell(done: float, total: float, message: str) -> None:
-            share = low + (high - low) * (done / total if total > 0 else 0.0)
-            self._progress(first + (last - first) * share, 1.0, message)
-
-        return tell
+    def _part(self, number: int) -> Run:
+        """The run of one part of the present round."""
+        return self._round_run.part((0.0, *_PARTS)[number], _PARTS[number])
 
 
 _THRESHOLDS: Final = "quality/thresholds_m"

@@ -21,10 +21,12 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import Scene
 from worker.quality.referee.protocol import Test
+from worker.run import Run
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -62,7 +64,7 @@ class Subject:
 
     @cached_property
     def grasps(self) -> GraspSet:
-        return synthesize(self.hand, self.obj, count=self.count, fidelity=PLAIN, seed=SEED, threads=1)
+        return synthesize(self.hand, self.obj, Wanted(count=self.count, fidelity=PLAIN, seed=SEED), Run(threads=1))
 
     @cached_property
     def pieces(self) -> ConvexPieces:

@@ -22,6 +22,7 @@ from worker.quality.referee.decomposition import ConvexPieces, union_volume
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.model import MujocoOptions, Scene, build
 from worker.quality.table import measure
+from worker.run import Run
 from worker.simulation.reference import World
 
 STEPS = (1, 3, 10)
@@ -53,7 +54,8 @@ def predictors(subjects: list[Subject], held: list[Bools], spent: float) -> list
     rows[-1]["steps_ratio"] = float(STEPS[-1])
     with cpu() as clock:
         slips = [
-            -simulated_displacement_cm(s.hand, s.obj, s.grasps.grasp, pieces=s.pieces, threads=1) for s in subjects
+            -simulated_displacement_cm(s.hand, s.obj, s.grasps.grasp, pieces=s.pieces, run=Run(threads=1))
+            for s in subjects
         ]
     rows.append(_row("static hand, 35 steps of MuJoCo (simulated displacement)", slips, held, clock.seconds, spent))
     rows[0]["numpy_seconds"] = seconds
@@ -138,7 +140,7 @@ def judged(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
 def pads(subjects: list[Subject]) -> list[Row]:
     """Contact area and epsilon if all hand surface within a distance of the object touched it."""
     tables = [
-        measure(s.hand, s.obj, s.grasps.take(slice(0, 16)), friction=1.0, thresholds_m=PADS_M, threads=1)
+        measure(s.hand, s.obj, s.grasps.take(slice(0, 16)), friction=1.0, thresholds_m=PADS_M, run=Run(threads=1))
         for s in subjects
     ]
     area = np.concatenate([t["quality/contact_area_cm2"] for t in tables]).mean(axis=0)
@@ -155,7 +157,7 @@ def study(subjects: list[Subject]) -> dict[str, Any]:
         # Grasps, pieces and kernels are there before a clock starts.
         assert len(subject.grasps) and len(subject.pieces)
         simulated_displacement_cm(
-            subject.hand, subject.obj, subject.grasps.grasp.take(slice(0, 1)), pieces=subject.pieces, threads=1
+            subject.hand, subject.obj, subject.grasps.grasp.take(slice(0, 1)), pieces=subject.pieces, run=Run(threads=1)
         )
     rows, held, spent = judged(subjects)
     return {

@@ -15,6 +15,7 @@ from worker.rendering.cameras import Cameras
 from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.rendering.scenery import Pictures
 from worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
+from worker.run import Run
 from worker.scenes.simulate import drop
 
 SCENES, VIEWS = 2, 2
@@ -67,7 +68,7 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
 def _shoot(setting: Setting, samples: int) -> tuple[Pictures, float]:
     setting.shot = replace(setting.shot, samples=samples)
     with cpu() as clock:
-        pictures = setting.shoot("cpu", threads=1)
+        pictures = setting.shoot(Run(threads=1))
     return pictures, clock.seconds
 
 

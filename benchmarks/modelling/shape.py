@@ -10,10 +10,12 @@ import numpy as np
 from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of, share, verdicts
 from service.model.domain import FIDELITIES
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.penetration import penetration_depth
 from worker.quality.probe import probe_of
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions, build
+from worker.run import Run
 
 STANDARD = FIDELITIES["standard"]
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -41,9 +43,9 @@ def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
         held, depth, seconds, faces = 0, [], 0.0, []
         for name in objects:
             obj = object_of(data, name, fidelity.face_error_m)
-            synthesize(hand, obj, count=1, fidelity=fidelity, seed=1, threads=1)
+            synthesize(hand, obj, Wanted(count=1, fidelity=fidelity, seed=1), Run(threads=1))
             with cpu() as clock:
-                found = synthesize(hand, obj, count=count, fidelity=fidelity, seed=SEED, threads=1)
+                found = synthesize(hand, obj, Wanted(count=count, fidelity=fidelity, seed=SEED), Run(threads=1))
             seconds += clock.seconds
             faces.append(len(obj.faces))
             held += int(verdicts(scenes[name], found).sum())

@@ -15,6 +15,7 @@ from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.domain import FIDELITIES, OFFERED
 from service.model.errors import InputError
 from worker.engines.devices import Device
+from worker.run import Run
 
 app = typer.Typer()
 
@@ -63,14 +64,14 @@ def chart(
     from worker.studies.chart.sweeps import turns
 
     turns(knobs=knob or ())  # a wrong name is told before an hour of work
-    resolved = Device(device).resolve()
+    work = Run(Device(device).resolve(), threads)
     batches = [_number(part) for part in _parts(batch)]
     if quick:
         hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
         batches, peer_batch, repeats = [4], 2, 1
     chosen = settings_of(
         _parts(methods), known_fidelities(_parts(fidelities)), batches=batches, peer_batch=peer_batch,
-        options=option or [], quick=quick, threads=threads, device=resolved,
+        options=option or [], quick=quick, run=work,
     )  # fmt: skip
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
@@ -82,8 +83,8 @@ def chart(
     result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | said
     if sweep:
         result["sweeps"] = turn(
-            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, threads=threads,
-            device=resolved, knobs=knob or (), say=_say,
+            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=work,
+            knobs=knob or (), say=_say,
         )  # fmt: skip
     if out is not None:
         write(result, out)

@@ -18,6 +18,7 @@ from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
 from worker.quality.referee.key import Level
 from worker.quality.referee.lifting import LiftLevel
+from worker.run import Run
 
 app = typer.Typer(add_completion=False)
 
@@ -78,8 +79,7 @@ def evaluate_command(
                 level=level,  # type: ignore[arg-type]
                 hard=hard,
                 friction=friction,
-                threads=threads,
-                progress=partial(_show, bar, task, case.name),
+                run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])

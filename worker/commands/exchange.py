@@ -14,6 +14,7 @@ from service.model.errors import InputError
 from service.store import standing
 from service.store.shards import read_shard
 from worker.files.choice import EveryOption, UnjudgedOption, choose
+from worker.run import Run
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -87,7 +88,7 @@ def import_(
     sets = read_sets(format_, source, hand, object_, options)
     said = Origin(format_, origin, licence)
     files = [
-        write_scored(one, said, output, referee=referee, friction=friction, threads=threads, ordinal=k)
+        write_scored(one, said, output, referee=referee, friction=friction, ordinal=k, run=Run(threads=threads))
         for k, one in enumerate(sets)
     ]
     (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Final
@@ -9,7 +10,7 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.errors import InputError
@@ -26,6 +27,7 @@ from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
 from worker.rendering.pages.sheets import best, best_kept, contact_sheet, figures, three_sides_sheet, views_page
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
+from worker.run import Run
 
 app = typer.Typer(add_completion=False)
 
@@ -84,8 +86,8 @@ def render(
         task = bar.add_task("rendering", total=None)
         result = render_views(
             obj, np.asarray(scene["scene/object_pose"], float), views=views, stereo=stereo, width=size[0],
-            height=size[1], seed=number, device=used, baseline_m=baseline, extras=extras,
-            progress=lambda done, total, message: bar.update(task, completed=done, total=total, description=message),
+            height=size[1], seed=number, baseline_m=baseline, extras=extras,
+            run=Run(used, progress=partial(_show, bar, task)),
         )  # fmt: skip
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
@@ -136,7 +138,7 @@ def pictures(
         shown.joint_positions,
         (edge, edge),
         sides,
-        device=Device(device).resolve(),
+        run=Run(Device(device).resolve()),
         samples=samples,
     )
     title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
@@ -165,6 +167,10 @@ def _drawn(scene: Shard, base_file: Path, hand: str | None) -> DrawnHand:
         )
     joints = np.asarray(base["grasp/joint_positions"], float)[source]
     return DrawnHand(model, rows, np.asarray(scene["grasp/hand_pose"], float)[rows], joints)
+
+
+def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:
+    bar.update(task, completed=done, total=total, description=message)
 
 
 def _progress(quiet: bool) -> Progress:

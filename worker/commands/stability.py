@@ -66,9 +66,10 @@ def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long:
     backend.start()
     import warp as wp
 
+    from worker.run import Run
     from worker.studies.stability.studies import run
 
-    maps = run(names, hand, obj, quick=quick, long=long, threads=threads, say=_say)
+    maps = run(names, hand, obj, quick=quick, long=long, work=Run(threads=threads), say=_say)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 

@@ -29,10 +29,11 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-from worker.planners import PLANNERS, planner, scene_planner
-from worker.planners import Progress as Report
+from worker.planners import PLANNERS, planner
 from worker.planners.registry import parsed_options
 from worker.quality.referee.key import Level
+from worker.run import Progress as Report
+from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.simulation.surroundings import Scenes
 
@@ -96,7 +97,7 @@ def synth(
     obj = object_from_path(object_, face_error_m=request.knobs.face_error_m, options=mesh)
     place = parse_scene(scene, faces=faces)
     if place.kind != "free":
-        scene_planner(method, request.options)
+        planner(method, request.options, in_scenes=True)
     device = Device(device).resolve()
     began = time.perf_counter()
     poses = rest_poses(place, obj, count=scenes, seed=seed) if place.kind != "free" else {}
@@ -105,8 +106,7 @@ def synth(
         batches = [
             certified_grasps(
                 model, obj, request, count=min(BATCH_SIZE, grasps - first), batch=first // BATCH_SIZE,
-                threads=threads, device=device, scenes=where,
-                progress=report(first, min(BATCH_SIZE, grasps - first)),
+                scenes=where, run=Run(device, threads, report(first, min(BATCH_SIZE, grasps - first))),
             )
             for first in range(0, grasps, BATCH_SIZE)
         ]  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -24,11 +23,11 @@ from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import LiftLevel, judge_lifts
 from worker.quality.referee.protocol import Outcome
 from worker.quality.table import DEFAULT_FRICTION, measure
+from worker.run import ALONE, Run
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
-Progress = Callable[[float, float, str], None]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
 THRESHOLD_M: Final = 0.005
@@ -41,9 +40,8 @@ def evaluate(
     level: Level | LiftLevel = "certificate",
     hard: bool = False,
     friction: float | None = None,
-    threads: int = 0,
     cache: Path | None = None,
-    progress: Progress = lambda done, total, message: None,
+    run: Run = ALONE,
 ) -> dict[str, Any]:
     """One row of numbers, None where a number does not exist: too thin an object has no verdict.
 
@@ -59,9 +57,7 @@ def evaluate(
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
     mu = friction or case.friction or DEFAULT_FRICTION
-    table = measure(
-        case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], threads=threads, progress=progress
-    )
+    table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
     row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}
     row |= _success(case, None, 0.0)
     try:
@@ -72,13 +68,12 @@ def evaluate(
     else:
         if protocol == "dexgraspbench":
             verdicts = judge(
-                case.hand, case.obj, case.grasps, level=cast(Level, level), hard=hard, threads=threads, pieces=pieces,
-                progress=progress,
+                case.hand, case.obj, case.grasps, level=cast(Level, level), hard=hard, pieces=pieces, run=run,
             )  # fmt: skip
             row |= _success(case, verdicts, verdicts.seconds)
         if protocol == "lift" and case.placed is not None:
-            row |= _lifted(case, case.placed, level, hard, threads, pieces, progress)
-        sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, threads=threads)
+            row |= _lifted(case, case.placed, level, hard, pieces, run)
+        sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
         row |= pieces.facts
     return row | _medians(case, table, sd)
 
@@ -108,13 +103,10 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
     return row
 
 
-def _lifted(
-    case: Case, placed: Placed, level: str, hard: bool, threads: int, pieces: ConvexPieces, progress: Progress
-) -> dict[str, Any]:
+def _lifted(case: Case, placed: Placed, level: str, hard: bool, pieces: ConvexPieces, run: Run) -> dict[str, Any]:
     chosen: Any = "lift" if level == "certificate" else level
     verdicts = judge_lifts(
-        case.hand, case.obj, case.grasps, placed, level=chosen, hard=hard, threads=threads, pieces=pieces,
-        progress=progress,
+        case.hand, case.obj, case.grasps, placed, level=chosen, hard=hard, pieces=pieces, run=run
     )  # fmt: skip
     clear = plan_way(case.hand, case.obj, case.grasps, placed).clear
     held = int(verdicts.success.sum())

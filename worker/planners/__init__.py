@@ -5,26 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.port import Cancelled, Method, Options, Planner, Progress
-from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner, scene_planner
-from worker.simulation.surroundings import Placed
+from worker.planners.port import Method, Options, Planner, Wanted
+from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner
+from worker.run import ALONE, Run
 
 __all__ = [
     "GROUP",
     "PLANNERS",
-    "Cancelled",
     "Method",
     "Options",
     "Planner",
-    "Progress",
+    "Run",
+    "Wanted",
     "method",
     "method_names",
     "planner",
-    "scene_planner",
     "synthesize",
 ]
 
@@ -32,24 +30,11 @@ __all__ = [
 def synthesize(
     hand: HandModel,
     obj: ObjectModel,
+    wanted: Wanted,
+    run: Run = ALONE,
     *,
-    count: int,
     method: str = "fast_graspd",
-    fidelity: Fidelity,
     options: Mapping[str, Any] | None = None,
-    seed: int = 0,
-    batch: int = 0,
-    threads: int = 0,
-    device: str = "cpu",
-    progress: Progress = lambda done, total, message: None,
-    cancelled: Cancelled = lambda: False,
-    placed: Placed | None = None,
 ) -> GraspSet:
-    """Grasps by the named method with its own `options`, each in its scene where they are `placed`; see `Planner`."""
-    common: dict[str, Any] = {
-        "count": count, "fidelity": fidelity, "seed": seed, "batch": batch, "threads": threads, "device": device,
-        "progress": progress, "cancelled": cancelled,
-    }  # fmt: skip
-    if placed is None:
-        return planner(method, options)(hand, obj, **common)
-    return scene_planner(method, options)(hand, obj, **common, placed=placed)
+    """Grasps by the named method with its own `options`; see `Planner`."""
+    return planner(method, options, in_scenes=wanted.placed is not None)(hand, obj, wanted, run)

@@ -12,57 +12,36 @@ from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.run import Run
 from worker.simulation.surroundings import Placed
 
-Progress = Callable[[float, float, str], None]
-Cancelled = Callable[[], bool]
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which grasps of a hand on an object."""
+
+    count: int
+    fidelity: Fidelity
+    seed: int = 0
+    batch: int = 0
+    """Number of the batch among those of one seed."""
+    placed: Placed | None = None
+    """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
 
 
 class Planner(Protocol):
-    """Makes `count` grasps of a hand on an object.
+    """Makes `wanted.count` grasps of a hand on an object.
 
     The same seed, batch and index of a grasp within its batch give the same grasp, whatever the other grasps are; on
-    the CPU bit for bit. `progress(done, total, message)` may be called often; `cancelled()` is polled between launches.
+    the CPU bit for bit. `run.progress(done, total, message)` may be called often; `run.cancelled()` is polled between
+    launches. `wanted.placed` is None but for methods that plan `in_scenes`.
 
     Raises:
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
         InputError: when the pair cannot be grasped at all, with the reason.
     """
 
-    def __call__(
-        self,
-        hand: HandModel,
-        obj: ObjectModel,
-        *,
-        count: int,
-        fidelity: Fidelity,
-        seed: int,
-        batch: int,
-        threads: int,
-        device: str,
-        progress: Progress,
-        cancelled: Cancelled,
-    ) -> GraspSet: ...
-
-
-class ScenePlanner(Protocol):
-    """A planner that makes grasps for the scenes they are in: grasp i in scene `placed.index[i]`."""
-
-    def __call__(
-        self,
-        hand: HandModel,
-        obj: ObjectModel,
-        *,
-        count: int,
-        fidelity: Fidelity,
-        seed: int,
-        batch: int,
-        threads: int,
-        device: str,
-        progress: Progress,
-        cancelled: Cancelled,
-        placed: Placed | None,
-    ) -> GraspSet: ...
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet: ...
 
 
 class Options(BaseModel):
@@ -81,8 +60,8 @@ class Method:
     """Where the method is published."""
     planner: Callable[[Any], Planner]
     """From the options to the planner."""
-    scene_planner: Callable[[Any], ScenePlanner] | None = None
-    """The same for grasps in scenes; None: the method plans around floating objects only."""
+    in_scenes: bool = False
+    """Whether it plans grasps for the scenes they are in, or around floating objects only."""
     options: type[Options] = Options
     """The options it takes."""
     uses: tuple[str, ...] = ()

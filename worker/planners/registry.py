@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from service.cli import validation_line
 from service.model.errors import InputError
-from worker.planners.port import Method, Options, Planner, ScenePlanner
+from worker.planners.port import Method, Options, Planner
 
 #: Entry-point group of planners of other packages.
 GROUP: Final = "graspd.planners"
@@ -53,26 +53,17 @@ def method(name: str) -> Method:
     return found
 
 
-def planner(name: str, options: Mapping[str, Any] | None = None) -> Planner:
+def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: bool = False) -> Planner:
     """The planner of a method with its options; texts are read as the option's type.
 
     Raises:
-        InputError: unknown method, unknown option, or a value out of its range.
-    """
-    return method(name).planner(_options(name, options))
-
-
-def scene_planner(name: str, options: Mapping[str, Any] | None = None) -> ScenePlanner:
-    """The same for grasps in scenes.
-
-    Raises:
-        InputError: as `planner`, or the method plans around floating objects only.
+        InputError: unknown method, unknown option, a value out of its range; or it is to plan in scenes and cannot.
     """
     known = method(name)
-    if known.scene_planner is None:
-        able = ", ".join(one for one in method_names() if method(one).scene_planner is not None)
+    if in_scenes and not known.in_scenes:
+        able = ", ".join(one for one in method_names() if method(one).in_scenes)
         raise InputError(f"method {name} plans around floating objects only; in scenes choose {able}, or scene free")
-    return known.scene_planner(_options(name, options))
+    return known.planner(_options(name, options))
 
 
 def _options(name: str, options: Mapping[str, Any] | None) -> Options:

@@ -15,9 +15,7 @@ from typing import TypeVar
 import numpy as np
 import warp as wp
 
-from service.model.cores import available_cores
-from service.model.errors import TaskCancelled
-from worker.planners.port import Cancelled, Progress
+from worker.run import Run
 
 T = TypeVar("T")
 
@@ -25,32 +23,30 @@ T = TypeVar("T")
 class Steps:
     """Counts work done by all threads; looks at cancellation."""
 
-    def __init__(self, total: float, progress: Progress, cancelled: Cancelled) -> None:
-        self._total, self._progress, self._cancelled = total, progress, cancelled
+    def __init__(self, total: float, run: Run) -> None:
+        self._total, self._run = total, run
         self._done = 0.0
         self._lock = threading.Lock()
 
     def __call__(self, work: float, message: str) -> None:
         """Add done work; raises TaskCancelled."""
-        if self._cancelled():
-            raise TaskCancelled("the synthesis was cancelled")
+        self._run.check("the synthesis")
         with self._lock:
             self._done += work
-            self._progress(self._done, self._total, message)
+            self._run.progress(self._done, self._total, message)
 
 
-def cut(count: int, threads: int, device: str, *, least: int = 1) -> list[range]:
+def cut(count: int, run: Run, *, least: int = 1) -> list[range]:
     """Contiguous, nearly equal parts of a batch: one on a GPU, at most one per thread on a CPU.
 
     Args:
         count: grasps.
-        threads: CPU threads; 0: one per core.
-        device: Warp device.
+        run: its device and threads.
         least: fewest grasps worth a thread of their own.
     """
-    if wp.get_device(device).is_cuda:
+    if wp.get_device(run.device).is_cuda:
         return [range(count)]
-    parts = max(1, min(threads or available_cores(), count // least))
+    parts = max(1, min(run.cores, count // least))
     bounds = np.linspace(0, count, parts + 1).astype(int)
     return [range(int(a), int(b)) for a, b in pairwise(bounds)]
 

@@ -20,6 +20,8 @@ from service.model.errors import GraspdError
 if TYPE_CHECKING:
     from worker.objects.model import ObjectModel
 
+from worker.run import Run
+
 log = logging.getLogger(__name__)
 _RADIUS_M: Final = 0.03
 _HAND: Final = "barrett"
@@ -48,24 +50,24 @@ def check_engine(device: Callable[[], str], stages: Collection[Stage], *, thread
             name = stage.value
             importlib.import_module(f"worker.stages.{name}")
             if stage in _CHECKS:
-                _CHECKS[stage](of_device, threads)
+                _CHECKS[stage](Run(of_device, threads))
     except Exception as error:
         raise EngineError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
     log.info("the engine works; the check took %.1f s", time.monotonic() - started)
 
 
-def _check_synthesis(device: str, threads: int) -> None:
+def _check_synthesis(run: Run) -> None:
     from worker.certified import certified_grasps
     from worker.hands.load import hand_from_path
 
     request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="raw")
-    found = certified_grasps(hand_from_path(_HAND), _ball(), request, count=1, threads=threads, device=device)
+    found = certified_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
     _expect(
         len(found.grasps) == 1 and np.isfinite(found.grasps.grasp.hand_pose).all(), "a grasp of a ball is no number"
     )
 
 
-def _check_scene(device: str, threads: int) -> None:
+def _check_scene(run: Run) -> None:
     from worker.scenes import drop
 
     height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
@@ -73,15 +75,15 @@ def _check_scene(device: str, threads: int) -> None:
     _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
 
 
-def _check_pictures(device: str, threads: int) -> None:
+def _check_pictures(run: Run) -> None:
     from worker.rendering import render
 
     pose = np.array([[0.0, 0.0, _RADIUS_M, 1.0, 0.0, 0.0, 0.0]])
-    made = render(_ball(), pose, views=1, stereo=False, width=32, height=24, seed=0, device=device, threads=threads)
+    made = render(_ball(), pose, views=1, stereo=False, width=32, height=24, seed=0, run=run)
     _expect(int(np.ptp(made["image/rgb"])) > 0, "a picture of a ball shows nothing")
 
 
-_CHECKS: Final[Mapping[Stage, Callable[[str, int], None]]] = {
+_CHECKS: Final[Mapping[Stage, Callable[[Run], None]]] = {
     Stage.SYNTHESIZE: _check_synthesis,
     Stage.SCENE: _check_scene,
     Stage.RENDER: _check_pictures,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.cores import available_cores
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
@@ -23,10 +22,9 @@ from worker.quality.penetration import penetration_depth
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from worker.quality.volume import SharedVolume
 from worker.quality.wrench_space import Norm, measure_space, wrenches
+from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
-Progress = Callable[[float, float, str], None]
-Cancelled = Callable[[], bool]
 
 #: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
@@ -43,9 +41,7 @@ def measure(
     friction: float = DEFAULT_FRICTION,
     thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
     norm: Norm = "l1",
-    threads: int = 0,
-    progress: Progress = lambda done, total, message: None,
-    cancelled: Cancelled = lambda: False,
+    run: Run = ALONE,
 ) -> dict[str, NDArray[np.generic]]:
     """Quality columns of a base shard for N grasps, at the posture of contact.
 
@@ -56,16 +52,14 @@ def measure(
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
         norm: l1 (GraspIt!'s) or linf wrench space.
-        threads: 0: all cores.
-        progress: called with grasps done.
-        cancelled: polled between chunks.
+        run: told of grasps done; asked between chunks whether to stop.
 
     Returns:
         `quality/...` datasets: those of `MEASURES`, the thresholds and the planner's stability loss.
 
     Raises:
         InputError: no thresholds, or one beyond `REACH_M`.
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
     """
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
@@ -78,15 +72,14 @@ def measure(
 
     def work(chunk: slice) -> dict[str, NDArray[np.generic]]:
         nonlocal done
-        if cancelled():
-            raise TaskCancelled("the quality table was cancelled")
+        run.check("the quality table")
         columns = pair.columns(Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]))
         with lock:
             done += chunk.stop - chunk.start
-            progress(done, len(grasps), "quality")
+            run.progress(done, len(grasps), "quality")
         return columns
 
-    with ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="quality") as pool:
+    with ThreadPoolExecutor(run.cores, thread_name_prefix="quality") as pool:
         parts = list(pool.map(work, chunks))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else pair.empty()
     columns["quality/thresholds_m"] = thresholds

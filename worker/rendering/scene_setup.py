@@ -19,6 +19,8 @@ from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
 from worker.rendering.tracer import Tracer
 
 #: The table: a slab whose top is z = 0 [m].
+from worker.run import Run
+
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)
 #: Depth at which things wait that a pass does not show [m].
 _AWAY_M: Final = -50.0
@@ -80,38 +82,25 @@ class Setting:
             turn=np.array([scene.turn for scene in scenes]), lamps=[scene.lamp for scene in scenes],
         )  # fmt: skip
 
-    def shoot(
-        self,
-        device: str,
-        *,
-        threads: int = 0,
-        normals: bool = False,
-        tick: Callable[[float], None] | None = None,
-        cancelled: Callable[[], bool] = lambda: False,
-    ) -> Pictures:
+    def shoot(self, run: Run, *, normals: bool = False) -> Pictures:
         """The pictures; `Pictures.shape` is 0 for the table, 1 for the object, 2 + m for neighbour m."""
-        shot = replace(self.shot, normals=normals)
-        return self.stage(device).shoot(shot, threads=threads, tick=tick, cancelled=cancelled)
+        return self.stage(run.device).shoot(replace(self.shot, normals=normals), run)
 
-    def shoot_alone(self, device: str, *, threads: int = 0, cancelled: Callable[[], bool] = lambda: False) -> Pictures:
+    def shoot_alone(self, run: Run) -> Pictures:
         """One ray per pixel of the object with nothing around it; `Pictures.shape` is 1 where it is seen."""
         poses = self.poses.copy()
         poses[:, [k for k in range(poses.shape[1]) if k != 1], 2] = _AWAY_M
-        return self.stage(device, poses).shoot(
-            replace(self.shot, samples=1, shaded=False), threads=threads, cancelled=cancelled
-        )
+        return self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run)
 
-    def shoot_with(
-        self, drawn: DrawnHand, device: str, *, threads: int = 0, cancelled: Callable[[], bool] = lambda: False
-    ) -> Pictures:
+    def shoot_with(self, drawn: DrawnHand, run: Run) -> Pictures:
         """The same pictures with a hand in them."""
-        key = (*_key(self.objects), drawn.hand.content, len(self.poses), device)
-        stage = _kept(key, lambda: [*_solids(self.objects), *hand_solids(drawn.hand)], len(self.poses), device)
+        key = (*_key(self.objects), drawn.hand.content, len(self.poses), run.device)
+        stage = _kept(key, lambda: [*_solids(self.objects), *hand_solids(drawn.hand)], len(self.poses), run.device)
         shown = [look_of(drawn.hand, body) for body in drawn_bodies(drawn.hand)]
         stage.place(
             np.concatenate([self.poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
         )
-        return stage.shoot(self.shot, threads=threads, cancelled=cancelled)
+        return stage.shoot(self.shot, run)
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
         """The stage of these objects, kept for the next call with the same ones, with everything in its place."""

@@ -7,7 +7,7 @@ the pixel centres: depth, normals and shape indices come from it alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +19,6 @@ import warp as wp
 from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
-from service.model.cores import available_cores
 from service.model.errors import TaskCancelled
 from service.model.transforms import compose, pose_from_matrix, quat_from_axis_angle, quat_rotate
 from worker.engines import backend
@@ -27,6 +26,7 @@ from worker.rendering import kernels
 from worker.rendering.cameras import Floats, pixel_rays
 from worker.rendering.passes import LightPass, light_passes
 from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
+from worker.run import ALONE, Run
 
 #: The camera frame of the tracer (x right, y up, looks down -z) in the camera frame used here.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -93,28 +93,24 @@ class Tracer:
     def shoot(
         self,
         shot: Shot,
-        *,
-        threads: int = 0,
-        tick: Callable[[float], None] | None = None,
-        cancelled: Callable[[], bool],
+        run: Run = ALONE,
     ) -> Pictures:
         """Traces all cameras, `PIXELS_TOGETHER` pixels at a time.
 
         Args:
             shot: cameras and light.
-            threads: CPU threads that share the views; 0: one per core this process may use. A GPU takes all at once.
-            tick: told the share that is done.
-            cancelled: asked before every pass.
+            run: its threads share the views, a GPU takes all at once; told of pictures done, and asked before every
+                pass whether to stop.
 
         Raises:
-            TaskCancelled: `cancelled()` answered True.
+            TaskCancelled: `run.cancelled()` answered True.
         """
         self._turn(shot.turn)
-        parts = self._parts(shot, threads or available_cores())
+        parts = self._parts(shot, run.cores)
         done: list[Pictures] = []
         for group in parts:
             exposures = [_Exposure(self, shot, views) for views in group]
-            self._expose(exposures, shot, len(done) / sum(map(len, parts)), 1 / len(parts), tick, cancelled)
+            self._expose(exposures, shot, len(done) / sum(map(len, parts)), 1 / len(parts), run)
             done += [exposure.pictures(shot.samples) for exposure in exposures]
         names = ("rgb", "depth", "shape", "normal") if shot.normals else ("rgb", "depth", "shape")
         return Pictures(*(np.concatenate([getattr(p, name) for p in done]) for name in names))
@@ -134,22 +130,21 @@ class Tracer:
         shot: Shot,
         done: float,
         share: float,
-        tick: Callable[[float], None] | None,
-        cancelled: Callable[[], bool],
+        run: Run,
     ) -> None:
         """All passes of some exposures, in step: a pass has one lamp."""
         with ThreadPoolExecutor(len(exposures)) as pool:
             for number, one in enumerate(light_passes(shot.samples, shot.toward_lamp)):
-                if cancelled():
+                if run.cancelled():
                     raise TaskCancelled(f"cancelled after {number} of {shot.samples} passes")
                 rays = _rays(shot, one.shift, self.device)
                 self._sensor.create_default_light(enable_shadows=True, direction=wp.vec3f(*-one.toward))
                 # The first trace of a stage compiles its kernels: one thread must do that alone.
-                run = partial(_trace, rays=rays, one=one, first=number == 0)
-                list(pool.map(run, exposures) if self._traced else map(run, exposures))
+                trace = partial(_trace, rays=rays, one=one, first=number == 0)
+                list(pool.map(trace, exposures) if self._traced else map(trace, exposures))
                 self._traced = True
-                if tick is not None:
-                    tick(done + share * (number + 1) / shot.samples)
+                ready = done + share * (number + 1) / shot.samples
+                run.progress(ready * len(shot.world), len(shot.world), f"rendering {len(shot.world)} pictures")
 
     def _turn(self, turn: Floats) -> None:
         """Turns the worlds under the lamp and refits the tracer's tree."""

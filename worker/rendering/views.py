@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,6 +19,7 @@ from worker.rendering.channels import occlusion_ratio, ray_distance
 from worker.rendering.hands import DrawnHand
 from worker.rendering.scene_setup import TABLE_SIZE, CameraPlan, Setting
 from worker.rendering.scenery import Pictures
+from worker.run import ALONE, Run
 from worker.scenes.neighbours import Neighbours
 
 __all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
@@ -26,7 +27,6 @@ __all__ = ["SAMPLES", "TABLE_SIZE", "Extras", "render"]
 #: Passes per picture; half of them light the scene with the lamp, half with the sky.
 SAMPLES: Final = 12
 
-Progress = Callable[[float, float, str], None]
 Arrays = dict[str, NDArray[np.generic]]
 
 
@@ -55,12 +55,9 @@ def render(
     width: int,
     height: int,
     seed: int,
-    device: str,
-    progress: Progress | None = None,
-    cancelled: Callable[[], bool] = lambda: False,
+    run: Run = ALONE,
     baseline_m: float = BASELINE_M,
     samples: int = SAMPLES,
-    threads: int = 0,
     extras: Extras = NO_EXTRAS,
 ) -> Arrays:
     """Pictures of every scene from sampled or given cameras, all in one launch per pass.
@@ -72,12 +69,9 @@ def render(
         stereo: a rectified left and right picture per placement.
         width, height: picture size [px].
         seed: of cameras, materials and lights; same seed, same pixels. Scene s depends on (seed, s) alone.
-        device: Warp device, such as `cpu` or `cuda:0`.
-        progress: told about passes done.
-        cancelled: asked before each pass.
+        run: told of pictures done; asked before each pass whether to stop. Pixels do not depend on its threads.
         baseline_m: distance of the eyes.
         samples: rays per pixel.
-        threads: CPU threads; 0: one per core this process may use. Pixels do not depend on it.
         extras: further channels, given cameras, other objects, a hand.
 
     Returns:
@@ -87,7 +81,7 @@ def render(
 
     Raises:
         InputError: a count or size is out of range.
-        TaskCancelled: `cancelled()` answered True.
+        TaskCancelled: `run.cancelled()` answered True.
     """
     poses = np.asarray(object_pose, float).reshape(-1, 7)
     plan = CameraPlan(views, width, height, baseline_m if stereo else None, extras.cameras)
@@ -99,16 +93,13 @@ def render(
     beside = extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))
     placed = np.concatenate([poses[:, None], beside.poses], axis=1)
     setting = Setting([obj, *beside.objects], placed, plan, seed=seed, samples=samples)
-    pictures = setting.shoot(
-        device, threads=threads, normals="normals" in extras.channels,
-        tick=_ticker(progress, len(setting.shot.world)), cancelled=cancelled,
-    )  # fmt: skip
+    pictures = setting.shoot(run, normals="normals" in extras.channels)
     result = annotate(setting, pictures, obj, extras.channels)
     if "occlusion" in extras.channels:
-        alone = setting.shoot_alone(device, threads=threads, cancelled=cancelled).shape == 1
+        alone = setting.shoot_alone(run.quiet()).shape == 1
         result["box/occlusion_ratio"] = occlusion_ratio(np.asarray(result["image/segmentation"], np.uint8), alone)
     if extras.drawn is not None:
-        seen = setting.shoot_with(extras.drawn, device, threads=threads, cancelled=cancelled)
+        seen = setting.shoot_with(extras.drawn, run.quiet())
         result["image/rgb_hand"] = seen.rgb
         result["camera/hand_grasp"] = extras.drawn.grasp[setting.shot.world].astype(np.int32)
     return result
@@ -138,9 +129,3 @@ def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: S
     if pictures.normal is not None:
         result["image/normals"] = pictures.normal.astype(np.float16)
     return result
-
-
-def _ticker(progress: Progress | None, pictures: int) -> Callable[[float], None] | None:
-    if progress is None:
-        return None
-    return lambda share: progress(share * pictures, pictures, f"rendering {pictures} pictures")

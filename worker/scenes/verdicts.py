@@ -3,7 +3,6 @@ against six pushes?"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -18,6 +17,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import LiftLevel, judge_lifts
 from worker.quality.referee.protocol import DIRECTIONS
+from worker.run import Run
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Scenes
 
@@ -40,9 +40,7 @@ def scene_verdicts(
     *,
     level: LiftLevel,
     pieces: ConvexPieces | None,
-    threads: int,
-    progress: Callable[[float, float, str], None],
-    cancelled: Callable[[], bool],
+    run: Run,
 ) -> tuple[GraspSet, Arrays, dict[str, int]]:
     """Plan the way of grasps in their scenes, and judge those that are clear.
 
@@ -55,9 +53,7 @@ def scene_verdicts(
         scenes: the scenes.
         level: of the lift test.
         pieces: the object's convex pieces; None: nobody judges, and grasps are only told clear or not.
-        threads: 0: all cores.
-        progress: called with the share that is judged.
-        cancelled: polled between grasps.
+        run: told of grasps judged; asked between grasps whether to stop.
 
     Returns:
         The grasps with `approach`, `coming` and `lift`; columns of the base shard, `quality/success` being the
@@ -74,7 +70,7 @@ def scene_verdicts(
     columns["quality/success"] = success
     if pieces is None:
         return grasps, columns, counts
-    common: dict[str, Any] = {"threads": threads, "pieces": pieces, "progress": progress, "cancelled": cancelled}
+    common: dict[str, Any] = {"pieces": pieces, "run": run}
     lifts = judge_lifts(hand, obj, grasps.take(clear), placed.take(clear), level=level, **common)
     success[clear] = lifts.success
     outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)

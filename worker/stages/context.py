@@ -10,6 +10,7 @@ from typing import Final
 
 from service.model.errors import TaskCancelled
 from service.store.store import Store
+from worker.run import Run
 
 #: Progress told per second at most: enough for a smooth bar, little for Redis.
 _PROGRESS_RATE: Final = 4.0
@@ -50,13 +51,10 @@ class TaskContext:
             self._told = now
             self._tell(done, total, message)
 
-    def part(self, start: float, end: float) -> Callable[[float, float, str], None]:
-        """Progress of a part of the task that goes from share `start` to share `end` of the whole."""
-
-        def progress(done: float, total: float, message: str) -> None:
-            self.progress(start + (end - start) * (done / total if total > 0 else 0.0), 1.0, message)
-
-        return progress
+    @property
+    def run(self) -> Run:
+        """What the engine room needs to know of the task."""
+        return Run(self.device, self.threads, self.progress, self.cancelled)
 
     def cancelled(self) -> bool:
         """Whether to stop at the next launch."""

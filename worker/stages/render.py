@@ -26,10 +26,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         width=request.width,
         height=request.height,
         seed=batch_seed(message),
-        device=context.device,
-        progress=context.part(0.0, 1.0),
-        cancelled=context.cancelled,
-        threads=context.threads,
+        run=context.run.part(0.0, 1.0),
         extras=Extras(channels=request.channels),
     )
     return Output(pictures, {"scene_shard": message.inputs[0]})

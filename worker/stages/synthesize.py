@@ -24,11 +24,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         message.request,
         count=message.count,
         batch=message.batch,
-        threads=context.threads,
-        device=context.device,
         pieces=lambda prepared: pieces_of(context.store, prepared),
-        progress=context.part(0.0, 1.0),
-        cancelled=context.cancelled,
+        run=context.run,
     )
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     info = {**seconds, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}

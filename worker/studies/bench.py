@@ -17,6 +17,8 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import pairs
 from worker.planners.fast_graspd.planner import optimise_batch
+from worker.planners.port import Wanted
+from worker.run import Run
 from worker.studies.timing import kernel_shares
 
 Load = Callable[[float], ObjectModel]
@@ -72,7 +74,7 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
-        optimise_batch(hand, obj, count=1, fidelity=fidelity, seed=seed, batch=0, threads=1, device=device)
+        optimise_batch(hand, obj, Wanted(count=1, fidelity=fidelity, seed=seed, batch=0), Run(threads=1, device=device))
         seconds.append(round(time.perf_counter() - began, 3))
     return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
 
@@ -83,7 +85,9 @@ def _run(
     seconds = []
     for seed in range(repeats + 1):
         began = time.perf_counter()
-        optimise_batch(hand, obj, count=batch, fidelity=fidelity, seed=seed, batch=0, threads=threads, device=device)
+        optimise_batch(
+            hand, obj, Wanted(count=batch, fidelity=fidelity, seed=seed, batch=0), Run(threads=threads, device=device)
+        )
         seconds.append(time.perf_counter() - began)
     typical = median(seconds[1:])
     iterations = fidelity.coarse_iterations + fidelity.fine_iterations

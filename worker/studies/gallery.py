@@ -15,16 +15,18 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import synthesize
+from worker.planners import Wanted, synthesize
 from worker.rendering.camera_file import GivenCameras
 from worker.rendering.cameras import FIELD_OF_VIEW, distance_to_fill, look_at
 from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import label_page, scene_cells
 from worker.rendering.views import Extras, render
+from worker.run import Run
 from worker.scenes import Neighbours, drop, drop_together, transfer
 
 Say = Callable[[str], None]
 #: Size of one picture [px].
+
 SIZE: Final = (300, 225)
 #: Rays per pixel: pages are looked at.
 SAMPLES: Final = 32
@@ -63,7 +65,7 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
         poses = drop(obj, count=1, seed=seed + k)["scene/object_pose"]
         options: dict[str, Any] = {**_VIEW, "stereo": True}
         seen = render(
-            obj, poses, views=1, seed=seed + k, device=device, extras=Extras(channels=("normals",)), **options
+            obj, poses, views=1, seed=seed + k, extras=Extras(channels=("normals",)), **options, run=Run(device=device)
         )
         rows.append(scene_cells(seen))
         names.append([obj.name])
@@ -82,9 +84,14 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
             say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps stay clear")
             camera = _camera(drawn, obj, pose)
             seen = render(
-                obj, pose[None], views=1, seed=seed + k, device=device,
-                extras=Extras(cameras=GivenCameras(extrinsics=camera[None]), drawn=drawn), **_VIEW,
-            )  # fmt: skip
+                obj,
+                pose[None],
+                views=1,
+                seed=seed + k,
+                extras=Extras(cameras=GivenCameras(extrinsics=camera[None]), drawn=drawn),
+                **_VIEW,
+                run=Run(device=device),
+            )
             cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
             below.append(f"{obj.name}: {kept} of {tried} fit")
         rows.append(cells)
@@ -101,10 +108,7 @@ def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple
     scenes = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
     kept, tried, best = 0, 0, -np.inf
     for batch in range(ROUNDS):
-        found = synthesize(
-            hand, obj, count=GRASPS, method="fast_graspd", fidelity=FIDELITIES["draft"], seed=seed, batch=batch,
-            threads=0, device=device, progress=lambda *_: None, cancelled=lambda: False,
-        )  # fmt: skip
+        found = synthesize(hand, obj, Wanted(GRASPS, FIDELITIES["draft"], seed, batch), Run(device))
         placed = transfer(hand, found.grasp, found.pregrasp, scenes)
         clearance = np.asarray(placed["grasp/table_clearance_m"], float)
         kept, tried = kept + int(placed["grasp/valid"].sum()), tried + len(clearance)
@@ -150,7 +154,7 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
         poses, beside = scene["scene/object_pose"], Neighbours(others, scene["scene/neighbour_pose"])
         extras = Extras(channels=("normals", "occlusion"), cameras=_past(poses, first, beside), neighbours=beside)
         options: dict[str, Any] = {**_VIEW, "stereo": True}
-        seen = render(first, poses, views=1, seed=seed + k, device=device, extras=extras, **options)
+        seen = render(first, poses, views=1, seed=seed + k, extras=extras, **options, run=Run(device=device))
         rows.append(scene_cells(seen))
         hidden = float(np.asarray(seen["box/occlusion_ratio"])[0])
         names.append([f"{first.name}, {100 * hidden:.0f} % hidden"])

@@ -20,6 +20,7 @@ from service.store.shards import write_shard
 from worker.objects.model import ObjectModel
 from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.rendering.views import SAMPLES, Extras, render
+from worker.run import Run
 from worker.scenes.simulate import drop
 
 SCENES: Final = 2
@@ -58,15 +59,22 @@ def bench_render(
 
     def whole() -> dict[str, NDArray[np.generic]]:
         return render(
-            obj, poses, views=VIEWS, stereo=False, width=width, height=height, seed=seed, device=device, threads=1,
+            obj,
+            poses,
+            views=VIEWS,
+            stereo=False,
+            width=width,
+            height=height,
+            seed=seed,
             extras=extras,
-        )  # fmt: skip
+            run=Run(device=device, threads=1),
+        )
 
     arrays = whole()
     timer = _Timer(device, repeats)
     stage = setting.stage(device)
-    bare = timer(lambda: stage.shoot(bare_shot, threads=1, cancelled=lambda: False))
-    plain = timer(lambda: setting.shoot(device, threads=1))
+    bare = timer(lambda: stage.shoot(bare_shot, Run(device, 1)))
+    plain = timer(lambda: setting.shoot(Run(device, 1)))
     rendered = timer(whole)
     packed = timer(lambda: write_shard("views", arrays, {}))
     stored = {name: _store(arrays, options, timer) for name, options in COMPRESSIONS.items()}

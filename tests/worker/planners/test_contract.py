@@ -13,6 +13,8 @@ from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import PLANNERS, method, synthesize
+from worker.planners.port import Wanted
+from worker.run import Run
 
 #: All methods but fast_graspd, with the options that make them quick.
 PEERS: dict[str, dict[str, object]] = {name: dict(method(name).quick) for name in PLANNERS if name != "fast_graspd"}
@@ -22,9 +24,13 @@ EACH = pytest.mark.parametrize("name", sorted(PEERS))
 
 def grasps(name: str, count: int, *, threads: int = 1, seed: int = 0, hand: str = "barrett") -> GraspSet:
     return synthesize(
-        hand_from_path(hand), object_from_path("block"), count=count, method=name, fidelity=FIDELITIES["draft"],
-        options=PEERS[name], seed=seed, threads=threads,
-    )  # fmt: skip
+        hand_from_path(hand),
+        object_from_path("block"),
+        Wanted(count=count, fidelity=FIDELITIES["draft"], seed=seed),
+        Run(threads=threads),
+        method=name,
+        options=PEERS[name],
+    )
 
 
 @EACH
@@ -54,7 +60,11 @@ def test_cancelling_stops_at_the_first_look(name: str) -> None:
 
     with pytest.raises(TaskCancelled):
         synthesize(
-            hand_from_path("barrett"), object_from_path("block"), count=2, method=name, fidelity=FIDELITIES["draft"],
-            options=PEERS[name], threads=1, progress=progress, cancelled=stop.is_set,
-        )  # fmt: skip
+            hand_from_path("barrett"),
+            object_from_path("block"),
+            Wanted(count=2, fidelity=FIDELITIES["draft"]),
+            Run(threads=1, progress=progress, cancelled=stop.is_set),
+            method=name,
+            options=PEERS[name],
+        )
     assert len(calls) == 1

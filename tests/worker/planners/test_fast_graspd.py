@@ -13,7 +13,9 @@ from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.table import measure
+from worker.run import Run
 
 DRAFT = FIDELITIES["draft"]
 QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
@@ -23,8 +25,8 @@ def grasps(
     count: int, *, hand: str = "allegro", obj: str = "mug", fidelity: Fidelity = QUICK, threads: int = 1, seed: int = 0,
     batch: int = 0,
 ) -> GraspSet:  # fmt: skip
-    knobs = {"count": count, "fidelity": fidelity, "threads": threads, "seed": seed, "batch": batch}
-    return synthesize(hand_from_path(hand), object_from_path(obj), device="cpu", **knobs)
+    wanted = Wanted(count, fidelity, seed, batch)
+    return synthesize(hand_from_path(hand), object_from_path(obj), wanted, Run(threads=threads))
 
 
 def test_the_same_seed_gives_the_same_grasps_bit_for_bit() -> None:
@@ -61,7 +63,7 @@ def test_grasps_respect_joint_limits_and_unit_quaternions(hand: str) -> None:
 def test_grasps_touch_with_several_links_and_hardly_penetrate(hand: str, obj: str) -> None:
     """Medians over 12 grasps at standard fidelity; limits a third looser than what users are told to expect."""
     found = grasps(12, hand=hand, obj=obj, fidelity=FIDELITIES["standard"], threads=2)
-    quality = measure(hand_from_path(hand), object_from_path(obj), found, friction=1.0, threads=2)
+    quality = measure(hand_from_path(hand), object_from_path(obj), found, friction=1.0, run=Run(threads=2))
     assert np.median(quality["quality/contact_links"]) >= 3
     assert np.median(quality["quality/penetration_depth_mm"]) < 1.0
     assert np.median(quality["quality/self_penetration_depth_mm"]) < 1.0
@@ -106,12 +108,14 @@ def test_cancelling_stops_within_a_few_iterations() -> None:
 
     with pytest.raises(TaskCancelled):
         synthesize(
-            hand_from_path("allegro"), object_from_path("mug"), count=4, fidelity=DRAFT, threads=1,
-            progress=progress, cancelled=stop.is_set,
-        )  # fmt: skip
+            hand_from_path("allegro"),
+            object_from_path("mug"),
+            Wanted(count=4, fidelity=DRAFT),
+            Run(threads=1, progress=progress, cancelled=stop.is_set),
+        )
     assert len(calls) == 1
 
 
 def test_an_unknown_method_is_refused_with_the_known_ones() -> None:
     with pytest.raises(InputError, match="fast_graspd"):
-        synthesize(hand_from_path("allegro"), object_from_path("mug"), count=1, method="magic", fidelity=DRAFT)
+        synthesize(hand_from_path("allegro"), object_from_path("mug"), Wanted(count=1, fidelity=DRAFT), method="magic")

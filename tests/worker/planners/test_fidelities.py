@@ -18,7 +18,9 @@ from service.model.domain import FIDELITIES, Fidelity
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import load_object
 from worker.planners import PLANNERS, method, synthesize
+from worker.planners.port import Wanted
 from worker.quality.table import measure
+from worker.run import Run
 
 #: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
 SHORT: dict[str, Any] = {
@@ -42,15 +44,15 @@ def made(name: str, fidelity: Fidelity) -> dict[str, str]:
     obj = load_object({"egg.stl": egg()}, name="egg", digest="egg", face_error_m=fidelity.face_error_m)
     options = dict(method(name).quick) | ({"grid": 24} if name == "graspd2022" else {})
     found = synthesize(
-        hand, obj, count=2, method=name, fidelity=fidelity, options=options, seed=3, threads=1,
-    )  # fmt: skip
+        hand, obj, Wanted(count=2, fidelity=fidelity, seed=3), Run(threads=1), method=name, options=options
+    )
     columns = {
         "faces": obj.faces,
         "grasp": found.grasp.hand_pose,
         "joints": found.grasp.joint_positions,
         "pregrasp": found.pregrasp.joint_positions,
         "squeeze": found.squeeze.joint_positions,
-        **measure(hand, obj, found, threads=1),
+        **measure(hand, obj, found, run=Run(threads=1)),
     }
     return {column: digest_bytes(values.tobytes()) for column, values in columns.items()}
 

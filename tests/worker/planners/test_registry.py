@@ -97,3 +97,9 @@ def test_the_page_names_every_method_with_all_its_options_and_defaults(name: str
     row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` | "))
     for option, field in method(name).options.model_fields.items():
         assert f"`{option}` ({field.default:g}" in row
+
+
+def test_a_method_that_plans_around_free_objects_is_refused_in_scenes() -> None:
+    with pytest.raises(InputError, match="autograsp plans around floating objects only; in scenes choose fast_graspd"):
+        planner("autograsp", in_scenes=True)
+    assert callable(planner("fast_graspd", in_scenes=True))

@@ -14,6 +14,8 @@ from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
+from worker.run import Run
 
 #: Mean distance between the same surface points of two hands [m]. A difference of 5 mm is seen at a glance.
 ALIKE_M = 0.005
@@ -21,7 +23,7 @@ ALIKE_M = 0.005
 
 def test_no_two_grasps_of_a_batch_are_alike() -> None:
     hand = hand_from_path("allegro")
-    found = synthesize(hand, object_from_path("block"), count=32, fidelity=FIDELITIES["draft"], device="cpu")
+    found = synthesize(hand, object_from_path("block"), Wanted(count=32, fidelity=FIDELITIES["draft"]))
     points = sample_surface(hand, 200)
     poses = body_poses(hand, found.grasp.hand_pose, found.grasp.joint_positions)
     world = apply(poses[:, points.body], points.position)
@@ -38,7 +40,7 @@ def test_memory_is_flat_over_a_thousand_batches() -> None:
 
     def run(first: int, count: int) -> int:
         for batch in range(first, first + count):
-            synthesize(hand, obj, count=4, fidelity=tiny, batch=batch, threads=2, device="cpu")
+            synthesize(hand, obj, Wanted(count=4, fidelity=tiny, batch=batch), Run(threads=2))
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     warm = run(0, 100)

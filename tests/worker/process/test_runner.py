@@ -231,7 +231,7 @@ def test_progress_is_told_a_few_times_a_second_however_often_it_is_made() -> Non
 def test_a_part_of_a_task_moves_its_share_of_the_bar() -> None:
     told: list[tuple[float, float, str]] = []
     context = TaskContext(open_store("memory://"), tell=lambda *args: told.append(args))
-    context.part(0.8, 1.0)(1, 2, "quality")
+    context.run.part(0.8, 1.0).progress(1, 2, "quality")
     assert told == [(pytest.approx(0.9), 1.0, "quality")]
 
 

@@ -8,6 +8,7 @@ from service.model.domain import FIDELITIES
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.quality.referee.judge import judge
 
 GRASPS = 32
@@ -17,7 +18,7 @@ GRASPS = 32
 def test_cheap_levels_agree_with_the_letter_on_grasps_that_nobody_chose() -> None:
     """99 % is what larger studies find; two grasps of 32 leave room for one chance event more than that."""
     hand, obj = hand_from_path("allegro"), object_from_path("bottle")
-    grasps = synthesize(hand, obj, count=GRASPS, fidelity=FIDELITIES["draft"], seed=77, device="cpu")
+    grasps = synthesize(hand, obj, Wanted(count=GRASPS, fidelity=FIDELITIES["draft"], seed=77))
     letter = judge(hand, obj, grasps, level="letter")
     assert 0 < letter.success.sum() < GRASPS, "the set must hold both kinds"
     for level, work in (("certificate", 0.3), ("screen", 0.3)):

@@ -21,6 +21,7 @@ from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, Probe
 from worker.quality.table import MEASURES, measure
 from worker.quality.volume import SharedVolume, VoxelVolume
+from worker.run import Run
 
 #: Single precision of coordinates around 0.1 m.
 SINGLE = 1e-6
@@ -138,7 +139,7 @@ def test_moving_hand_and_object_together_changes_nothing_but_rounding() -> None:
 
 def test_columns_are_the_schema_and_the_same_for_any_number_of_threads() -> None:
     poses = posture(*(((0, 0, -0.09), (a, a)) for a in np.linspace(0.1, 0.5, 20)))
-    one, two = (measure(two_finger_hand(), BOX, grasp_set(poses), threads=n) for n in (1, 2))
+    one, two = (measure(two_finger_hand(), BOX, grasp_set(poses), run=Run(threads=n)) for n in (1, 2))
     # What is optional comes from the referee, `valid` from the gate.
     wanted = {n for n, column in SCHEMAS["base"].items() if n.startswith("quality/") and not column.optional}
     assert set(one) == wanted - {"quality/valid"}
@@ -148,7 +149,7 @@ def test_columns_are_the_schema_and_the_same_for_any_number_of_threads() -> None
 
 def test_cancelled_table_stops() -> None:
     with pytest.raises(TaskCancelled):
-        measure(two_finger_hand(), BOX, grasp_set(closed_on_box(0)), cancelled=lambda: True)
+        measure(two_finger_hand(), BOX, grasp_set(closed_on_box(0)), run=Run(cancelled=lambda: True))
 
 
 def test_threshold_beyond_reach_is_refused() -> None:

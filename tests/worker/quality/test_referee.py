@@ -30,6 +30,7 @@ from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from worker.quality.referee.model import OBJECT_MASS, MujocoOptions, blend, build
 from worker.quality.referee.protocol import Outcome, Test
 from worker.quality.referee.robustness import robustness
+from worker.run import Run
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
@@ -186,7 +187,7 @@ def test_hard_holds_no_more_than_normal() -> None:
 
 
 def test_verdicts_do_not_depend_on_threads() -> None:
-    one, two = (judge(PADS, BOX, many_grasps(), threads=n, pieces=WHOLE) for n in (1, 2))
+    one, two = (judge(PADS, BOX, many_grasps(), pieces=WHOLE, run=Run(threads=n)) for n in (1, 2))
     assert np.array_equal(one.margin, two.margin)
     assert one.key == two.key
 
@@ -203,7 +204,7 @@ def test_progress_is_told_by_one_thread_at_a_time_and_counts_every_grasp() -> No
         time.sleep(0.02)  # long enough for another thread to come in, if it may
         alone.release()
 
-    judge(PADS, BOX, many_grasps(), level="screen", threads=4, pieces=WHOLE, progress=progress)
+    judge(PADS, BOX, many_grasps(), level="screen", pieces=WHOLE, run=Run(threads=4, progress=progress))
     assert overlaps == 0
     assert told == list(range(1, len(many_grasps()) + 1))
 
@@ -360,7 +361,7 @@ def test_unknown_level_is_refused() -> None:
 
 def test_cancelled_referee_stops() -> None:
     with pytest.raises(TaskCancelled):
-        judge(PADS, BOX, grasp_of(), pieces=WHOLE, cancelled=lambda: True)
+        judge(PADS, BOX, grasp_of(), pieces=WHOLE, run=Run(cancelled=lambda: True))
 
 
 def test_convex_object_is_its_own_single_piece(tmp_path: Path) -> None:

@@ -16,16 +16,18 @@ from worker.objects.model import ObjectModel
 from worker.rendering import render
 from worker.rendering.cameras import Cameras
 from worker.rendering.views import TABLE_SIZE
+from worker.run import Run
 
 #: What a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it.
 DEPTH_M = 1e-4
+
 SIZE = (96, 72)
 RADIUS = 0.05
 REST = np.array([[0.02, -0.01, RADIUS, 1.0, 0, 0, 0]])
 
 
 def shoot(obj: ObjectModel, poses: np.ndarray, **options) -> dict[str, np.ndarray]:
-    options = {"views": 2, "stereo": True, "seed": 1, "device": "cpu", "samples": 2} | options
+    options = {"views": 2, "stereo": True, "seed": 1, "samples": 2} | options
     return render(obj, poses, width=SIZE[0], height=SIZE[1], **options)
 
 
@@ -236,12 +238,12 @@ def test_the_object_casts_a_shadow(ball, ball_views):
 def test_a_cancelled_render_stops_between_passes(ball):
     answers = iter([False, True])
     with pytest.raises(TaskCancelled):
-        shoot(ball, REST, cancelled=lambda: next(answers))
+        shoot(ball, REST, run=Run(cancelled=lambda: next(answers)))
 
 
 def test_progress_ends_with_all_pictures(ball):
     told: list[tuple[float, float, str]] = []
-    shoot(ball, REST, progress=lambda *what: told.append(what))
+    shoot(ball, REST, run=Run(progress=lambda *what: told.append(what)))
     assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
     assert told[-1][:2] == (4.0, 4.0)
 

@@ -17,6 +17,7 @@ from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 from worker.scenes.clearance import approach
 from worker.scenes.way import MARGIN_M, STANDOFF_M, plan_way
 from worker.simulation.surroundings import Obstacle, Placed
@@ -33,7 +34,7 @@ def planned():
 
     spec = SceneSpec(kind="table")
     placed = Placed(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(8) % 2)
-    return hand, obj, placed, synthesize(hand, obj, count=8, fidelity=QUICK, seed=4, placed=placed)
+    return hand, obj, placed, synthesize(hand, obj, Wanted(count=8, fidelity=QUICK, seed=4, placed=placed))
 
 
 def test_every_grasp_is_clear_of_the_table_by_mujocos_distances(planned) -> None:
@@ -68,14 +69,14 @@ def test_the_whole_way_is_as_clear_as_it_says(planned) -> None:
 def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     hand, obj, placed, grasps = planned
     alone = Placed(placed.supports, placed.object_pose, placed.index[:3])
-    found = synthesize(hand, obj, count=3, fidelity=QUICK, seed=4, placed=alone)
+    found = synthesize(hand, obj, Wanted(count=3, fidelity=QUICK, seed=4, placed=alone))
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
 
 
 def test_a_scene_without_obstacles_leaves_the_hand_free_to_come_from_below() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
     nothing = Placed((), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(8, int))
-    found = synthesize(hand, obj, count=8, fidelity=QUICK, seed=4, placed=nothing)
+    found = synthesize(hand, obj, Wanted(count=8, fidelity=QUICK, seed=4, placed=nothing))
     below = Obstacle.half_space([0, 0, 1], -0.03)
     assert (mujoco_distances(hand, found.grasp, below) < 0).any()
 

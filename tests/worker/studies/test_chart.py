@@ -17,10 +17,11 @@ from service.store.study_records import latest
 from worker.commands.chart import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
+from worker.run import Run
 from worker.studies.chart.report import markdown
 from worker.studies.chart.settings import settings_of
 from worker.studies.chart.statistics import first_valid, pareto, summed
-from worker.studies.chart.sweeps import Turn, _run, turns
+from worker.studies.chart.sweeps import Turn, _make, turns
 from worker.studies.chart.variants import asking_each
 
 RUN_KEYS = {
@@ -87,7 +88,7 @@ def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
 def test_a_method_can_be_charted_with_options_and_a_batch_of_its_own() -> None:
     plain, kept = settings_of(
         ["graspit", "graspit:keep=5@10"], ["draft"], batches=[32], peer_batch=4, options=["graspit:steps=40000"],
-        quick=False, threads=1, device="cpu",
+        quick=False, run=Run(threads=1),
     )  # fmt: skip
     assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
     assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
@@ -160,7 +161,7 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
-        _run(hand, obj, 2, 0, turn=Turn("queries", "", little, change), threads=1, device="cpu")
+        _make(hand, obj, 2, 0, turn=Turn("queries", "", little, change), run=Run(threads=1))
         for change in (None, asking_each)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)

@@ -23,6 +23,7 @@ from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.quality.probe import probe_of
 from worker.rendering import render
+from worker.run import Run
 from worker.scenes import drop
 from worker.simulation.reference import Contacts, World, direct
 
@@ -91,7 +92,7 @@ def test_the_page_shows_the_stored_table(title: str) -> None:
 def test_the_pages_recipe_finds_the_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
     obj = object_from_path("block")
     poses = drop(obj, count=1, seed=2)["scene/object_pose"]
-    arrays = render(obj, poses, views=1, stereo=False, width=40, height=30, seed=3, device="cpu", samples=2, threads=1)
+    arrays = render(obj, poses, views=1, stereo=False, width=40, height=30, seed=3, samples=2, run=Run(threads=1))
     (tmp_path / "views.h5").write_bytes(write_shard("views", arrays, {}))
     with h5py.File(tmp_path / "scenes.h5", "w") as file:
         file["scene/object_pose"] = poses

@@ -23,7 +23,7 @@ def test_the_bare_tracer_traces_the_same_scene():
     poses = np.array([[[0, 0, 0.035, 1.0, 0, 0, 0]]])
     setting = Setting([BLOCK], poses, CameraPlan(2, 48, 36, None), seed=0, samples=4)
     whole = setting.shoot("cpu")
-    bare = setting.stage("cpu").shoot(replace(setting.shot, shaded=False), cancelled=lambda: False)
+    bare = setting.stage("cpu").shoot(replace(setting.shot, shaded=False))
     np.testing.assert_array_equal(bare.shape, whole.shape)
     np.testing.assert_array_equal(bare.depth, whole.depth)
     assert not bare.rgb.any() and whole.rgb.any()

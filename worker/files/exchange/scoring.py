@@ -14,10 +14,11 @@ from worker.files.base_attributes import base_attributes
 from worker.files.exchange.imported import Imported, Origin, plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
+from worker.run import ALONE, Run
 
 
 def write_scored(
-    found: Imported, origin: Origin, folder: Path, *, referee: str, friction: float, threads: int = 0, ordinal: int = 0
+    found: Imported, origin: Origin, folder: Path, *, referee: str, friction: float, ordinal: int = 0, run: Run = ALONE
 ) -> Path:
     """Judge and measure a set of grasps and write it as a base shard, its object's mesh beside it.
 
@@ -27,8 +28,8 @@ def write_scored(
         folder: where to; made if absent.
         referee: level of the verdicts, or none.
         friction: Coulomb coefficient of the metrics.
-        threads: 0: all cores.
         ordinal: number of the set, part of the file's name.
+        run: told of the share that is done; asked often whether to stop.
 
     Returns:
         the shard's path.
@@ -48,7 +49,7 @@ def write_scored(
         )  # fmt: skip
     except ValueError:
         raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
-    made = scored(found.hand, found.obj, found.grasps, request, threads=threads)
+    made = scored(found.hand, found.obj, found.grasps, request, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
     attributes: dict[str, Attribute] = {

@@ -7,15 +7,15 @@ from typing import Final
 
 from pydantic import Field
 
-from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.autograsp import kernels
 from worker.planners.autograsp.closing import Closer
 from worker.planners.peers import free_starts, grasp_set, ground_of, joined
-from worker.planners.port import Cancelled, Method, Options, Planner, Progress
+from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
+from worker.run import Run
 from worker.simulation.state import HandState
 
 
@@ -31,17 +31,14 @@ class Autograsp:
     def __init__(self, options: AutograspOptions) -> None:
         self.options = options
 
-    def __call__(
-        self, hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int,
-        threads: int, device: str, progress: Progress, cancelled: Cancelled,
-    ) -> GraspSet:  # fmt: skip
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, device, kernels)
-        steps = Steps(3 * count, progress, cancelled)
+        pair = ground_of(hand, obj, run.device, kernels)
+        steps = Steps(3 * wanted.count, run)
 
         def work(indices: range) -> HandState:
             n = len(indices)
-            state = free_starts(pair, seed=seed, batch=batch, indices=indices)
+            state = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(n, "starts")
             closer = Closer(pair, n)
             state = closer.approach(state, self.options.standoff_m)
@@ -50,7 +47,7 @@ class Autograsp:
             steps(n, "closing")
             return state
 
-        states = run_parts(cut(count, threads, device), work)
+        states = run_parts(cut(wanted.count, run), work)
         return grasp_set(pair, joined(states), began, {})
 
 

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -17,8 +16,9 @@ from worker.planners.dfc.schedule import STEPS
 from worker.planners.dfc.search import Descent, Floats
 from worker.planners.dfc.starts import sample_starts
 from worker.planners.peers import grasp_set, ground_of, joined
-from worker.planners.port import Cancelled, Method, Options, Planner, Progress
+from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
+from worker.run import Run
 from worker.simulation.state import HandState
 
 #: Force closure, distance and penetration that the source lets pass.
@@ -37,22 +37,19 @@ class Dfc:
     def __init__(self, options: DfcOptions) -> None:
         self.options = options
 
-    def __call__(
-        self, hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int,
-        threads: int, device: str, progress: Progress, cancelled: Cancelled,
-    ) -> GraspSet:  # fmt: skip
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, device, kernels)
-        steps = Steps(count * (self.options.steps + 1), progress, cancelled)
+        pair = ground_of(hand, obj, run.device, kernels)
+        steps = Steps(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
-            starts = sample_starts(hand, obj, seed=seed, batch=batch, indices=indices)
+            starts = sample_starts(hand, obj, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(len(indices), "starts")
-            descent = Descent(pair, starts, [[seed, batch, index] for index in indices])
+            descent = Descent(pair, starts, [[wanted.seed, wanted.batch, index] for index in indices])
             descent.run(self.options.steps, steps)
             return descent.hands(), descent.energies()
 
-        found = run_parts(cut(count, threads, device), work)
+        found = run_parts(cut(wanted.count, run), work)
         energies = np.concatenate([part[1] for part in found])
         passed = (energies[:, :3] < np.array(PASSES)).all(axis=1)
         return grasp_set(pair, joined([part[0] for part in found]), began, {"passed": passed.tolist()})

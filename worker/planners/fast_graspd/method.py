@@ -12,6 +12,6 @@ METHOD: Final = Method(
     summary="gradient descent through a differentiable contact simulation",
     source="D. Turpin et al., Fast-Grasp'D, ICRA 2023",
     planner=lambda options: plan,
-    scene_planner=lambda options: plan,
+    in_scenes=True,
     uses=tuple(name for name in Fidelity.model_fields if name != "name"),
 )

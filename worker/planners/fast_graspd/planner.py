@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,8 +18,9 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.scene_starts import sample_scene_starts
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
 from worker.planners.fast_graspd.selection import best_of_each, merits, posture_of
+from worker.run import Run
 from worker.planners.fast_graspd.starts import Probe, sample_starts
-from worker.planners.port import Cancelled, Progress
+from worker.planners.port import Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.data import Data
@@ -47,64 +48,30 @@ class Part:
     curve: list[float] | None = None
 
 
-def plan(
-    hand: HandModel,
-    obj: ObjectModel,
-    *,
-    count: int,
-    fidelity: Fidelity,
-    seed: int,
-    batch: int,
-    threads: int,
-    device: str,
-    progress: Progress,
-    cancelled: Cancelled,
-    placed: Placed | None = None,
-) -> GraspSet:
+def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
     """See `worker.planners.Planner`."""
     began = time.perf_counter()
-    parts = optimise_batch(
-        hand, obj, count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads, device=device,
-        progress=progress, cancelled=cancelled, placed=placed,
-    )  # fmt: skip
-    return grasps_of(hand, obj, parts, time.perf_counter() - began, placed)
+    parts = optimise_batch(hand, obj, wanted, run)
+    return grasps_of(hand, obj, parts, time.perf_counter() - began, wanted.placed)
 
 
-def optimise_batch(
-    hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int, threads: int,
-    device: str, progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
-    placed: Placed | None = None,
-) -> list[Part]:  # fmt: skip
+def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> list[Part]:
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
-    return optimise_pair(
-        pair_of(hand, obj, fidelity, device), count=count, fidelity=fidelity, seed=seed, batch=batch, threads=threads,
-        progress=progress, cancelled=cancelled, placed=placed,
-    )  # fmt: skip
+    return optimise_pair(pair_of(hand, obj, wanted.fidelity, run.device), wanted, run)
 
 
-def optimise_pair(
-    pair: Pair, *, count: int, fidelity: Fidelity, seed: int, batch: int, threads: int,
-    progress: Progress = lambda done, total, message: None, cancelled: Cancelled = lambda: False,
-    placed: Placed | None = None,
-) -> list[Part]:  # fmt: skip
-    """The same for a pair that is on its device already, and need not be as the fidelity would make it."""
-    fidelity = fidelity if placed is None else in_scene(fidelity)
-    steps = Steps(count * (_hands(fidelity) + 1), progress, cancelled)
+def optimise_pair(pair: Pair, wanted: Wanted, run: Run) -> list[Part]:
+    """The same for a pair that is on `run.device` already, and need not be as the fidelity would make it."""
+    if wanted.placed is not None:
+        wanted = replace(wanted, fidelity=in_scene(wanted.fidelity))
+    steps = Steps(wanted.count * (_hands(wanted.fidelity) + 1), run)
 
     def work(indices: range) -> Part:
         part = Part(indices)
-        _work(
-            pair,
-            part,
-            fidelity,
-            seed,
-            batch,
-            steps,
-            placed.take(slice(indices.start, indices.stop)) if placed else None,
-        )
+        _work(pair, part, wanted, steps)
         return part
 
-    return run_parts(cut(count, threads, pair.hand.device, least=PART), work)
+    return run_parts(cut(wanted.count, run, least=PART), work)
 
 
 def _hands(fidelity: Fidelity) -> int:
@@ -117,13 +84,14 @@ def _finalists(fidelity: Fidelity) -> int:
     return min(fidelity.finalists, fidelity.starts)
 
 
-def _work(
-    pair: Pair, part: Part, fidelity: Fidelity, seed: int, batch: int, steps: Steps, placed: Placed | None
-) -> None:
+def _work(pair: Pair, part: Part, wanted: Wanted, steps: Steps) -> None:
+    fidelity, rows = wanted.fidelity, slice(part.indices.start, part.indices.stop)
+    placed = wanted.placed.take(rows) if wanted.placed else None
     n, hand, obj = len(part.indices), pair.hand.model, pair.fine.obj.model
     finalists = _finalists(fidelity)
     obstacles = _obstacles(pair, placed)
-    which: dict[str, Any] = {"seed": seed, "batch": batch, "indices": part.indices, "each": fidelity.starts}
+    which: dict[str, Any] = {"seed": wanted.seed, "batch": wanted.batch, "indices": part.indices}
+    which["each"] = fidelity.starts
     coarse, fine = pair.model(pair.coarse, obstacles), pair.model(pair.fine, obstacles)
     state = sample_starts(coarse, **which) if placed is None else sample_scene_starts(coarse, placed=placed, **which)
     touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None

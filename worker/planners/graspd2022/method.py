@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -16,8 +15,9 @@ from worker.planners.fast_graspd.pairs import Pair
 from worker.planners.graspd2022 import kernels
 from worker.planners.graspd2022.search import Floats, Search
 from worker.planners.peers import Kept, free_starts, grasp_set, ground_of, joined
-from worker.planners.port import Cancelled, Method, Options, Planner, Progress
+from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
+from worker.run import Run
 from worker.simulation.state import HandState
 
 
@@ -37,21 +37,18 @@ class Graspd2022:
     def __init__(self, options: Graspd2022Options) -> None:
         self.options = options
 
-    def __call__(
-        self, hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int,
-        threads: int, device: str, progress: Progress, cancelled: Cancelled,
-    ) -> GraspSet:  # fmt: skip
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
         began = time.perf_counter()
-        pair: Pair = ground_of(hand, obj, device, kernels)
+        pair: Pair = ground_of(hand, obj, run.device, kernels)
         search = _searches(pair, self.options.grid)
-        steps = Steps(count * (self.options.steps + 1), progress, cancelled)
+        steps = Steps(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
-            starts = free_starts(pair, seed=seed, batch=batch, indices=indices)
+            starts = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(len(indices), "starts")
             return search.run(starts, steps=self.options.steps, tell=steps)
 
-        found = run_parts(cut(count, threads, device), work)
+        found = run_parts(cut(wanted.count, run), work)
         residual = np.concatenate([part[1] for part in found])
         return grasp_set(pair, joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()})
 

@@ -7,7 +7,6 @@ from typing import Final
 
 from pydantic import Field
 
-from service.model.domain import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -17,8 +16,9 @@ from worker.planners.graspit import kernels
 from worker.planners.graspit.schedule import FIRST_STEP
 from worker.planners.graspit.search import Search
 from worker.planners.peers import Kept, grasp_set, ground_of, joined
-from worker.planners.port import Cancelled, Method, Options, Planner, Progress
+from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.threads import Steps, cut, run_parts
+from worker.run import Run
 from worker.simulation.state import HandState
 
 _searches: Final = Kept(Search)
@@ -39,24 +39,21 @@ class Graspit:
     def __init__(self, options: GraspitOptions) -> None:
         self.options = options
 
-    def __call__(
-        self, hand: HandModel, obj: ObjectModel, *, count: int, fidelity: Fidelity, seed: int, batch: int,
-        threads: int, device: str, progress: Progress, cancelled: Cancelled,
-    ) -> GraspSet:  # fmt: skip
+    def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, device, kernels, closing_kernels)
+        pair = ground_of(hand, obj, run.device, kernels, closing_kernels)
         search = _searches(pair)
         keep, moves = self.options.keep, self.options.steps - FIRST_STEP
-        chains = -(-count // keep)
-        steps = Steps(chains * moves, progress, cancelled)
+        chains = -(-wanted.count // keep)
+        steps = Steps(chains * moves, run)
 
         def work(indices: range) -> HandState:
-            seeds = [[seed, batch, chain] for chain in indices]
+            seeds = [[wanted.seed, wanted.batch, chain] for chain in indices]
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
             return Closer(pair, len(state.pivot)).close(state).state
 
-        states = joined(run_parts(cut(chains, threads, device), work))
-        return grasp_set(pair, states[:count], began, {"chains": chains, "moves": moves})
+        states = joined(run_parts(cut(chains, run), work))
+        return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 
 def _planner(options: GraspitOptions) -> Planner:

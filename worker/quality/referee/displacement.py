@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.cores import available_cores
 from worker.engines.mujoco_warnings import ARENA, void
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
@@ -22,6 +21,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import add_object, add_shape
+from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ STEPS: Final = 35
 
 
 def simulated_displacement_cm(
-    hand: HandModel, obj: ObjectModel, grasp: Posture, *, pieces: ConvexPieces | None = None, threads: int = 0
+    hand: HandModel, obj: ObjectModel, grasp: Posture, *, pieces: ConvexPieces | None = None, run: Run = ALONE
 ) -> Floats:
     """(N,) way of the object's centre of mass in the displacement test, for N grasp postures [cm]; nan: it blew up.
 
@@ -51,7 +51,7 @@ def simulated_displacement_cm(
         mujoco.mj_step(model, data, nstep=STEPS)
         return math.nan if void(data) else float(np.linalg.norm(data.qpos[:3] - centre))
 
-    with ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="displacement") as pool:
+    with ThreadPoolExecutor(run.cores, thread_name_prefix="displacement") as pool:
         return 100.0 * np.array(list(pool.map(work, bodies)), float)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.cores import available_cores
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -23,10 +21,9 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import Level, postures_key, verdict_key
 from worker.quality.referee.model import COARSE, MujocoOptions, build
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
+from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
-Progress = Callable[[float, float, str], None]
-Cancelled = Callable[[], bool]
 
 LEVELS: Final = ("letter", "certificate", "screen")
 
@@ -81,11 +78,9 @@ def judge(
     *,
     level: Level = "certificate",
     hard: bool = False,
-    threads: int = 0,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    progress: Progress = lambda done, total, message: None,
-    cancelled: Cancelled = lambda: False,
+    run: Run = ALONE,
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.quality.referee.protocol` for the levels.
 
@@ -97,32 +92,29 @@ def judge(
         grasps: N grasps with pregrasp and squeeze postures.
         level: letter, certificate or screen.
         hard: sliding friction halved, torsional friction a tenth.
-        threads: 0: all cores.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
-        progress: called with grasps done.
-        cancelled: polled between grasps.
+        run: told of grasps done; asked between grasps whether to stop.
 
     Raises:
         InputError: unknown level.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
     """
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
-    bench = _Bench(hand, obj, pieces, level, hard, threads or available_cores())
+    bench = _Bench(hand, obj, pieces, level, hard, run.cores)
     done, lock = 0, threading.Lock()
 
     def work(row: int) -> Trial:
         nonlocal done
-        if cancelled():
-            raise TaskCancelled("the referee was cancelled")
+        run.check("the referee")
         trial = bench.trial(grasps, row)
         with lock:
             done += 1
-            progress(done, len(grasps), "referee")
+            run.progress(done, len(grasps), "referee")
         return trial
 
     with ThreadPoolExecutor(bench.threads, thread_name_prefix="referee") as pool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,9 +13,8 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.cores import available_cores
 from service.model.digests import digest_bytes, digest_json
-from service.model.errors import InputError, TaskCancelled
+from service.model.errors import InputError
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -26,6 +24,7 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
 from worker.quality.referee.model import MujocoOptions, build
+from worker.run import ALONE, Run
 from worker.simulation.surroundings import Placed
 
 LiftLevel = Literal["letter", "lift"]
@@ -65,11 +64,9 @@ def judge_lifts(
     *,
     level: LiftLevel = "lift",
     hard: bool = False,
-    threads: int = 0,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    progress: Callable[[float, float, str], None] = lambda done, total, message: None,
-    cancelled: Callable[[], bool] = lambda: False,
+    run: Run = ALONE,
 ) -> LiftVerdicts:
     """Lift grasps out of their scenes; see `worker.quality.referee.lift`.
 
@@ -80,16 +77,14 @@ def judge_lifts(
         placed: their scenes; `index` has a scene for each.
         level: letter or lift.
         hard: sliding friction halved, torsional friction a tenth, of supports too.
-        threads: 0: all cores.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces.
-        progress: called with grasps done.
-        cancelled: polled between grasps.
+        run: told of grasps done; asked between grasps whether to stop.
 
     Raises:
         InputError: unknown level, or no scene or approach to lift from.
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
     """
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
@@ -100,15 +95,14 @@ def judge_lifts(
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = build(hand, obj, pieces, physics, placed.supports)
     tests: queue.SimpleQueue[Lift] = queue.SimpleQueue()
-    workers = max(1, min(threads or available_cores(), len(grasps)))
+    workers = max(1, min(run.cores, len(grasps)))
     for _ in range(workers):
         tests.put(Lift(scene, placed))
     done, lock = 0, threading.Lock()
 
     def work(row: int) -> LiftTrial:
         nonlocal done
-        if cancelled():
-            raise TaskCancelled("the referee was cancelled")
+        run.check("the referee")
         test = tests.get()
         try:
             trial = test.letter(grasps, row) if level == "letter" else test.lift(grasps, row)
@@ -116,7 +110,7 @@ def judge_lifts(
             tests.put(test)
         with lock:
             done += 1
-            progress(done, len(grasps), "lifts")
+            run.progress(done, len(grasps), "lifts")
         return trial
 
     with ThreadPoolExecutor(workers, thread_name_prefix="lift") as pool:

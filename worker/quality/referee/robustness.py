@@ -13,8 +13,9 @@ from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.judge import Cancelled, Progress, judge
+from worker.quality.referee.judge import judge
 from worker.quality.referee.key import Level
+from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
 
@@ -34,11 +35,9 @@ def robustness(
     seed: int = 0,
     level: Level = "screen",
     hard: bool = False,
-    threads: int = 0,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
-    progress: Progress = lambda done, total, message: None,
-    cancelled: Cancelled = lambda: False,
+    run: Run = ALONE,
 ) -> Floats:
     """(N,) share of `repeats` in which a grasp still holds with noise on the object's pose; nan: not tried.
 
@@ -56,15 +55,13 @@ def robustness(
         seed: of the noise.
         level: what a noisy verdict costs; a share is no rate of success, so the cheap level does.
         hard: the hard protocol's friction.
-        threads: 0: all cores.
         pieces: convex pieces of the object; by default its CoACD pieces.
         cache: folder of the pieces, see `decompose`.
-        progress: called with noisy verdicts done.
-        cancelled: polled between verdicts.
+        run: told of noisy verdicts done; asked between them whether to stop.
 
     Raises:
         MeshError: the object has no usable convex pieces.
-        TaskCancelled: when `cancelled()` answers True.
+        TaskCancelled: when `run.cancelled()` answers True.
     """
     out = np.full(len(grasps), np.nan)
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
@@ -72,10 +69,7 @@ def robustness(
         return out
     moves = np.array([_noise(obj, noise_m, noise_rad, (seed, k, int(i))) for k in range(repeats) for i in tried])
     noisy = _moved(grasps, np.tile(tried, repeats), invert(moves))
-    verdicts = judge(
-        hand, obj, noisy, level=level, hard=hard, threads=threads, pieces=pieces, cache=cache, progress=progress,
-        cancelled=cancelled,
-    )  # fmt: skip
+    verdicts = judge(hand, obj, noisy, level=level, hard=hard, pieces=pieces, cache=cache, run=run)
     out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
     return out
 

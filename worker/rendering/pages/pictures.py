@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -20,6 +20,8 @@ from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
 from worker.rendering.tracer import Tracer
 
 #: Sides 120 degrees apart, measured from the side view of the hand [rad].
+from worker.run import ALONE, Run
+
 THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
@@ -50,9 +52,8 @@ def grasp_pictures(
     size: tuple[int, int] = (320, 320),
     azimuths: Sequence[float] = THREE_SIDES[:1],
     *,
-    device: str = "cpu",
+    run: Run = ALONE,
     samples: int = SAMPLES,
-    cancelled: Callable[[], bool] = lambda: False,
 ) -> NDArray[np.uint8]:
     """Pictures of N grasps from A sides.
 
@@ -63,15 +64,14 @@ def grasp_pictures(
         joint_positions: (N, J).
         size: width and height [px].
         azimuths: A sides [rad] about the vertical; 0 looks across the direction in which the palm approaches.
-        device: Warp device.
+        run: asked between passes whether to stop.
         samples: rays per pixel.
-        cancelled: asked between passes.
 
     Returns:
         (N, A, H, W, 3) sRGB.
 
     Raises:
-        TaskCancelled: `cancelled()` answered True.
+        TaskCancelled: `run.cancelled()` answered True.
     """
     hand_pose = np.atleast_2d(np.asarray(hand_pose, float))
     joints = np.atleast_2d(np.asarray(joint_positions, float))
@@ -87,8 +87,8 @@ def grasp_pictures(
         bodies = body_poses(hand, hand_pose[part], joints[part])
         worlds = len(bodies)
         if worlds not in stages:
-            stages[worlds] = Tracer(solids, worlds, device)
-        shots.append(_shoot(stages[worlds], hand, obj, bodies, size, azimuths, samples, cancelled))
+            stages[worlds] = Tracer(solids, worlds, run.device)
+        shots.append(_shoot(stages[worlds], hand, obj, bodies, size, azimuths, samples, run))
     empty = np.zeros((0, len(azimuths), size[1], size[0], 3), np.uint8)
     return np.concatenate([empty, *shots])
 
@@ -101,7 +101,7 @@ def _shoot(
     size: tuple[int, int],
     azimuths: Sequence[float],
     samples: int,
-    cancelled: Callable[[], bool],
+    run: Run,
 ) -> NDArray[np.uint8]:
     worlds, (width, height) = len(bodies), size
     points = np.concatenate(
@@ -123,7 +123,7 @@ def _shoot(
             # The lamp goes round with the camera, so no side lies in the dark.
             turn=-angles, lamps=[STUDIO] * worlds,
         )  # fmt: skip
-        sides.append(stage.shoot(shot, cancelled=cancelled).rgb)
+        sides.append(stage.shoot(shot, run.quiet()).rgb)
     return np.stack(sides, axis=1)
 
 

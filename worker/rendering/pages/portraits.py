@@ -100,7 +100,7 @@ def _shoot(
         intrinsics=k, width=width, height=height, samples=_SAMPLES, toward_lamp=TOWARD_LAMP,
         turn=-np.asarray(azimuths), lamps=[STUDIO] * worlds,
     )  # fmt: skip
-    return stage.shoot(shot, cancelled=lambda: False).rgb
+    return stage.shoot(shot).rgb
 
 
 def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:

@@ -9,7 +9,6 @@ from typing import Any, Final
 import warp as wp
 
 from service.model.clock import timestamp
-from service.model.cores import available_cores
 from service.model.domain import FIDELITIES
 from service.model.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
@@ -61,7 +60,7 @@ def chart(
             for _ in range(repeats):
                 for cell in cells:
                     cell.repeat()
-                    cell.time_first(cell.setting.threads or available_cores())
+                    cell.time_first(cell.setting.run.cores)
             for cell in cells:
                 runs.append(_row(cell, hand, thing))
                 say(_line(runs[-1]))
@@ -72,9 +71,9 @@ def chart(
 def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> dict[str, Any]:
     return {
         "created": timestamp(),
-        "device": device_name(settings[0].device),
+        "device": device_name(settings[0].run.device),
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
-        "threads": settings[0].threads or available_cores(),
+        "threads": settings[0].run.cores,
         "referee": {"protocol": "dexgraspbench", "level": "certificate"},
         "friction": FRICTION,
         "threshold_m": THRESHOLD_M,

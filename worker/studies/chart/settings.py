@@ -9,16 +9,18 @@ from typing import Any, Final
 from service.model.domain import FIDELITIES
 from service.model.errors import InputError
 from worker.planners import method, planner
+from worker.run import Run
 from worker.studies.chart.trials import Setting
 
 #: Label of methods that know no fidelities: they run as their source has them.
 LABEL: Final = "as published"
+
 _VARIANT: Final = re.compile(r"([^:@]+)(?::([\w.]+=[\w.]+(?:\+[\w.]+=[\w.]+)*))?(?:@([1-9]\d{0,3}))?")
 
 
 def settings_of(
     methods: Sequence[str], fidelities: Sequence[str], *, batches: Sequence[int], peer_batch: int,
-    options: Sequence[str], quick: bool, threads: int, device: str,
+    options: Sequence[str], quick: bool, run: Run,
 ) -> list[Setting]:  # fmt: skip
     """A setting for every method, fidelity and batch; methods without fidelities have one each.
 
@@ -34,7 +36,7 @@ def settings_of(
         known = method(name)
         own = {**(known.quick if quick else {}), **given.get(name, {}), **changes}
         planner(name, own)
-        common: dict[str, Any] = {"options": own, "warm": known.quick, "threads": threads, "device": device}
+        common: dict[str, Any] = {"options": own, "warm": known.quick, "run": run}
         if known.has_fidelities:
             found += [Setting(name, f, FIDELITIES[f], batch=b, **common) for f in fidelities for b in batches]
         else:

@@ -21,7 +21,9 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.planner import grasps_of, optimise_pair
+from worker.planners.port import Wanted
 from worker.quality.referee.decomposition import decompose
+from worker.run import Run
 from worker.simulation.model import LossOptions
 from worker.studies.chart import kernels
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
@@ -103,7 +105,7 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[Turn]:
 
 
 def sweep(
-    hand: HandModel, thing: Thing, *, batch: int, repeats: int, quick: bool, threads: int, device: str,
+    hand: HandModel, thing: Thing, *, batch: int, repeats: int, quick: bool, run: Run,
     knobs: Sequence[str] = (), say: Say = lambda line: None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """One row per knob and value: `knob`, `value`, `default`, `speedup` and the figures of a run.
@@ -111,7 +113,7 @@ def sweep(
     Values are run in turn, repeat by repeat. `speedup` is what the default costs over what the value costs: in
     processor seconds on a CPU, which do not depend on what else the machine does, in seconds on a GPU.
     """
-    wp.load_module(module=kernels, device=device)
+    wp.load_module(module=kernels, device=run.device)
     default = Turn("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
@@ -119,7 +121,7 @@ def sweep(
     for turn in [default, *turns(quick, knobs)]:
         if turn is default or not turn.default:
             cells[turn.knob, turn.value] = Trial(
-                _setting(turn, batch, threads, device), hand, thing.load(turn.fidelity.face_error_m), true, pieces
+                _setting(turn, batch, run), hand, thing.load(turn.fidelity.face_error_m), true, pieces
             )
     for _ in range(repeats):
         for cell in cells.values():
@@ -130,7 +132,7 @@ def sweep(
     rows = []
     for turn in turns(quick, knobs):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
-        faster = _cost(base, device) / _cost(found, device)
+        faster = _cost(base, run.device) / _cost(found, run.device)
         rows.append(
             {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
             | {"speedup": plain(faster), **found}
@@ -146,15 +148,13 @@ def _cost(row: dict[str, Any], device: str) -> float:
     return float(row["processor_seconds_per_grasp"])
 
 
-def _setting(turn: Turn, batch: int, threads: int, device: str) -> Setting:
-    run = partial(_run, turn=turn, threads=threads, device=device)
-    return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, threads=threads, device=device, run=run)
+def _setting(turn: Turn, batch: int, run: Run) -> Setting:
+    make = partial(_make, turn=turn, run=run)
+    return Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
 
 
-def _run(
-    hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, threads: int, device: str
-) -> GraspSet:
+def _make(hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: Turn, run: Run) -> GraspSet:
     began = time.perf_counter()
-    pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, device))
-    parts = optimise_pair(pair, count=count, fidelity=turn.fidelity, seed=seed, batch=0, threads=threads)
+    pair = (turn.change or _same)(pair_of(hand, obj, turn.fidelity, run.device))
+    parts = optimise_pair(pair, Wanted(count, turn.fidelity, seed), run)
     return grasps_of(hand, obj, parts, time.perf_counter() - began)

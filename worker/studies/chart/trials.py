@@ -14,11 +14,12 @@ from service.model.domain import Fidelity
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import synthesize
+from worker.planners import Wanted, synthesize
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
 from worker.quality.table import measure
+from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ COLUMNS: Final = {
 }
 
 
-Run = Callable[[HandModel, ObjectModel, int, int], GraspSet]
+Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
 """From hand, object, grasps and seed to grasps."""
 
 
@@ -58,19 +59,16 @@ class Setting:
     """Grasps per call, and per repeat."""
     warm: Mapping[str, Any] = field(default_factory=dict)
     """Options of the call before the first timed one."""
-    threads: int = 0
-    device: str = "cpu"
-    run: Run | None = None
-    """Another way to run it than by method and fidelity: for sweeps of what no fidelity names."""
+    run: Run = ALONE
+    make: Make | None = None
+    """Another way to make them than by method and fidelity: for sweeps of what no fidelity names."""
 
     def grasps(self, hand: HandModel, obj: ObjectModel, count: int, seed: int, *, warm: bool = False) -> GraspSet:
         """Make grasps."""
-        if self.run is not None:
-            return self.run(hand, obj, count, seed)
-        return synthesize(
-            hand, obj, count=count, method=self.method, fidelity=self.knobs, seed=seed, threads=self.threads,
-            options={**self.options, **(self.warm if warm else {})}, device=self.device,
-        )  # fmt: skip
+        if self.make is not None:
+            return self.make(hand, obj, count, seed)
+        options = {**self.options, **(self.warm if warm else {})}
+        return synthesize(hand, obj, Wanted(count, self.knobs, seed), self.run, method=self.method, options=options)
 
 
 @dataclass
@@ -101,15 +99,15 @@ class Trial:
 
     def repeat(self) -> None:
         """One timed call, then quality and verdict of its grasps."""
-        batch, threads = self.setting.batch, self.setting.threads
+        batch, run = self.setting.batch, self.setting.run
         began, used = time.perf_counter(), time.process_time()
         found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds))
         self.seconds.append(time.perf_counter() - began)
         self.processor_seconds.append(time.process_time() - used)
         table = measure(
-            self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], threads=threads
+            self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=run
         )  # fmt: skip
-        verdicts = judge(self.hand, self.true, found, pieces=self.pieces, threads=threads)
+        verdicts = judge(self.hand, self.true, found, pieces=self.pieces, run=run)
         self.success.append(verdicts.success)
         self.columns.append({key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()})
         self.postures.append(found.grasp)
@@ -140,7 +138,7 @@ class Trial:
             for name in ("hand_pose", "joint_positions")
         )
         slip = simulated_displacement_cm(
-            self.hand, self.true, Posture(pose, joints), pieces=self.pieces, threads=self.setting.threads
+            self.hand, self.true, Posture(pose, joints), pieces=self.pieces, run=self.setting.run
         )
         names = ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume")
         row = {name: float(np.nanmean(self.values(name)[order])) for name in names}

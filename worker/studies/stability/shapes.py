@@ -16,6 +16,7 @@ from worker.certified import certified_grasps
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
+from worker.run import ALONE, Run
 
 MILLIMETRES: Final = 1e-3
 
@@ -87,7 +88,7 @@ CLOSED: Final = tuple(name for name, (_, options) in DEFECTS.items() if not opti
 
 
 def shape_map(
-    hand: HandModel, *, fidelities: Sequence[str] = ("draft", "standard", "fine"), count: int = 8, threads: int = 0,
+    hand: HandModel, *, fidelities: Sequence[str] = ("draft", "standard", "fine"), count: int = 8, run: Run = ALONE,
     families: Sequence[str] = tuple(FAMILIES), defects: Sequence[str] = tuple(DEFECTS),
     say: Callable[[str], None] = lambda line: None,
 ) -> StabilityMap:  # fmt: skip
@@ -101,7 +102,7 @@ def shape_map(
     cells = []
     for panel, value, mesh, options in jobs:
         for fidelity in fidelities:
-            cell = _cell(hand, panel, value, mesh, options, fidelity, count, threads)
+            cell = _cell(hand, panel, value, mesh, options, fidelity, count, run)
             say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
             cells.append(cell)
     return StabilityMap(
@@ -126,12 +127,12 @@ def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectM
 
 def _cell(
     hand: HandModel, panel: str, value: float | str, mesh: Any, options: dict[str, Any], fidelity: str, count: int,
-    threads: int,
+    run: Run,
 ) -> MapCell:  # fmt: skip
     request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", fidelity=fidelity, audits=0)
     try:
         obj = prepared(mesh, options, FIDELITIES[fidelity].face_error_m)
-        found = certified_grasps(hand, obj, request, count=count, threads=threads)
+        found = certified_grasps(hand, obj, request, count=count, run=run)
     except GraspdError as error:
         return MapCell(panel, value, fidelity, float("nan"), "refused", str(error))
     valid = float(found.columns["quality/valid"].mean())

@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from service.model.stability import StabilityMap
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
+from worker.run import Run
 from worker.studies.stability import descents, gradients, integrators, shapes
 
 Say = Callable[[str], None]
 
 
 def run(
-    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, threads: int, say: Say
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: Run, say: Say
 ) -> list[StabilityMap]:
     """The maps of the named studies, in the order of the names."""
     model, thing = hand_from_path(hand), object_from_path(obj)
@@ -35,7 +36,7 @@ def run(
             model, fidelities=("draft",) if quick else ("draft", "standard", "fine"), count=4 if quick else 8,
             families=("plate", "cube") if quick else tuple(shapes.FAMILIES),
             # Grasps on an open mesh cost more than all else of a quick run.
-            defects=shapes.CLOSED if quick else tuple(shapes.DEFECTS), threads=threads, say=say,
+            defects=shapes.CLOSED if quick else tuple(shapes.DEFECTS), run=work, say=say,
         ),
         "starts": lambda: descents.start_map(model, thing, count=4 if quick else 8, say=say),
         "rates": lambda: descents.rate_map(

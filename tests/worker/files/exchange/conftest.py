@@ -12,6 +12,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
+from worker.planners.port import Wanted
 
 
 @pytest.fixture(scope="session")
@@ -27,4 +28,4 @@ def block() -> ObjectModel:
 
 @pytest.fixture(scope="session")
 def grasps(hand: HandModel, block: ObjectModel) -> GraspSet:
-    return synthesize(hand, block, count=4, fidelity=FIDELITIES["draft"], seed=5)
+    return synthesize(hand, block, Wanted(count=4, fidelity=FIDELITIES["draft"], seed=5))

@@ -1,0 +1,61 @@
+"""The context of a piece of work: on what it runs, whom it tells how far it is, and who may stop it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+from service.model.cores import available_cores
+from service.model.errors import TaskCancelled
+
+Progress = Callable[[float, float, str], None]
+"""Told what is done, of how much, and a word on it; from any thread, often."""
+Cancelled = Callable[[], bool]
+"""Asked often, from any thread: whether to stop."""
+
+
+def _silent(done: float, total: float, message: str) -> None:
+    """Progress that nobody wants to know."""
+
+
+def _never() -> bool:
+    return False
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where and how work is done; what it makes does not depend on it, but for the rounding of a GPU."""
+
+    device: str = "cpu"
+    """Warp device."""
+    threads: int = 0
+    """CPU threads; 0: one per core this process may use."""
+    progress: Progress = _silent
+    cancelled: Cancelled = _never
+
+    @property
+    def cores(self) -> int:
+        """CPU threads, the default counted."""
+        return self.threads or available_cores()
+
+    def part(self, start: float, end: float) -> Run:
+        """The same for a part of the work, whose progress goes from share `start` to share `end` of the whole."""
+
+        def tell(done: float, total: float, message: str) -> None:
+            self.progress(start + (end - start) * (done / total if total > 0 else 0.0), 1.0, message)
+
+        return replace(self, progress=tell)
+
+    def quiet(self) -> Run:
+        """The same for a part of the work that is too short, or too hard to foresee, to tell of."""
+        return replace(self, progress=_silent)
+
+    def check(self, what: str) -> None:
+        """Raises TaskCancelled if the work should stop."""
+        if self.cancelled():
+            raise TaskCancelled(f"{what} was cancelled")
+
+
+#: On the CPU with all its cores; nobody is told, nobody stops it.
+ALONE: Final = Run()
