@@ -19,6 +19,7 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
+from worker.planners import Wanted
 
 COUNT = 6
 
@@ -115,8 +116,9 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
 ) -> None:
     planned: list[int] = []
 
-    def plan(*_: Any, count: int, batch: int, **__: Any) -> GraspSet:
-        planned.append(batch)
+    def plan(_hand: Any, _obj: Any, wanted: Wanted, *_: Any, **__: Any) -> GraspSet:
+        count = wanted.count
+        planned.append(wanted.batch)
         posture = Posture(np.tile([0.0, 0, 1, 1, 0, 0, 0], (count, 1)), np.zeros((count, len(hand.joint_names))))
         return GraspSet(posture, posture, posture, np.full(count, np.nan))
 

@@ -100,7 +100,7 @@ def test_a_three_sides_sheet_is_wide_enough_for_three(pictures):
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])
 def test_a_views_page_has_a_row_per_placement(block, stereo, cells):
     pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
-    views = render(block, pose, views=2, stereo=stereo, width=64, height=48, seed=0, device="cpu", samples=2)
+    views = render(block, pose, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
     page = opened(views_page(views, title="block"))
     assert page.shape[1] > cells * 64
     assert page.shape[0] > 2 * 48
@@ -108,7 +108,7 @@ def test_a_views_page_has_a_row_per_placement(block, stereo, cells):
 
 def test_a_views_page_shows_the_pictures_with_a_hand_where_there_are_any(block):
     pose = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
-    views = render(block, pose, views=1, stereo=False, width=64, height=48, seed=0, device="cpu", samples=2)
+    views = render(block, pose, views=1, stereo=False, width=64, height=48, seed=0, samples=2)
     without = opened(views_page(views, title="block"))
     views["image/rgb_hand"] = np.full((1, 48, 64, 3), [255, 0, 255], np.uint8)
     page = opened(views_page(views, title="block"))

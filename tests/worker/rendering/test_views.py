@@ -268,7 +268,7 @@ def test_memory_stays_flat_over_repeated_renders(ball):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_pixels_do_not_depend_on_the_number_of_cores(mug, mug_poses, mug_views, monkeypatch, cores):
-    monkeypatch.setattr("worker.rendering.tracer.available_cores", lambda: cores)
+    monkeypatch.setattr("worker.run.available_cores", lambda: cores)
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])
