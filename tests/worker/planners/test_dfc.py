@@ -14,6 +14,7 @@ from worker.planners.dfc.search import Descent
 from worker.planners.dfc.starts import DISTANCE, sample_starts
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
+from worker.run import ALONE
 from worker.simulation.state import HandState
 
 BOX = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05)))
@@ -118,7 +119,7 @@ def test_a_fall_is_always_accepted_and_a_rise_with_its_boltzmann_factor() -> Non
 
 def test_annealing_ends_at_a_lower_energy_than_it_began() -> None:
     found = descent()
-    tell = Steps(1, lambda *_: None, lambda: False)
+    tell = Steps(1, ALONE)
     found.run(1, tell)
     before = found.energies()[0] @ WEIGHTS
     found.run(1500, tell)

@@ -16,6 +16,7 @@ from worker.planners.graspit.schedule import FIRST_STEP, acceptance, jump_share,
 from worker.planners.graspit.search import Search
 from worker.planners.peers import ground_of
 from worker.planners.threads import Steps
+from worker.run import ALONE, Run
 
 
 def test_the_temperature_follows_ingbers_schedule() -> None:
@@ -112,7 +113,7 @@ def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
     told: list[float] = []
-    steps = Steps(1.0, lambda done, total, message: told.append(done), lambda: False)
+    steps = Steps(1.0, Run(progress=lambda done, total, message: told.append(done)))
     few = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 50, keep=1, tell=steps)
     assert told[-1] == 4 * 50
     many = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 2000, keep=1, tell=steps)
@@ -123,7 +124,7 @@ def test_the_states_kept_of_a_chain_differ() -> None:
     search = Search(
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
-    kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=Steps(1, lambda *_: None, lambda: False))
+    kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=Steps(1, ALONE))
     apart = np.linalg.norm(kept.pivot[:, None] - kept.pivot[None], axis=2)
     assert len(kept.pivot) == 4
     assert np.any(apart[np.triu_indices(4, 1)] > 0.005)

@@ -18,11 +18,11 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.scene_starts import sample_scene_starts
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
 from worker.planners.fast_graspd.selection import best_of_each, merits, posture_of
-from worker.run import Run
 from worker.planners.fast_graspd.starts import Probe, sample_starts
 from worker.planners.port import Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.quality.postures import pregrasp, squeeze
+from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.launches import Launches
 from worker.simulation.obstacles import DeviceObstacles
