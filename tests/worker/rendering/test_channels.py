@@ -32,7 +32,7 @@ DEPTH_M = 1e-4
 
 
 def shoot(obj: ObjectModel, poses: np.ndarray = REST, **options) -> dict[str, np.ndarray]:
-    options = {"views": 2, "stereo": False, "seed": 1, "device": "cpu", "samples": 2} | options
+    options = {"views": 2, "stereo": False, "seed": 1, "samples": 2} | options
     return render(obj, poses, width=SIZE[0], height=SIZE[1], **options)
 
 
