@@ -28,7 +28,7 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
+from worker.planners import Run, Wanted, synthesize
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.lifting import judge_lifts
@@ -52,9 +52,9 @@ def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, count: int) -
     spec = SceneSpec(kind="table", faces="all")
     poses = rest_poses(spec, obj, count=1, seed=SEED)["scene/object_pose"]
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
-    common: dict[str, Any] = {"count": count, "fidelity": FIDELITY, "seed": SEED, "threads": 1, "device": "cpu"}
-    planned, seconds = _timed(lambda: synthesize(hand, obj, **common, placed=placed))
-    free, free_seconds = _timed(lambda: synthesize(hand, obj, **common))
+    wanted, run = Wanted(count, FIDELITY, SEED), Run(threads=1)
+    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed), run))
+    free, free_seconds = _timed(lambda: synthesize(hand, obj, wanted, run))
     found = _judged(hand, obj, planned, placed, pieces)
     filtered = _judged(hand, obj, free, placed, pieces)
     free_held = judge(hand, obj, free, pieces=pieces).success.mean()
