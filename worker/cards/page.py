@@ -156,7 +156,10 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
             "letter drops."
         )
     else:
-        text = f"No referee judged: a grasp is valid if it passes the geometric gate, {gate}."
+        text = (
+            f"No referee judged, so no grasp is valid. A grasp that passes the geometric gate, {gate}, is sound: "
+            "whether it holds is not known."
+        )
     return f"## Validity\n\n{text}\n\n{validity_table(card)}{_plot('yield.png', plots)}"
 
 
