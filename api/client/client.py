@@ -11,6 +11,7 @@ from typing import Any, Final, Self
 from urllib.parse import urlsplit
 
 import httpx
+from httpx_sse import EventSource
 
 from api.hosts import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
@@ -182,7 +183,7 @@ class Client:
     def _events(self, path: str) -> Iterator[tuple[str, Any]]:
         with _Translated(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
             _raise_for(answer)
-            yield from parse_events(answer.iter_lines())
+            yield from events_of(answer)
 
     def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
         """The answer to a request; the error behind a problem document is raised."""
@@ -202,18 +203,11 @@ def _is_too_fast(answer: httpx.Response) -> bool:
     return answer.status_code == 429 and RateError.slug in answer.text
 
 
-def parse_events(lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
-    """(event, decoded data) of a text/event-stream (HTML standard §9.2.6)."""
-    event, data = "message", ""
-    for line in lines:
-        if not line:
-            if data:
-                yield event, json.loads(data)
-            event, data = "message", ""
-        elif line.startswith("event:"):
-            event = line[6:].strip()
-        elif line.startswith("data:"):
-            data += line[5:].strip()
+def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
+    """(event, decoded data) of a text/event-stream."""
+    for event in EventSource(answer).iter_sse():
+        if event.data:
+            yield event.event, event.json()
 
 
 class _Translated:

@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.client.client import Client, parse_events
+from api.client.client import Client, events_of
 from api.models import Job, Shard
 from service.model.domain import AssetKind, Stage, State
 from service.model.errors import (
@@ -93,15 +93,16 @@ def test_watching_goes_on_where_the_stream_broke() -> None:
     streams = iter([event("progress", State.RUNNING), event("end", State.SUCCEEDED)])
 
     def handler(request: httpx.Request) -> httpx.Response:
-        return httpx.Response(200, content=next(streams))
+        return httpx.Response(200, headers={"content-type": "text/event-stream"}, content=next(streams))
 
     with client_of(handler) as client:
         assert [seen.state for seen in client.watch("a")] == [State.RUNNING, State.SUCCEEDED]
 
 
 def test_an_event_may_come_in_pieces_with_comments_between() -> None:
-    lines = [": ping", "", "event: progress", 'data: {"done":', "data: 1}", "id: 7", "", "data: 2", ""]
-    assert list(parse_events(iter(lines))) == [("progress", {"done": 1}), ("message", 2)]
+    lines = [": ping", "", "event: progress", 'data: {"done":', "data: 1}", "id: 7", "", "data: 2", "", ""]
+    answer = httpx.Response(200, headers={"content-type": "text/event-stream"}, content="\n".join(lines))
+    assert list(events_of(answer)) == [("progress", {"done": 1}), ("message", 2)]
 
 
 def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:

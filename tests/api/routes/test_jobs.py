@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from starlette.testclient import TestClient
 
-from api.client.client import parse_events
+from api.client.client import events_of
 from service.model.planning import plan
 from service.pipeline.backends import Parts
 from tests.api.factories import add_job, fail, finish, finish_all
@@ -98,7 +98,7 @@ def test_events_of_a_finished_job_say_its_end(http: TestClient, parts: Parts) ->
     finish_all(parts, record)
     with http.stream("GET", f"/v1/jobs/{record.id}/events") as answer:
         assert answer.headers["content-type"].startswith("text/event-stream")
-        events = list(parse_events(iter(answer.iter_lines())))
+        events = list(events_of(answer))
     assert [name for name, _ in events] == ["progress", "end"]
     assert events[-1][1]["state"] == "succeeded"
 
