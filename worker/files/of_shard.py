@@ -14,7 +14,7 @@ from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError
 from service.model.scene_spec import SceneSpec
 from service.store.shards import Shard
-from worker.files.origin import Found, Wanted, at, find, options_of
+from worker.files.origin import Found, Sought, at, find, options_of
 from worker.hands.load import hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -57,15 +57,15 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     return obj
 
 
-def _loaded(wanted: Wanted, found: Found, face_error_m: float) -> ObjectModel:
+def _loaded(wanted: Sought, found: Found, face_error_m: float) -> ObjectModel:
     return load_object(
         found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
     )
 
 
-def _wanted(shard: Shard, kind: AssetKind) -> Wanted:
+def _wanted(shard: Shard, kind: AssetKind) -> Sought:
     said = shard.attributes
-    return Wanted(
+    return Sought(
         kind,
         str(said.get(kind.value, "")),
         str(said.get(f"{kind.value}_digest", "")),
@@ -105,7 +105,7 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
 
 def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
     folder = None if shard.path is None else shard.path.resolve().parent
-    wanted = Wanted(AssetKind.OBJECT, name, digest, source, folder=folder)
+    wanted = Sought(AssetKind.OBJECT, name, digest, source, folder=folder)
     return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
 
 

@@ -36,7 +36,7 @@ _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict
 
 
 @dataclass(frozen=True)
-class Wanted:
+class Sought:
     """A hand or an object as a shard knows it."""
 
     kind: AssetKind
@@ -67,69 +67,69 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
     return found | ({"object_options": json_attribute(dict(options))} if options else {})
 
 
-def find(wanted: Wanted) -> Found:
+def find(sought: Sought) -> Found:
     """The files of a hand or object: built in, at the path the shard notes, in the store, or in the shard's folder.
 
     Raises:
         NotFoundError: in none of these; says where it looked.
     """
-    if wanted.name in builtin_names(wanted.kind):
-        files = builtin_files(wanted.kind, wanted.name)
-        if digest_files(wanted.kind, files) == wanted.digest:
+    if sought.name in builtin_names(sought.kind):
+        files = builtin_files(sought.kind, sought.name)
+        if digest_files(sought.kind, files) == sought.digest:
             return Found(files, {})
     looked: list[str] = []
-    for path in _paths(wanted, looked):
-        if (found := at(wanted, path)) is not None:
+    for path in _paths(sought, looked):
+        if (found := at(sought, path)) is not None:
             return found
-    if (found := _stored(wanted, looked)) is not None:
+    if (found := _stored(sought, looked)) is not None:
         return found
-    for path in _beside(wanted, looked):
-        if (found := at(wanted, path)) is not None:
+    for path in _beside(sought, looked):
+        if (found := at(sought, path)) is not None:
             return found
     raise NotFoundError(
-        f"the {wanted.kind} {wanted.name!r} of digest {wanted.digest[:12]} is not {', not '.join(looked)}; "
-        f"name its file: --{wanted.kind}"
+        f"the {sought.kind} {sought.name!r} of digest {sought.digest[:12]} is not {', not '.join(looked)}; "
+        f"name its file: --{sought.kind}"
     )
 
 
-def _paths(wanted: Wanted, looked: list[str]) -> Iterator[Path]:
-    if wanted.source:
-        looked.append(f"at {wanted.source}, where the shard was made")
-        yield Path(wanted.source)
+def _paths(sought: Sought, looked: list[str]) -> Iterator[Path]:
+    if sought.source:
+        looked.append(f"at {sought.source}, where the shard was made")
+        yield Path(sought.source)
 
 
-def _stored(wanted: Wanted, looked: list[str]) -> Found | None:
+def _stored(sought: Sought, looked: list[str]) -> Found | None:
     url = Settings().resolved_store_url
     looked.append(f"in the store {url}")
     parts = urlsplit(url)
     if parts.scheme == "file" and not Path(unquote(parts.path)).is_dir():
         return None  # to look must not make one
     try:
-        return Found(load_asset_files(open_store(url), wanted.kind, wanted.digest), {})
+        return Found(load_asset_files(open_store(url), sought.kind, sought.digest), {})
     except GraspdError:
         return None
 
 
-def _beside(wanted: Wanted, looked: list[str]) -> Iterator[Path]:
-    if wanted.folder is None:
+def _beside(sought: Sought, looked: list[str]) -> Iterator[Path]:
+    if sought.folder is None:
         return
-    looked.append(f"in {wanted.folder}")
-    near = (path for pattern in ("*", "*/*") for path in sorted(wanted.folder.glob(pattern)))
-    fitting = (path for path in near if path.suffix.lower() in SUFFIXES[wanted.kind])
+    looked.append(f"in {sought.folder}")
+    near = (path for pattern in ("*", "*/*") for path in sorted(sought.folder.glob(pattern)))
+    fitting = (path for path in near if path.suffix.lower() in SUFFIXES[sought.kind])
     yield from (path for _, path in zip(range(LOOKED_AT), fitting, strict=False))
 
 
-def at(wanted: Wanted, path: Path) -> Found | None:
-    """The files at a path, if they are what is wanted."""
+def at(sought: Sought, path: Path) -> Found | None:
+    """The files at a path, if they are what is sought."""
     try:
         if not path.is_file():
             return None
-        _, files, stated = _FILES[wanted.kind](path)
-        digest = digest_files(wanted.kind, files)
+        _, files, stated = _FILES[sought.kind](path)
+        digest = digest_files(sought.kind, files)
     except (GraspdError, OSError):
         return None
-    for options in ({}, dict(wanted.options or {})):
-        if digest_variant(digest, options) == wanted.digest:
+    for options in ({}, dict(sought.options or {})):
+        if digest_variant(digest, options) == sought.digest:
             return Found(files, {**stated, **options})
     return None
 
