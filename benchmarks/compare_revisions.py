@@ -49,7 +49,11 @@ from service.settings import Settings
 print(json.dumps(create_app(Settings(data_dir=Path(sys.argv[1]), host="127.0.0.1")).openapi()))
 """
 HELP: Final = """
-import graspd, typer
+import typer
+try:
+    import graspd.cli as graspd
+except ImportError:  # one module in older revisions
+    import graspd
 def walk(command, name):
     print("==", name)
     print(command.get_help(typer.Context(command, info_name=name)))

@@ -36,10 +36,10 @@ def test_a_command_that_talks_http_needs_no_web_framework_and_no_database(module
 
 OVERVIEW = """
 import contextlib, io, sys
-import graspd
+import graspd.cli
 sys.argv = ["graspd", "--help"]
 with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-    graspd.main()
+    graspd.cli.main()
 """
 
 

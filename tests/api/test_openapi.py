@@ -7,7 +7,7 @@ import typer
 from starlette.testclient import TestClient
 from typer.core import TyperGroup
 
-import graspd
+import graspd.cli
 
 
 def operations(http: TestClient) -> dict[str, dict[str, object]]:
@@ -38,9 +38,9 @@ def test_no_reference_in_the_document_is_open(http: TestClient) -> None:
     assert wanted <= set(schemas)
 
 
-@pytest.mark.parametrize("name", [name for name, module, _, _ in graspd.COMMANDS if module != "graspd_demo"])
+@pytest.mark.parametrize("name", [name for name, module, _, _ in graspd.cli.COMMANDS if module != "graspd.demo"])
 def test_every_command_of_the_overview_opens(name: str) -> None:
-    module = next(module for known, module, _, _ in graspd.COMMANDS if known == name)
-    root = typer.main.get_command(graspd.build())
+    module = next(module for known, module, _, _ in graspd.cli.COMMANDS if known == name)
+    root = typer.main.get_command(graspd.cli.build())
     assert isinstance(root, TyperGroup)
-    assert graspd.load(module, name) is not None
+    assert graspd.cli.load(module, name) is not None

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-import graspd
+import graspd.cli
 from tests.conftest import REPOSITORY
 from tests.deploy.composition import SERVICES
 
 DOCKERFILE = REPOSITORY / "docker" / "Dockerfile"
 CONSTRAINTS = REPOSITORY / "docker" / "constraints.txt"
-COMMANDS = {name for name, *_ in graspd.COMMANDS}
+COMMANDS = {name for name, *_ in graspd.cli.COMMANDS}
 
 
 def instructions() -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ import pin
 
 ENGINE = {"warp-lang", "newton", "mujoco", "trimesh", "scipy", "manifold3d", "coacd", "yourdfpy", "matplotlib"}
 ROOMS = {"service": (), "api": ("api",), "worker": ("worker",)}
-OWN = {"service", "api", "worker", "graspd", "graspd_demo"}
+OWN = {"service", "api", "worker", "graspd"}
 
 
 def imported(folder: Path) -> set[str]:
@@ -79,8 +79,8 @@ import importlib.util
 found = importlib.util.find_spec
 importlib.util.find_spec = lambda name, package=None: None if name in BLOCKED else found(name, package)
 sys.argv = ["graspd", *sys.argv[2:]]
-import graspd
-graspd.main()
+import graspd.cli
+graspd.cli.main()
 """
 
 

@@ -13,7 +13,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-import graspd
+import graspd.cli
 from service.model.domain import Lane, Stage
 from service.model.version import PACKAGE_VERSION
 from service.queue.rq_queue import queue_name
@@ -25,7 +25,7 @@ from tests.deploy.composition import SERVICES, seconds
 FOLDER = REPOSITORY / "docker" / "kubernetes"
 VARIANTS = ("fixed-cpu", "keda-cpu", "keda-gpu")
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-COMMANDS = {name for name, *_ in graspd.COMMANDS}
+COMMANDS = {name for name, *_ in graspd.cli.COMMANDS}
 Document = dict[str, Any]
 
 

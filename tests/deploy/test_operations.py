@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import graspd
+import graspd.cli
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
 from service.model.domain import State
@@ -113,9 +113,9 @@ def test_keys_are_made_rotated_limited_and_revoked(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("call", page.calls(), ids=" ".join)
 def test_every_command_on_the_page_exists_with_its_options(call: list[str]) -> None:
-    module = next((module for name, module, *_ in graspd.COMMANDS if name == call[0]), None)
+    module = next((module for name, module, *_ in graspd.cli.COMMANDS if name == call[0]), None)
     assert module is not None, f"graspd has no command {call[0]}"
-    command: Any = graspd.load(module, call[0])
+    command: Any = graspd.cli.load(module, call[0])
     rest = call[1:]
     while rest and getattr(command, "commands", None):
         assert rest[0] in command.commands, f"graspd {call[0]} has no command {rest[0]}"

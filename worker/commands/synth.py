@@ -8,36 +8,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.model.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
+from service.model.domain import FIDELITIES, JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import parse_scene
 from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
-from service.store.attributes import Attribute
-from service.store.shards import json_attribute, write_shard
-from worker.certified import Certified, certified_grasps, joined_columns
-from worker.engines.devices import Device
-from worker.files.base_attributes import base_attributes
-from worker.files.origin import remembered
-from worker.hands.load import hand_from_path
-from worker.hands.model import HandModel
-from worker.objects.model import ObjectModel
-from worker.objects.prepare import object_from_path
-from worker.planners import PLANNERS, planner
+from service.store.shards import write_shard
+from worker.files.synthesis import chosen_fidelity, synthesized
+from worker.planners import PLANNERS
 from worker.planners.registry import parsed_options
 from worker.quality.referee.key import Level
 from worker.run import Progress as Report
-from worker.run import Run
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.simulation.surroundings import Scenes
-
-Arrays = dict[str, NDArray[Any]]
 
 app = typer.Typer()
 
@@ -91,35 +76,14 @@ def synth(
             "friction": friction, "fidelity": chosen_fidelity(fidelity, contact_solver),
         }
     )  # fmt: skip
-    planner(method, request.options)  # a wrong name or option is told before the files are read
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
-    model = hand_from_path(hand)
-    obj = object_from_path(object_, face_error_m=request.knobs.face_error_m, options=mesh)
-    place = parse_scene(scene, faces=faces)
-    if place.kind != "free":
-        planner(method, request.options, in_scenes=True)
-    device = Device(device).resolve()
-    began = time.perf_counter()
-    poses = rest_poses(place, obj, count=scenes, seed=seed) if place.kind != "free" else {}
-    where = Scenes(supports_of(place), poses["scene/object_pose"]) if poses else None
     with _bar(grasps, quiet=json) as report:
-        batches = [
-            certified_grasps(
-                model, obj, request, count=min(BATCH_SIZE, grasps - first), batch=first // BATCH_SIZE,
-                scenes=where, run=Run(device, threads, report(first, min(BATCH_SIZE, grasps - first))),
-            )
-            for first in range(0, grasps, BATCH_SIZE)
-        ]  # fmt: skip
-    seconds = time.perf_counter() - began
-    arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
-    arrays |= {name: poses[name] for name in ("scene/object_pose", "scene/rest_probability") if name in poses}
-    attributes = _attributes(model, obj, request, batches, device, seconds)
-    if poses:
-        attributes["scene"] = json_attribute(place.model_dump(mode="json"))
-    out.write_bytes(write_shard("base", arrays, attributes | remembered(hand, object_, mesh)))
-    found = summary(arrays, request, batches, out, seconds)
-    if poses:
-        found |= {"scene": place.kind, "scenes": len(poses["scene/object_pose"])} | _shares(batches)
+        made = synthesized(
+            hand, object_, request, place=parse_scene(scene, faces=faces), scenes=scenes, mesh=mesh, device=device,
+            threads=threads, report=report,
+        )  # fmt: skip
+    out.write_bytes(write_shard("base", made.arrays, made.attributes))
+    found = {"file": str(out), **made.summary()}
     if json:
         emit(found)
     else:
@@ -154,75 +118,6 @@ def _bar(grasps: int, *, quiet: bool) -> Iterator[Any]:
             return tell
 
         yield report
-
-
-def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
-    """The knobs of a named fidelity, with another contact solver where one is given.
-
-    Raises:
-        InputError: unknown fidelity or solver.
-    """
-    if name not in FIDELITIES:
-        raise InputError(f"unknown fidelity {name!r}; choose one of {', '.join(FIDELITIES)}")
-    knobs = FIDELITIES[name].model_dump()
-    if contact_solver:
-        knobs |= {"contact_solver": contact_solver, "name": f"{name}+{contact_solver}"}
-    try:
-        return Fidelity(**knobs)
-    except ValueError:
-        raise InputError(f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel") from None
-
-
-def _attributes(
-    hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[Certified], device: str, seconds: float
-) -> dict[str, Attribute]:
-    attributes: dict[str, Attribute] = {
-        "hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest,
-        "method": request.method, "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
-        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4),
-    }  # fmt: skip
-    tried = sum(batch.tried for batch in batches)
-    return attributes | base_attributes(hand, request, tried=tried, verdict_key=batches[0].verdict_key)
-
-
-def summary(arrays: Arrays, request: JobOptions, batches: list[Certified], out: Path, seconds: float) -> dict[str, Any]:
-    """What a user wants to know first of a base shard."""
-    column = int(np.argmin(np.abs(arrays["quality/thresholds_m"] - 0.005)))
-    count = len(arrays["quality/valid"])
-
-    def mean(name: str, digits: int) -> float | None:
-        values = arrays[f"quality/{name}"]
-        values = values[:, column] if values.ndim == 2 else values
-        known = values[np.isfinite(values)]
-        return round(float(known.mean()), digits) if len(known) else None
-
-    return {
-        "file": str(out),
-        "grasps": count,
-        "tried": sum(batch.tried for batch in batches),
-        "valid": int(arrays["quality/valid"].sum()),
-        "sound": int(arrays["quality/sound"].sum()),
-        "referee": request.referee,
-        "want": request.want,
-        "wanted": request.grasps,
-        "seconds": round(seconds, 3),
-        "grasps_per_second": round(count / seconds, 2),
-        "mean": {
-            "epsilon": mean("epsilon", 4),
-            "contact_area_cm2": mean("contact_area_cm2", 2),
-            "intersection_volume_cm3": mean("intersection_volume_cm3", 4),
-            "penetration_depth_mm": mean("penetration_depth_mm", 3),
-        },
-    }
-
-
-def _shares(batches: list[Certified]) -> dict[str, float]:
-    """Of all grasps that were planned: clear, lifted, lifted at half the friction."""
-    planned = sum(batch.planned for batch in batches)
-    return {
-        name: round(sum(batch.shares[name] * batch.planned for batch in batches) / max(1, planned), 4)
-        for name in batches[0].shares
-    }
 
 
 def _said(found: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from graspd import build
+from graspd.cli import build
 
 #: Colours of the arrow on the palm and of the prepared mesh: red exceeds blue by at least this [of 255].
 WARM = 60
@@ -139,7 +139,7 @@ def test_the_picture_shows_something(kind: str, name: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("arguments", [["--help"], ["hands", "--help"], ["objects", "--help"]])
 def test_an_overview_imports_no_engine(arguments: list[str]) -> None:
     code = (
-        "import sys; from typer.testing import CliRunner; from graspd import build;"
+        "import sys; from typer.testing import CliRunner; from graspd.cli import build;"
         f"assert CliRunner().invoke(build(), {arguments!r}).exit_code == 0;"
         "sys.exit(any(name in sys.modules for name in ('warp', 'newton', 'scipy', 'worker')))"
     )

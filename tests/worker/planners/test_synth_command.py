@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from graspd import build
+from graspd.cli import build
 from service.model.errors import ConflictError, NotFoundError
 from service.readers import Grasps, open_shards
 from service.store.shards import Shard, read_shard

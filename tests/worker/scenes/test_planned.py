@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from graspd import build
+from graspd.cli import build
 from service.model.domain import resolve_fidelity
 from service.store.shards import read_shard
 from tests.worker.simulation.test_surroundings import mujoco_distances

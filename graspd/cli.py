@@ -15,7 +15,7 @@ from service.model.version import PACKAGE_VERSION
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     (
         "demo",
-        "graspd_demo",
+        "graspd.demo",
         "Start here",
         "The main job on built-in data: grasps, scenes, pictures, and a page that shows them.",
     ),
@@ -66,7 +66,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
 ROOMS: Final[dict[str, tuple[str, str]]] = {
     "api": ("fastapi", "api"),
     "worker": ("warp", "worker"),
-    "graspd_demo": ("warp", "all"),
+    "graspd.demo": ("warp", "all"),
 }
 
 
@@ -112,7 +112,7 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
 
 def missing_extra(module: str) -> str | None:
     """The extra to install before a module can be used; None if it can be used now."""
-    needed, extra = ROOMS.get(module.partition(".")[0], ("", ""))
+    needed, extra = ROOMS.get(module) or ROOMS.get(module.partition(".")[0], ("", ""))
     return extra if needed and find_spec(needed) is None else None
 
 
@@ -147,7 +147,3 @@ def _entry() -> None:
 def main() -> None:
     """Entry point of the `graspd` command."""
     build()()
-
-
-if __name__ == "__main__":
-    main()

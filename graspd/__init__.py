@@ -1,0 +1,100 @@
+"""graspd in Python: grasps of a hand on an object, made here or by a service, and those of files.
+
+    import graspd
+
+    grasps = graspd.synthesize("my_hand.urdf", "mug.stl", count=64, scene="table")
+    best = grasps.valid().top("epsilon", 10)
+    best.hand_pose, best.joint_positions, best.joint_names
+    graspd.open("grasps.h5")
+    graspd.Client("http://127.0.0.1:8000").submit("allegro", "mug", grasps=64).wait().grasps()
+
+Everything is imported when it is first used. Every error that graspd raises on purpose is a `graspd.GraspdError`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+from graspd import shadows
+
+if TYPE_CHECKING:
+    from graspd.grasps import Grasp, Grasps, Postures, open
+    from graspd.remote import Client, Job
+    from graspd.synthesis import synthesize
+    from service.model.errors import (
+        BusyError,
+        ConflictError,
+        DamagedError,
+        GraspdError,
+        HandError,
+        InputError,
+        LimitError,
+        MeshError,
+        NotFoundError,
+        TaskError,
+        UnavailableError,
+    )
+
+    __version__: str
+
+_ERRORS: Final = "service.model.errors"
+#: Name, the module it lives in.
+_LIVES_IN: Final = {
+    "synthesize": "graspd.synthesis",
+    "open": "graspd.grasps",
+    "Grasps": "graspd.grasps",
+    "Grasp": "graspd.grasps",
+    "Postures": "graspd.grasps",
+    "Client": "graspd.remote",
+    "Job": "graspd.remote",
+    "GraspdError": _ERRORS,
+    "InputError": _ERRORS,
+    "NotFoundError": _ERRORS,
+    "ConflictError": _ERRORS,
+    "MeshError": _ERRORS,
+    "HandError": _ERRORS,
+    "LimitError": _ERRORS,
+    "UnavailableError": _ERRORS,
+    "BusyError": _ERRORS,
+    "DamagedError": _ERRORS,
+    "TaskError": _ERRORS,
+}
+
+__all__ = [
+    "BusyError",
+    "Client",
+    "ConflictError",
+    "DamagedError",
+    "Grasp",
+    "GraspdError",
+    "Grasps",
+    "HandError",
+    "InputError",
+    "Job",
+    "LimitError",
+    "MeshError",
+    "NotFoundError",
+    "Postures",
+    "TaskError",
+    "UnavailableError",
+    "__version__",
+    "open",
+    "synthesize",
+]
+
+shadows.check()
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("service.model.version").PACKAGE_VERSION
+    if name not in _LIVES_IN:
+        raise AttributeError(f"module 'graspd' has no attribute {name!r}")
+    found = getattr(import_module(_LIVES_IN[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,313 @@
+"""Grasps of one hand as arrays: with their postures, metrics and verdicts, chosen and sorted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.metrics import GRASP_METRICS, GraspMetric
+from service.model.transforms import compose
+from service.readers.files import Shards, open_shards
+from service.store import standing
+from service.store.attributes import Attribute
+from service.store.manifests import INDEX_THRESHOLD_M
+from service.store.shards import SCHEMAS, Shard, read_shard, write_shard
+
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+#: Rows to keep: a mask (N,), row numbers, or a function that makes either from the grasps.
+Rows = NDArray[Any] | Sequence[int] | Sequence[bool]
+
+_METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
+_PER_GRASP: Final = frozenset(path for path, column in SCHEMAS["base"].items() if column.shape.split()[0] == "N")
+_THRESHOLDS: Final = "quality/thresholds_m"
+_SCENES: Final = ("scene/object_pose", "scene/rest_probability")
+_INDEX: Final = "grasp/scene_index"
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Hand postures in the object frame."""
+
+    hand_pose: Floats
+    """(N, 7) pose of the hand's root link: x y z [m], then unit quaternion w x y z."""
+    joint_positions: Floats
+    """(N, J) [rad or m], order in `Grasps.joint_names`."""
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """One grasp."""
+
+    hand_pose: Floats
+    """(7,) pose of the hand's root link in the object frame: x y z [m], then unit quaternion w x y z."""
+    joints: dict[str, float]
+    """Position of each joint at contact [rad or m]."""
+    valid: bool
+    metrics: dict[str, float]
+
+
+class Grasps:
+    """N grasps of one hand; the order is that of the file, or of `top`.
+
+    Columns have the names, shapes, units and frames of docs/dataset.md.
+    """
+
+    def __init__(self, columns: Mapping[str, Array], attributes: Mapping[str, Attribute]) -> None:
+        self._columns = dict(columns)
+        self._attributes = dict(attributes)
+        if "object" not in self._columns:
+            self._columns["object"] = np.full(len(columns["grasp/hand_pose"]), str(attributes.get("object", "")))
+
+    def __len__(self) -> int:
+        return len(self._columns["grasp/hand_pose"])
+
+    def __repr__(self) -> str:
+        names = ", ".join(self.objects)
+        return f"<{len(self)} grasps of {self.hand} on {names or 'nothing'}, {int(self.is_valid.sum())} valid>"
+
+    def __iter__(self) -> Iterator[Grasp]:
+        return (self[i] for i in range(len(self)))
+
+    @overload
+    def __getitem__(self, rows: int) -> Grasp: ...
+    @overload
+    def __getitem__(self, rows: slice | Rows) -> Grasps: ...
+    def __getitem__(self, rows: Any) -> Any:
+        """One grasp by its number; some of them by a slice, a mask (N,) or numbers."""
+        if isinstance(rows, int | np.integer):
+            return self._one(range(len(self))[int(rows)])
+        chosen = rows if isinstance(rows, slice) else np.asarray(rows)
+        if isinstance(chosen, np.ndarray) and not len(chosen):
+            chosen = chosen.astype(int)
+        kept = {path: data[chosen] if self._per_grasp(path) else data for path, data in self._columns.items()}
+        return Grasps(kept, self._attributes)
+
+    # What they are of.
+
+    @property
+    def hand(self) -> str:
+        """Name of the hand."""
+        return str(self._attributes.get("hand", ""))
+
+    @property
+    def objects(self) -> list[str]:
+        """Names of the objects, each once, in order of appearance."""
+        return list(dict.fromkeys(str(name) for name in self._columns["object"]))
+
+    @property
+    def joint_names(self) -> list[str]:
+        """(J) names of the hand's moving joints, the order of all joint positions."""
+        names = self._attributes.get("joint_names", [])
+        return [str(name) for name in names] if isinstance(names, list) else []
+
+    @property
+    def attributes(self) -> dict[str, Attribute]:
+        """What the file says of all of them: method, fidelity, seed, digests (docs/dataset.md)."""
+        return dict(self._attributes)
+
+    # Postures.
+
+    @property
+    def hand_pose(self) -> Floats:
+        """(N, 7) pose of the hand's root link at contact, in the object frame: x y z [m], quaternion w x y z."""
+        return self.column("grasp/hand_pose")
+
+    @property
+    def joint_positions(self) -> Floats:
+        """(N, J) joints at contact [rad or m]."""
+        return self.column("grasp/joint_positions")
+
+    @property
+    def pregrasp(self) -> Postures:
+        """The open hand before contact."""
+        return Postures(self.column("pregrasp/hand_pose"), self.column("pregrasp/joint_positions"))
+
+    @property
+    def squeeze(self) -> Postures:
+        """The commanded posture that presses on the object."""
+        return Postures(self.column("squeeze/hand_pose"), self.column("squeeze/joint_positions"))
+
+    @property
+    def approach(self) -> Floats:
+        """(N, W, 7) root poses of the open hand from its standoff to the pregrasp; grasps planned in a scene only."""
+        return self.column("grasp/approach")
+
+    @property
+    def lift(self) -> Postures:
+        """The squeezing hand 10 cm higher; grasps planned in a scene only."""
+        return Postures(self.column("grasp/lift"), self.column("squeeze/joint_positions"))
+
+    # Where they are used.
+
+    @property
+    def object_pose(self) -> Floats:
+        """(N, 7) pose of the object in each grasp's scene, z up; grasps planned in a scene only."""
+        return self.column("scene/object_pose")[self.column(_INDEX)]
+
+    @property
+    def hand_pose_in_scene(self) -> Floats:
+        """(N, 7) `hand_pose` in each grasp's scene frame, z up; grasps planned in a scene only."""
+        return compose(self.object_pose, self.hand_pose)
+
+    # Quality.
+
+    @property
+    def is_valid(self) -> NDArray[np.bool_]:
+        """(N,) sound, and a referee judged that it holds; in a scene: that it lifts."""
+        return standing.valid(self._columns)
+
+    @property
+    def is_sound(self) -> NDArray[np.bool_]:
+        """(N,) passed the geometric gate."""
+        return standing.sound(self._columns)
+
+    @property
+    def metrics(self) -> list[str]:
+        """Names that `metric` and `top` take."""
+        return [metric.name for metric in GRASP_METRICS if metric.path in self._columns]
+
+    def metric(self, name: str, *, threshold_m: float = INDEX_THRESHOLD_M) -> Array:
+        """(N,) a metric of docs/metrics.md; nan where it is not known.
+
+        Args:
+            name: such as epsilon or contact_area_cm2.
+            threshold_m: hand surface nearer than this is in contact; the nearest threshold of the file is taken [m].
+
+        Raises:
+            InputError: the file has no such metric.
+        """
+        known = self._known(name)
+        values = self._columns[known.path]
+        if not known.swept:
+            return values
+        return values[:, int(np.argmin(np.abs(self._columns[_THRESHOLDS] - threshold_m)))]
+
+    def column(self, path: str) -> Array:
+        """A column of docs/dataset.md, such as quality/verdict_margin; InputError if the file has none."""
+        if path not in self._columns:
+            raise InputError(f"these grasps have no column {path!r}; they have {', '.join(sorted(self._columns))}")
+        return self._columns[path]
+
+    # Choosing.
+
+    def valid(self) -> Grasps:
+        """The valid ones."""
+        return self[self.is_valid]
+
+    def where(self, rows: Rows | Callable[[Grasps], Rows]) -> Grasps:
+        """Those of a mask (N,) or of row numbers, given or made: `where(lambda g: g.metric("epsilon") > 0.3)`."""
+        return self[np.asarray(rows(self) if callable(rows) else rows)]
+
+    def top(self, metric: str, count: int) -> Grasps:
+        """The best by a metric, the best first; those whose metric is not known are left out.
+
+        Raises:
+            InputError: the file has no such metric, or `count` is negative.
+        """
+        if count < 0:
+            raise InputError(f"top {metric} of {count}: a number of grasps is not negative")
+        values = np.asarray(self.metric(metric), float)
+        order = np.argsort(values if self._known(metric).less_is_better else -values, kind="stable")
+        return self[order[np.isfinite(values[order])][:count]]
+
+    # Files.
+
+    def save(self, path: str | Path) -> Path:
+        """Write them as one file that every command and `graspd.open` reads.
+
+        Raises:
+            InputError: they are of several objects, or the file cannot be written.
+        """
+        if len(self.objects) > 1:
+            raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
+        said = {name: value for name, value in self._attributes.items() if name not in ("shard_id", "schema")}
+        columns = {name: data for name, data in self._columns.items() if name != "object"}
+        try:
+            Path(path).write_bytes(write_shard("base", columns, said))
+        except OSError as error:
+            raise InputError(f"{path} cannot be written: {error.strerror}") from None
+        return Path(path)
+
+    def _known(self, name: str) -> GraspMetric:
+        metric = _METRICS.get(name)
+        if metric is None or metric.path not in self._columns:
+            raise InputError(f"these grasps have no metric {name!r}; they have {', '.join(self.metrics)}")
+        return metric
+
+    def _one(self, row: int) -> Grasp:
+        joints = dict(zip(self.joint_names, map(float, self.joint_positions[row]), strict=True))
+        metrics = {name: float(self.metric(name)[row]) for name in self.metrics}
+        return Grasp(self.hand_pose[row], joints, bool(self.is_valid[row]), metrics)
+
+    @staticmethod
+    def _per_grasp(path: str) -> bool:
+        return path in _PER_GRASP or path == "object"
+
+
+def open(
+    source: str | Path | Sequence[str | Path],
+    *,
+    hand: str | None = None,
+    job: str | None = None,
+    dataset: str | None = None,
+) -> Grasps:
+    """The grasps of a file, of several, of a folder (searched whole), or of a job or dataset in a store.
+
+    Args:
+        source: a path, several, or the URL of a store (`file://`, `s3://`, `gs://`, `az://`).
+        hand: which hand's, where there are several: joints of two hands do not fit into one array.
+        job: id of a job in the store.
+        dataset: name of a dataset in the store: its newest snapshot.
+
+    Raises:
+        InputError: no file of grasps, or of several hands; NotFoundError: no such file, job or dataset.
+        DamagedShard: a file is not what its checksum says.
+    """
+    shards = open_shards(source, job=job, dataset=dataset)
+    return joined([read_shard(shards.path(file), kind="base") for file in _of_hand(shards, hand).of("base")])
+
+
+def joined(shards: Sequence[Shard]) -> Grasps:
+    """The grasps of base shards of one hand as one; columns that some lack are left out.
+
+    Raises:
+        InputError: there is none, or joints or contact thresholds differ.
+    """
+    if not shards:
+        raise InputError("there is no file of grasps here")
+    first = shards[0]
+    for shard in shards[1:]:
+        if shard.attributes.get("joint_names") != first.attributes.get("joint_names"):
+            raise InputError(f"the files are of hands with other joints: {first.path} and {shard.path}")
+        if not np.array_equal(shard[_THRESHOLDS], first[_THRESHOLDS]):
+            raise InputError(f"the files were measured at other contact thresholds: {first.path} and {shard.path}")
+    common = set.intersection(*(set(shard.arrays) for shard in shards))
+    columns: dict[str, Array] = {
+        path: np.concatenate([shard[path] for shard in shards])
+        for path in sorted(common)
+        if path in _PER_GRASP or path in _SCENES
+    }
+    columns[_THRESHOLDS] = first[_THRESHOLDS]
+    if _INDEX in columns:
+        before = np.cumsum([0, *(len(shard["scene/object_pose"]) for shard in shards[:-1])])
+        columns[_INDEX] = np.concatenate([shard[_INDEX] + at for shard, at in zip(shards, before, strict=True)])
+    counts = [len(shard["grasp/hand_pose"]) for shard in shards]
+    names = [str(shard.attributes.get("object", "")) for shard in shards]
+    columns["object"] = np.repeat(np.array(names), counts)
+    return Grasps(columns, first.attributes)
+
+
+def _of_hand(shards: Shards, hand: str | None) -> Shards:
+    hands = sorted({file.hand for file in shards.of("base")})
+    if hand is not None and hand not in hands:
+        raise InputError(f"there are no grasps of the hand {hand!r}; there are those of {', '.join(hands) or 'none'}")
+    if hand is None and len(hands) > 1:
+        raise InputError(f"these are grasps of {', '.join(hands)}; name one of them: hand={hands[0]!r}")
+    return shards.only(hands=[hand]) if hand else shards

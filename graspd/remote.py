@@ -1,0 +1,126 @@
+"""Jobs of a service: submitted, awaited, their grasps fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+from pydantic import ValidationError
+
+from graspd.grasps import Grasps, joined
+from service.cli import validation_line
+from service.model.domain import JobRequest, State
+from service.model.errors import InputError, TaskError
+from service.store.shards import read_shard
+
+try:
+    from api.client.client import Client as HttpClient
+    from api.client.reports import open_client
+    from api.models import JobDetail
+except ModuleNotFoundError as error:
+    raise ImportError(f"graspd.Client needs {error.name}; run pip install 'graspd[api]'") from error
+
+
+class Client:
+    """A graspd service. Usable as a context manager.
+
+    Args:
+        url: where its API answers; None: GRASPD_API_URL, or the service that runs on this machine's data folder.
+        key: Bearer key, if the service asks for one; None: GRASPD_API_KEY.
+    """
+
+    def __init__(self, url: str | None = None, *, key: str | None = None) -> None:
+        self._http = HttpClient(url, key=key) if url is not None and key is not None else open_client(url)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._http.close()
+
+    def submit(self, hand: str, object: str, **options: Any) -> Job:
+        """Submit a job: the same request gives the same job.
+
+        Args:
+            hand: name of a hand that the service knows.
+            object: name of an object that it knows.
+            options: `grasps`, `scene`, `fidelity`, `seed` and the other fields of POST /v1/jobs.
+
+        Raises:
+            InputError: an option that there is not, or that cannot be used; NotFoundError: unknown hand or object.
+            UnavailableError: the service does not answer.
+        """
+        try:
+            request = JobRequest.model_validate({"hand": hand, "object": object, **options})
+        except ValidationError as error:
+            raise InputError(validation_line(error)) from None
+        return Job(self._http, self._http.submit(request))
+
+    def job(self, job_id: str) -> Job:
+        """A job by its id; NotFoundError if there is none."""
+        return Job(self._http, self._http.job(job_id))
+
+
+class Job:
+    """One hand on one object, in work or ended."""
+
+    def __init__(self, http: HttpClient, said: JobDetail) -> None:
+        self._http, self._said = http, said
+
+    def __repr__(self) -> str:
+        return f"<job {self.id[:12]}: {self.hand} on {self.object}, {self.state}>"
+
+    @property
+    def id(self) -> str:
+        """Its id."""
+        return self._said.id
+
+    @property
+    def hand(self) -> str:
+        """Name of the hand."""
+        return self._said.request.hand
+
+    @property
+    def object(self) -> str:
+        """Name of the object."""
+        return self._said.request.object
+
+    @property
+    def state(self) -> str:
+        """queued, running, succeeded, failed or cancelled, when it was last asked for."""
+        return str(self._said.state)
+
+    def wait(self, progress: Callable[[float], None] | None = None) -> Self:
+        """Wait until it has ended.
+
+        Args:
+            progress: called with the share that is done, 0 to 1.
+
+        Raises:
+            TaskError: it failed or was cancelled; what it made until then can still be fetched.
+        """
+        self._said = self._http.wait(
+            self.id, on_progress=(lambda job: progress(float(job.progress))) if progress else None
+        )
+        if self._said.state != State.SUCCEEDED:
+            reasons = [attempt.reason for attempt in self._said.attempts]
+            raise TaskError(f"job {self.id[:12]} ended {self.state}{': ' + reasons[-1] if reasons else ''}")
+        return self
+
+    def grasps(self) -> Grasps:
+        """What it has made by now; InputError if that is nothing yet."""
+        self._said = self._http.job(self.id)
+        base = [shard for shard in self._said.shards if shard.kind == "base"]
+        if not base:
+            raise InputError(f"job {self.id[:12]} has made no grasps yet: it is {self.state}")
+        ordered = sorted(base, key=lambda shard: shard.batch)
+        return joined([read_shard(b"".join(self._http.fetch(one.file)), name=one.id[:12]) for one in ordered])
+
+    def cancel(self) -> Self:
+        """Stop it; what is written stays."""
+        self._said = self._http.cancel(self.id)
+        return self

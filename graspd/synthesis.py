@@ -1,0 +1,96 @@
+"""Grasps made in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ValidationError
+
+from graspd.grasps import Grasps
+from service.cli import validation_line
+from service.model.domain import JobOptions
+from service.model.errors import InputError
+from service.model.scene_spec import parse_scene
+
+
+def synthesize(
+    hand: str | Path,
+    object: str | Path,
+    *,
+    count: int = 32,
+    scene: str | Path = "free",
+    scenes: int = 4,
+    faces: Literal["drawn", "all"] = "drawn",
+    want: Literal["valid", "raw"] = "valid",
+    budget: float = 4.0,
+    referee: Literal["letter", "certificate", "screen", "none"] = "certificate",
+    method: str = "fast_graspd",
+    options: dict[str, Any] | None = None,
+    fidelity: str = "standard",
+    seed: int = 0,
+    friction: float = 1.0,
+    units: str | None = None,
+    scale_to: float | None = None,
+    device: str = "auto",
+    threads: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> Grasps:
+    """Grasps of a hand on an object, judged and measured as by `graspd synth`: the same seed gives the same ones.
+
+    The first call of a process builds or loads kernels.
+
+    Args:
+        hand: a URDF, a ZIP with one, or the name of a built-in hand.
+        object: a mesh (STL, OBJ, PLY, GLB, OFF) or the name of a built-in object.
+        count: grasps wanted; fewer come back where the budget of tries ends first.
+        scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/scenes.md).
+        scenes: scenes that they are shared out to.
+        faces: drawn: as drops fall; all: a scene for each stable face.
+        want: valid: that many valid grasps; raw: of any kind.
+        budget: grasps tried for each one wanted, at most.
+        referee: level at which MuJoCo judges; none: nobody, and grasps are sound at best.
+        method: the planner.
+        options: its own options, such as {"steps": 20000}.
+        fidelity: draft, standard or fine.
+        seed: with hand, object and options all that decides the result.
+        friction: Coulomb coefficient of the quality metrics.
+        units: of the mesh: m, cm, mm or in; guessed if not given.
+        scale_to: longest side of the object [m].
+        device: cpu, cuda:0 or auto.
+        threads: CPU threads; 0: one per core.
+        progress: called with the share that is done, 0 to 1.
+
+    Raises:
+        InputError: something of it cannot be used (MeshError, HandError: a file); says what, and the mend.
+        ImportError: this install has no engine: pip install 'graspd[worker]'.
+    """
+    try:
+        from service.store.asset_options import object_options
+        from worker.files.synthesis import chosen_fidelity, synthesized
+    except ModuleNotFoundError as error:
+        raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
+    try:
+        request = JobOptions(
+            grasps=count, want=want, budget=budget, referee=referee, method=method, options=options or {}, seed=seed,
+            friction=friction, audits=0,
+        )  # fmt: skip
+    except ValidationError as error:
+        raise InputError(validation_line(error)) from None
+    request = request.model_copy(update={"fidelity": chosen_fidelity(fidelity)})
+    made = synthesized(
+        str(hand), str(object), request, place=parse_scene(str(scene), faces=faces), scenes=scenes,
+        mesh=object_options(units=units, scale_to=scale_to), device=device, threads=threads,
+        report=_reporter(progress, count) if progress else None,
+    )  # fmt: skip
+    return Grasps(made.arrays, made.attributes)
+
+
+def _reporter(progress: Callable[[float], None], wanted: int) -> Callable[[int, int], Any]:
+    """From a batch's first grasp and number of grasps to what tells the share of all."""
+
+    def of_batch(first: int, size: int) -> Callable[[float, float, str], None]:
+        return lambda done, total, _message: progress((first + size * done / total) / wanted)
+
+    return of_batch

@@ -1,0 +1,49 @@
+"""docs/python.md and the notebook, run as they are printed, beside a service."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.run.supervisor import Supervisor
+from service.settings import Settings
+from tests.conftest import REPOSITORY
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    settings = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0)
+    with Supervisor(settings, workers=1) as supervisor:
+        supervisor.wait_ready(240)
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
+        yield kept | {"GRASPD_API_URL": supervisor.api_url, "GRASPD_DATA_DIR": str(settings.data_dir)}
+
+
+def run(code: str, environment: dict[str, str], folder: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment, cwd=folder
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "python.md").read_text(), re.DOTALL)
+    said = run("\n".join(blocks), environment, tmp_path)
+    assert "<8 grasps of allegro on mug, 8 valid>" in said
+    assert "<8 grasps of barrett on mug, 8 valid>" in said
+    assert "no_such_file.stl" in said
+
+
+def test_the_notebook_runs(environment: dict[str, str], tmp_path: Path) -> None:
+    notebook = json.loads((REPOSITORY / "examples" / "first_grasps.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    run("\n".join(["import matplotlib; matplotlib.use('Agg')", *cells]), environment, tmp_path)
+    assert (tmp_path / "grasps.h5").is_file()

@@ -1,0 +1,172 @@
+"""Grasps of a hand file on an object file as a job makes them, in this process: a base shard in memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
+from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
+from service.store.attributes import Attribute
+from service.store.shards import json_attribute
+from worker.certified import Certified, certified_grasps, joined_columns
+from worker.engines.devices import Device
+from worker.files.base_attributes import base_attributes
+from worker.files.origin import remembered
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.planners import planner
+from worker.run import Progress, Run
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.simulation.surroundings import Scenes
+
+Arrays = dict[str, NDArray[Any]]
+#: Threshold of the metrics that a summary tells [m].
+_TOLD_M: Final = 0.005
+FREE: Final = SceneSpec()
+
+
+@dataclass(frozen=True)
+class Synthesized:
+    """A base shard in memory, and what became of all tries."""
+
+    arrays: Arrays
+    attributes: dict[str, Attribute]
+    batches: list[Certified]
+    request: JobOptions
+    place: SceneSpec
+    seconds: float
+    """Wall time, without the reading of the files [s]."""
+
+    def summary(self) -> dict[str, Any]:
+        """What a user wants to know first, for JSON."""
+        count, request = len(self.arrays["quality/valid"]), self.request
+        told: dict[str, Any] = {
+            "grasps": count,
+            "tried": sum(batch.tried for batch in self.batches),
+            "valid": int(self.arrays["quality/valid"].sum()),
+            "sound": int(self.arrays["quality/sound"].sum()),
+            "referee": request.referee,
+            "want": request.want,
+            "wanted": request.grasps,
+            "seconds": round(self.seconds, 3),
+            "grasps_per_second": round(count / self.seconds, 2),
+            "mean": {
+                "epsilon": self._mean("epsilon", 4),
+                "contact_area_cm2": self._mean("contact_area_cm2", 2),
+                "intersection_volume_cm3": self._mean("intersection_volume_cm3", 4),
+                "penetration_depth_mm": self._mean("penetration_depth_mm", 3),
+            },
+        }
+        if self.place.kind != "free":
+            told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
+        return told
+
+    def _mean(self, name: str, digits: int) -> float | None:
+        values = self.arrays[f"quality/{name}"]
+        if values.ndim == 2:
+            values = values[:, int(np.argmin(np.abs(self.arrays["quality/thresholds_m"] - _TOLD_M)))]
+        known = values[np.isfinite(values)]
+        return round(float(known.mean()), digits) if len(known) else None
+
+    def _shares(self) -> dict[str, float]:
+        """Of all grasps that were planned: clear, lifted, lifted at half the friction."""
+        planned = sum(batch.planned for batch in self.batches)
+        return {
+            name: round(sum(batch.shares[name] * batch.planned for batch in self.batches) / max(1, planned), 4)
+            for name in self.batches[0].shares
+        }
+
+
+def synthesized(
+    hand: str,
+    obj: str,
+    request: JobOptions,
+    *,
+    place: SceneSpec = FREE,
+    scenes: int = 4,
+    mesh: Mapping[str, Any] | None = None,
+    device: str = "auto",
+    threads: int = 0,
+    report: Callable[[int, int], Progress] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Synthesized:
+    """The grasps of a job in one process, without a queue or a server.
+
+    Args:
+        hand: a URDF, a ZIP with one, or the name of a built-in hand.
+        obj: a mesh or the name of a built-in object.
+        request: how many grasps, how made and judged.
+        place: where they are used.
+        scenes: scenes that the grasps are shared out to.
+        mesh: how the object's file is read: units, scale_to, keep_largest, allow_open.
+        device: cpu, cuda:0 or auto.
+        threads: CPU threads; 0: one per core.
+        report: from a batch's first grasp and number of grasps to what is told of its progress.
+        cancelled: asked often; True: the work stops.
+
+    Raises:
+        InputError: unknown method, option, hand, object or device, or a scene without room.
+        TaskCancelled: `cancelled` answered True.
+    """
+    planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
+    options = dict(mesh or {})
+    model = hand_from_path(hand)
+    thing = object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options)
+    chosen = Device(device).resolve()
+    began = time.perf_counter()
+    poses = rest_poses(place, thing, count=scenes, seed=request.seed) if place.kind != "free" else {}
+    where = Scenes(supports_of(place), poses["scene/object_pose"]) if poses else None
+    sizes = [(first, min(BATCH_SIZE, request.grasps - first)) for first in range(0, request.grasps, BATCH_SIZE)]
+    alone = Run(chosen, threads) if cancelled is None else Run(chosen, threads, cancelled=cancelled)
+    batches = [
+        certified_grasps(
+            model, thing, request, count=size, batch=first // BATCH_SIZE, scenes=where,
+            run=alone if report is None else replace(alone, progress=report(first, size)),
+        )
+        for first, size in sizes
+    ]  # fmt: skip
+    seconds = time.perf_counter() - began
+    arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
+    arrays |= {name: poses[name] for name in ("scene/object_pose", "scene/rest_probability") if name in poses}
+    attributes = _attributes(model, thing, request, batches, chosen, seconds) | remembered(hand, obj, options)
+    if poses:
+        attributes["scene"] = json_attribute(place.model_dump(mode="json"))
+    return Synthesized(arrays, attributes, batches, request, place, seconds)
+
+
+def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:
+    """The knobs of a named fidelity, with another contact solver where one is given.
+
+    Raises:
+        InputError: unknown fidelity or solver.
+    """
+    if name not in FIDELITIES:
+        raise InputError(f"unknown fidelity {name!r}; choose one of {', '.join(FIDELITIES)}")
+    knobs = FIDELITIES[name].model_dump()
+    if contact_solver:
+        knobs |= {"contact_solver": contact_solver, "name": f"{name}+{contact_solver}"}
+    try:
+        return Fidelity(**knobs)
+    except ValueError:
+        raise InputError(f"unknown contact solver {contact_solver!r}; choose direct, jacobi or gauss_seidel") from None
+
+
+def _attributes(
+    hand: HandModel, obj: ObjectModel, request: JobOptions, batches: list[Certified], device: str, seconds: float
+) -> dict[str, Attribute]:
+    attributes: dict[str, Attribute] = {
+        "hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest,
+        "method": request.method, "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "seed": request.seed, "batch": 0, "device": device, "seconds": round(seconds, 4),
+    }  # fmt: skip
+    tried = sum(batch.tried for batch in batches)
+    return attributes | base_attributes(hand, request, tried=tried, verdict_key=batches[0].verdict_key)
