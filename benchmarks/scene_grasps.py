@@ -32,8 +32,9 @@ from worker.planners import Run, Wanted, synthesize
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.lifting import judge_lifts
+from worker.scenes.clearance import MARGIN_M
 from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.way import MARGIN_M, plan_way
+from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 
 #: Not a seed that any setting was chosen with.

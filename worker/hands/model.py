@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.hands.features import HandFeatures
 from worker.objects.content import content_of
 
 Floats = NDArray[np.float64]
@@ -124,6 +125,11 @@ class HandModel:
     def content(self) -> str:
         """Digest of the tree, the pieces and the numbers. `digest` is that of the files they were read from."""
         return content_of(self)
+
+    @cached_property
+    def features(self) -> HandFeatures:
+        """What of the pieces can touch a plane first."""
+        return HandFeatures.of(self.pieces)
 
     @property
     def bodies(self) -> int:

@@ -19,7 +19,7 @@ from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, hold
-from worker.simulation.obstacles import HandFeatures, feature_distances
+from worker.simulation.obstacles import feature_distances
 from worker.simulation.surroundings import Placed
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
@@ -258,7 +258,7 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
 def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
     """(B, fingers) least distance of each finger from the obstacles of its scene on paths (B, K, D); inf: no finger."""
     count, steps, _ = paths.shape
-    finger = finger_of_body(hand)[HandFeatures.of(hand).body]
+    finger = finger_of_body(hand)[hand.features.body]
     out = np.full((count, max(1, len(hand.fingertips))), np.inf)
     for number, scene in enumerate(placed.scenes):
         rows = np.flatnonzero(placed.index == number)

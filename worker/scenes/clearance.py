@@ -1,11 +1,7 @@
-"""Grasps on a table: base grasps moved by the object's rest pose and checked against the table.
-
-The lowest point of a convex piece is exact: corners for boxes and hulls, closed forms for round pieces.
-"""
+"""Grasps on a table: base grasps moved by the object's rest pose and checked against the table, exactly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
@@ -13,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import compose, quat_rotate, quat_to_matrix
+from service.model.transforms import compose
 from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
-from worker.hands.model import ConvexPiece, Floats, HandModel
+from worker.hands.model import Floats, HandModel
 from worker.scenes.neighbours import Neighbours, neighbour_clearance
+from worker.simulation.obstacles import PosedFeatures
+from worker.simulation.surroundings import UP, Obstacle
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
 MARGIN_M: Final = 0.002
 #: Postures checked on the straight way from pregrasp to grasp, both ends included.
 PATH_POSTURES: Final = 9
 _CHUNK: Final = 64
+_TABLE: Final = Obstacle.half_space(UP, 0.0)
 
 
 class Rejection(IntEnum):
@@ -34,24 +32,6 @@ class Rejection(IntEnum):
     TABLE_ON_APPROACH = 2
     NEIGHBOUR_AT_CONTACT = 3
     NEIGHBOUR_ON_APPROACH = 4
-
-
-@dataclass(frozen=True)
-class _Balls:
-    """Points with a radius, fixed to bodies: corners (radius 0), spheres, ends of capsules."""
-
-    body: NDArray[np.intp]
-    centre: Floats
-    radius: Floats
-
-
-@dataclass(frozen=True)
-class _Cylinders:
-    body: NDArray[np.intp]
-    centre: Floats
-    axis: Floats
-    half_length: Floats
-    radius: Floats
 
 
 def transfer(
@@ -144,51 +124,7 @@ def _beside(hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, n
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
     """(S, N, 2) lowest point of the hand at contact, and anywhere on its way, in the table frame [m]."""
-    path = approach(grasp, pregrasp)
-    bodies = body_poses(hand, path.hand_pose, path.joint_positions)
-    balls, cylinders = _solids(hand.pieces)
-    centres = quat_rotate(bodies[:, balls.body, 3:], balls.centre) + bodies[:, balls.body, :3]
-    middles = quat_rotate(bodies[:, cylinders.body, 3:], cylinders.centre) + bodies[:, cylinders.body, :3]
-    axes = quat_rotate(bodies[:, cylinders.body, 3:], cylinders.axis)
-    lowest = np.full((len(object_pose), len(path)), np.inf)
-    for s, pose in enumerate(object_pose):
-        up = quat_to_matrix(pose[3:])[2]
-        if len(balls.body):
-            lowest[s] = np.minimum(lowest[s], (centres @ up - balls.radius).min(axis=1) + pose[2])
-        if len(cylinders.body):
-            slope = axes @ up
-            reach = cylinders.half_length * np.abs(slope) + cylinders.radius * np.sqrt(np.maximum(0.0, 1 - slope**2))
-            lowest[s] = np.minimum(lowest[s], (middles @ up - reach).min(axis=1) + pose[2])
-    on_path = lowest.reshape(len(object_pose), len(grasp), -1)
+    features = PosedFeatures.of(hand, approach(grasp, pregrasp))
+    on_path = np.array([features.distance(_TABLE.seen_from(pose)).min(axis=1) for pose in object_pose])
+    on_path = on_path.reshape(len(object_pose), len(grasp), -1)
     return np.stack([on_path[..., -1], on_path.min(axis=2)], axis=-1)
-
-
-def _solids(pieces: tuple[ConvexPiece, ...]) -> tuple[_Balls, _Cylinders]:
-    """Convex pieces as balls and cylinders in their body frames."""
-    balls: list[tuple[int, Floats, float]] = []
-    rods: list[tuple[int, Floats, Floats, float, float]] = []
-    for piece in pieces:
-        middle, axis = piece.pose[:3], quat_rotate(piece.pose[3:], np.array([0.0, 0.0, 1.0]))
-        if piece.kind == "sphere":
-            balls.append((piece.body, middle, piece.size[0]))
-        elif piece.kind == "capsule":
-            radius, length = piece.size
-            balls += [(piece.body, middle + end * 0.5 * length * axis, radius) for end in (-1, 1)]
-        elif piece.kind == "cylinder":
-            rods.append((piece.body, middle, axis, 0.5 * piece.size[1], piece.size[0]))
-        else:
-            balls += [(piece.body, corner, 0.0) for corner in piece.vertices]
-    return (
-        _Balls(
-            np.array([b[0] for b in balls], np.intp),
-            np.array([b[1] for b in balls]).reshape(-1, 3),
-            np.array([b[2] for b in balls]),
-        ),
-        _Cylinders(
-            np.array([r[0] for r in rods], np.intp),
-            np.array([r[1] for r in rods]).reshape(-1, 3),
-            np.array([r[2] for r in rods]).reshape(-1, 3),
-            np.array([r[3] for r in rods]),
-            np.array([r[4] for r in rods]),
-        ),
-    )

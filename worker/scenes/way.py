@@ -19,18 +19,14 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import wide_open
 from worker.quality.probe import Probe, probe_of
-from worker.scenes.clearance import approach
+from worker.scenes.clearance import MARGIN_M, approach
 from worker.simulation.obstacles import obstacle_distances
-from worker.simulation.surroundings import Placed, Surroundings
+from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
 Floats = NDArray[np.float64]
 
-#: A way is free if the hand stays this far from every obstacle [m], and its points this far from the object.
-MARGIN_M: Final = 0.002
+#: On its way the hand's points stay this far from the object [m].
 OBJECT_MARGIN_M: Final = 0.001
-#: Length of the straight way to the pregrasp, and of the lift [m].
-STANDOFF_M: Final = 0.10
-RISE_M: Final = 0.10
 #: Postures stored on the approach, the standoff first, the pregrasp last, and between them others that are looked at.
 WAYPOINTS: Final = 6
 _LOOKS: Final = 4

@@ -15,7 +15,7 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.simulation.kernels import obstacles as kernels
-from worker.simulation.surroundings import Surroundings
+from worker.simulation.surroundings import Obstacle, Surroundings
 
 Floats = NDArray[np.float64]
 
@@ -25,40 +25,33 @@ _ENDLESS: Final = 1e9
 
 
 @dataclass(frozen=True)
-class HandFeatures:
-    """F points of a hand with a radius (balls) and circles about an axis (rims): all that can touch a plane first."""
+class PosedFeatures:
+    """The F features of a hand in P postures."""
 
-    body: NDArray[np.int32]
     centre: Floats
-    """(F, 3) body frame."""
+    """(P, F, 3)"""
     axis: Floats
-    """(F, 3) body frame; zero: a ball."""
+    """(P, F, 3); zero: a ball."""
     radius: Floats
-
-    def __len__(self) -> int:
-        return len(self.body)
+    """(F,)"""
+    rim: NDArray[np.bool_]
+    """(F,)"""
 
     @classmethod
-    def of(cls, hand: HandModel) -> HandFeatures:
-        """Corners of boxes and hulls, spheres, ends of capsules, rims of cylinders."""
-        rows: list[tuple[int, Floats, Floats, float]] = []
-        ball = np.zeros(3)
-        for piece in hand.pieces:
-            middle, axis = piece.pose[:3], quat_rotate(piece.pose[3:], np.array([0.0, 0.0, 1.0]))
-            if piece.kind == "sphere":
-                rows.append((piece.body, middle, ball, piece.size[0]))
-            elif piece.kind in ("capsule", "cylinder"):
-                radius, length = piece.size
-                about = axis if piece.kind == "cylinder" else ball
-                rows += [(piece.body, middle + 0.5 * end * length * axis, about, radius) for end in (-1, 1)]
-            else:
-                rows += [(piece.body, corner, ball, 0.0) for corner in piece.vertices]
-        return cls(
-            np.array([r[0] for r in rows], np.int32),
-            np.array([r[1] for r in rows]).reshape(-1, 3),
-            np.array([r[2] for r in rows]).reshape(-1, 3),
-            np.array([r[3] for r in rows]),
-        )
+    def of(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
+        """The features of a hand in these postures."""
+        features = hand.features
+        bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)[:, features.body]
+        centre = quat_rotate(bodies[..., 3:], features.centre) + bodies[..., :3]
+        axis = quat_rotate(bodies[..., 3:], features.axis)
+        return cls(centre, axis, features.radius, (features.axis**2).sum(axis=1) > 0.5)
+
+    def distance(self, obstacle: Obstacle) -> Floats:
+        """(P, F) signed distance from an obstacle [m]: exact over a half-space, beyond edges a lower bound."""
+        normal, offset = obstacle.planes[:, :3], obstacle.planes[:, 3]
+        sine = np.sqrt(np.maximum(0.0, 1.0 - (self.axis @ normal.T) ** 2))
+        reach = self.radius[:, None] * np.where(self.rim[:, None], sine, 1.0)
+        return np.asarray((self.centre @ normal.T - offset - reach).max(axis=-1))
 
 
 def feature_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
@@ -66,17 +59,10 @@ def feature_distances(hand: HandModel, postures: Posture, scene: Surroundings) -
 
     Against half-spaces it is exact, beyond the edges of others a lower bound.
     """
-    features = HandFeatures.of(hand)
-    bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)[:, features.body]
-    centre = quat_rotate(bodies[..., 3:], features.centre) + bodies[..., :3]
-    axis = quat_rotate(bodies[..., 3:], features.axis)
-    rim = (features.axis**2).sum(axis=1) > 0.5
-    least = np.full(centre.shape[:2], np.inf)
+    posed = PosedFeatures.of(hand, postures)
+    least = np.full(posed.centre.shape[:2], np.inf)
     for obstacle in scene.obstacles:
-        normal, offset = obstacle.planes[:, :3], obstacle.planes[:, 3]
-        sine = np.sqrt(np.maximum(0.0, 1.0 - (axis @ normal.T) ** 2))
-        reach = features.radius[:, None] * np.where(rim[:, None], sine, 1.0)
-        least = np.minimum(least, (centre @ normal.T - offset - reach).max(axis=-1))
+        least = np.minimum(least, posed.distance(obstacle))
     return least
 
 
@@ -113,7 +99,7 @@ class DeviceObstacles:
             device: Warp device.
             margin: distance to keep [m], of all features or (L,) of each body.
         """
-        found = HandFeatures.of(hand)
+        found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
         obstacles = [o for scene in scenes for o in scene.obstacles]
         planes = np.concatenate([np.zeros((0, 4)), *(o.planes for o in obstacles)])

@@ -21,6 +21,9 @@ Floats = NDArray[np.float64]
 
 #: Direction against gravity in the scene frame.
 UP: Final = np.array([0.0, 0.0, 1.0])
+#: Length of a hand's straight way to its pregrasp, and of the lift [m].
+STANDOFF_M: Final = 0.10
+RISE_M: Final = 0.10
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
-from worker.scenes.clearance import approach
-from worker.scenes.way import MARGIN_M, STANDOFF_M, plan_way
-from worker.simulation.surroundings import Obstacle, Placed
+from worker.scenes.clearance import MARGIN_M, approach
+from worker.scenes.way import plan_way
+from worker.simulation.surroundings import STANDOFF_M, Obstacle, Placed
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 

@@ -14,7 +14,7 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.simulation.data import Data
 from worker.simulation.model import LossOptions, Model
-from worker.simulation.obstacles import DeviceObstacles, HandFeatures
+from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.record import record_evaluation, record_placement
 from worker.simulation.state import HandState
@@ -32,7 +32,7 @@ SCENES = {
 
 def distances(hand: HandModel, state: HandState, obstacle: Obstacle) -> np.ndarray:
     """(F,) signed distance of each feature from an obstacle in float64, the object's centre being the origin."""
-    features, poses = HandFeatures.of(hand), bodies_of(hand, state)[HandFeatures.of(hand).body]
+    features, poses = hand.features, bodies_of(hand, state)[hand.features.body]
     centre = quat_rotate(poses[:, 3:], features.centre) + poses[:, :3]
     axis = quat_rotate(poses[:, 3:], features.axis)
     rim = np.linalg.norm(axis, axis=1) > 0.5

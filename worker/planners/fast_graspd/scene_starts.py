@@ -18,7 +18,7 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe, start_generator
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
-from worker.simulation.surroundings import Placed, Surroundings
+from worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
 
 Floats = NDArray[np.float64]
 
@@ -28,9 +28,7 @@ ROOM: Final = 0.006
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 #: Draws per start before the least penetrating one is taken.
 DRAWS: Final = 96
-#: Way along which a hand must be able to come [m], half the width of a palm [m], directions that are looked at, and
-#: how near one of the free ones is (cosine).
-STANDOFF_M: Final = 0.10
+#: Half the width of a palm [m], directions along which a hand may come, and how near one of the free ones is (cosine).
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98

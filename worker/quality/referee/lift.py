@@ -22,8 +22,6 @@ from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.model import Scene, blend
 from worker.quality.referee.protocol import (
-    LOST_ROTATION,
-    MAX_DISPLACEMENT_M,
     MAX_PENETRATION_M,
     PUSH,
     STAGE_S,
@@ -32,12 +30,10 @@ from worker.quality.referee.protocol import (
     Test,
     Trial,
 )
-from worker.simulation.surroundings import Placed
+from worker.simulation.surroundings import RISE_M, Placed
 
 Floats = NDArray[np.float64]
 
-#: How far the root rises [m].
-RISE_M: Final = 0.10
 #: Postures looked at between two waypoints of an approach.
 LOOKS: Final = 4
 #: The open hand may be this deep in the object's convex pieces on its way [m]: they stand out from its surface, where
@@ -165,19 +161,6 @@ class Lift(Test):
         of_hand = ours.any(axis=1) & ~ours.all(axis=1)
         on_support = of_hand & support.any(axis=1)
         return bool((distance[on_support] < 0).any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
-
-    def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False) -> bool:
-        pose, joints = grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row]
-        self._put(pose, joints)
-        for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
-            for stage in range(1, STAGES + 1):
-                self.scene.command(self.data, *blend(a, b, row, stage / STAGES))
-                self._run(STAGE_S)
-                if give_up:
-                    moved, turned = self._motion()
-                    if moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
-                        return False
-        return True
 
     def _rise(self, grasps: GraspSet, row: int) -> None:
         squeeze = grasps.squeeze.take(slice(row, row + 1))

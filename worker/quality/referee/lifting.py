@@ -25,13 +25,14 @@ from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
 from worker.quality.referee.model import MujocoOptions, build
 from worker.run import ALONE, Run
+from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed
 
 LiftLevel = Literal["letter", "lift"]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
 #: Raise when the code of the lift test changes what it says, constants aside.
 REVISION: Final = 1
-_MOVES: Final = {protocol: ("RISE_M", "LOOKS", "OVERHANG_M"), postures: ("ROOM_M", "WIDE")}
+_MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M"), postures: ("ROOM_M", "WIDE")}
 
 
 @dataclass(frozen=True)

@@ -139,8 +139,12 @@ class Test:
             return trial.fail(Outcome.PENETRATION)
         return trial
 
+    def _put(self, hand_pose: Floats, joints: Floats) -> None:
+        """The object at its start, the hand (7,), (J,) at rest."""
+        self.scene.place(self.data, hand_pose, joints)
+
     def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
-        self.scene.place(self.data, posture.hand_pose[row], posture.joint_positions[row])
+        self._put(posture.hand_pose[row], posture.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
         return self.penetration()
 
@@ -156,7 +160,7 @@ class Test:
 
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False) -> bool:
         """From pregrasp over grasp to squeeze; False as soon as the object is lost, if told to give up."""
-        self.scene.place(self.data, grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
             for stage in range(1, STAGES + 1):
                 self.scene.command(self.data, *blend(a, b, row, stage / STAGES))

@@ -24,6 +24,16 @@ class Features:
 
 
 @wp.struct
+class Feature:
+    """One of them as it is placed."""
+
+    body: wp.int32
+    centre: wp.vec3
+    axis: wp.vec3
+    radius: wp.float32
+
+
+@wp.struct
 class Obstacles:
     """Convex obstacles of all scenes, one after the other; a scene -1 has none."""
 
@@ -35,36 +45,50 @@ class Obstacles:
 
 
 @wp.func
-def reach_of(axis: wp.vec3, radius: wp.float32, n: wp.vec3):
-    """How far a feature reaches from its centre towards -n."""
-    along = wp.dot(axis, n)
-    if wp.dot(axis, axis) > 0.5:
-        return radius * wp.sqrt(wp.max(0.0, 1.0 - along * along))
-    return radius
+def posed(
+    features: Features, i: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
+):  # fmt: skip
+    """Feature i of hand b."""
+    out = Feature()
+    out.body = features.body[i]
+    rotation = body_q[b, out.body]
+    out.centre = body_p[b, out.body] + wp.quat_rotate(rotation, features.centre[i])
+    out.axis = wp.quat_rotate(rotation, features.axis[i])
+    out.radius = features.radius[i]
+    return out
 
 
 @wp.func
-def lowest_point(centre: wp.vec3, axis: wp.vec3, radius: wp.float32, n: wp.vec3):
+def reach_of(f: Feature, n: wp.vec3):
+    """How far a feature reaches from its centre towards -n."""
+    along = wp.dot(f.axis, n)
+    if wp.dot(f.axis, f.axis) > 0.5:
+        return f.radius * wp.sqrt(wp.max(0.0, 1.0 - along * along))
+    return f.radius
+
+
+@wp.func
+def lowest_point(f: Feature, n: wp.vec3):
     """The feature's point that is farthest along -n."""
     way = n
-    if wp.dot(axis, axis) > 0.5:
-        way = n - wp.dot(axis, n) * axis
+    if wp.dot(f.axis, f.axis) > 0.5:
+        way = n - wp.dot(f.axis, n) * f.axis
         length = wp.length(way)
         if length < 1.0e-9:
-            return centre
+            return f.centre
         way = way / length
-    return centre - radius * way
+    return f.centre - f.radius * way
 
 
 @wp.func
-def obstacle_distance(obstacles: Obstacles, k: wp.int32, centre: wp.vec3, axis: wp.vec3, radius: wp.float32):
+def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
     """(normal, distance) of a feature from obstacle k: the largest of its planes' distances."""
     d = float(-1.0e9)
     n = wp.vec3(0.0, 0.0, 1.0)
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
         plane = obstacles.planes[i]
         normal = wp.vec3(plane[0], plane[1], plane[2])
-        value = wp.dot(normal, centre) - plane[3] - reach_of(axis, radius, normal)
+        value = wp.dot(normal, f.centre) - plane[3] - reach_of(f, normal)
         if value > d:
             d = value
             n = normal
@@ -72,12 +96,12 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, centre: wp.vec3, axis: 
 
 
 @wp.func
-def outside_sphere(obstacles: Obstacles, k: wp.int32, centre: wp.vec3, reach: wp.float32):
-    """Whether the bounding sphere of obstacle k is farther than `reach` from a point."""
+def outside_sphere(obstacles: Obstacles, k: wp.int32, f: Feature, reach: wp.float32):
+    """Whether the bounding sphere of obstacle k is farther than `reach` from a feature."""
     if obstacles.radius[k] > 1.0e8:
         return False
-    offset = centre - obstacles.centre[k]
-    r = obstacles.radius[k] + reach
+    offset = f.centre - obstacles.centre[k]
+    r = obstacles.radius[k] + f.radius + wp.max(reach, 0.0)
     return wp.dot(offset, offset) > r * r
 
 
@@ -117,24 +141,20 @@ def penalty(
     b, i = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
-    body = features_in.body[i]
-    rotation = body_q_in[b, body]
-    centre = body_p_in[b, body] + wp.quat_rotate(rotation, features_in.centre[i])
-    axis = wp.quat_rotate(rotation, features_in.axis[i])
-    radius = features_in.radius[i]
+    f = posed(features_in, i, b, body_p_in, body_q_in)
     margin = features_in.margin[i]
     weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
     for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
-        if outside_sphere(obstacles_in, k, centre, radius + wp.max(margin + room_in, 0.0)):
+        if outside_sphere(obstacles_in, k, f, margin + room_in):
             continue
-        nd = obstacle_distance(obstacles_in, k, centre, axis, radius)
+        nd = obstacle_distance(obstacles_in, k, f)
         short = nd[3] - margin - room_in
         if short < 0.0:
             n = wp.vec3(nd[0], nd[1], nd[2])
             if weight != 0.0:
-                f = (weight * short) * n
-                wp.atomic_add(force_inout, b, body, f)
-                wp.atomic_add(torque_inout, b, body, wp.cross(lowest_point(centre, axis, radius, n), f))
+                force = (weight * short) * n
+                wp.atomic_add(force_inout, b, f.body, force)
+                wp.atomic_add(torque_inout, b, f.body, wp.cross(lowest_point(f, n), force))
             wp.atomic_max(depth_inout, b, -short)
 
 
@@ -158,16 +178,12 @@ def residuals(
     b, i = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
-    body = features_in.body[i]
-    rotation = body_q_in[b, body]
-    centre = body_p_in[b, body] + wp.quat_rotate(rotation, features_in.centre[i])
-    axis = wp.quat_rotate(rotation, features_in.axis[i])
-    radius = features_in.radius[i]
+    f = posed(features_in, i, b, body_p_in, body_q_in)
     margin = features_in.margin[i]
     for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
-        if outside_sphere(obstacles_in, k, centre, radius + wp.max(margin + near_in, 0.0)):
+        if outside_sphere(obstacles_in, k, f, margin + near_in):
             continue
-        nd = obstacle_distance(obstacles_in, k, centre, axis, radius)
+        nd = obstacle_distance(obstacles_in, k, f)
         if nd[3] < margin + near_in:
             n = wp.vec3(nd[0], nd[1], nd[2])
-            emit(residuals_out, b, body, -1, lowest_point(centre, axis, radius, n), n, nd[3] - margin - target_in, 1.0)
+            emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, nd[3] - margin - target_in, 1.0)
