@@ -89,7 +89,8 @@ def depth_error_mm(setting: Setting, pictures: Pictures, vertices: Any, faces: A
     shot = setting.shot
     points = Cameras(shot.width, shot.height, shot.intrinsics, shot.extrinsics).unproject(pictures.depth)
     local = [
-        apply(invert(setting.poses[world, 1]), points[v][pictures.shape[v] == 1]) for v, world in enumerate(shot.world)
+        apply(invert(setting.object_pose[world]), points[v][pictures.shape[v] == 1])
+        for v, world in enumerate(shot.world)
     ]
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     rows = np.concatenate(local)

@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 from cachetools import LRUCache
 
+from service.model.scene_spec import Box as BoxSupport
+from service.model.scene_spec import HalfSpace
 from service.model.transforms import apply
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.camera_file import SAMPLED, GivenCameras
@@ -16,14 +18,16 @@ from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere
 from worker.rendering.hands import DrawnHand, drawn_bodies, hand_solids, look_of
 from worker.rendering.palette import lamp, object_look, table_look
 from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
+from worker.rendering.standing import TABLE, Supports, seen_share, slab_poses, slabs
 from worker.rendering.tracer import Tracer
-
-#: The table: a slab whose top is z = 0 [m].
 from worker.run import Run
 
-TABLE_SIZE: Final = (1.2, 0.9, 0.04)
+#: Draws of cameras, of which the first is taken that sees this share of the object past the supports; else the best.
+_DRAWS: Final = 32
+_SEEN: Final = 0.8
 #: Depth at which things wait that a pass does not show [m].
 _AWAY_M: Final = -50.0
+_NOWHERE: Final = np.zeros((0, 3))
 _stages: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)
 
 
@@ -50,29 +54,50 @@ class CameraPlan:
     def eyes(self) -> int:
         return 1 if self.baseline_m is None else 2
 
-    def extrinsics(self, centre: Floats, radius: float, rng: np.random.Generator) -> Floats:
-        """(placements * eyes, 4, 4) around a ball; left before right."""
+    def extrinsics(
+        self,
+        centre: Floats,
+        radius: float,
+        rng: np.random.Generator,
+        supports: Supports = (),
+        points: Floats = _NOWHERE,
+    ) -> Floats:
+        """(placements * eyes, 4, 4) around a ball, from where supports hide little of points; left before right."""
         middles: Sequence[Floats]
         if self.given.extrinsics is not None:
             middles = list(self.given.extrinsics)
         else:
             cone = narrow_field(self.intrinsics, self.width, self.height)
-            middles = sample_hemisphere(centre, radius, views=self.views, field_of_view=cone, rng=rng)
+            middles = _unhidden(
+                lambda: sample_hemisphere(centre, radius, views=self.views, field_of_view=cone, rng=rng),
+                supports,
+                points,
+            )
         if self.baseline_m is None:
             return np.stack(middles)
         return np.stack([eye for middle in middles for eye in stereo_pair(middle, self.baseline_m)])
 
 
 class Setting:
-    """Scenes of one object, its neighbours and a table, ready to be shot."""
+    """Scenes of one object, its neighbours and what they stand on, ready to be shot."""
 
     def __init__(
-        self, objects: Sequence[ObjectModel], poses: Floats, plan: CameraPlan, *, seed: int, samples: int
+        self,
+        objects: Sequence[ObjectModel],
+        poses: Floats,
+        plan: CameraPlan,
+        *,
+        seed: int,
+        samples: int,
+        supports: Supports = TABLE,
     ) -> None:
-        """`poses` (S, 1 + M, 7) of the object and its M neighbours in the table frame."""
-        self.objects, self.plan = objects, plan
-        scenes = [_Scene(objects, pose, plan, np.random.default_rng([seed, s])) for s, pose in enumerate(poses)]
-        self.poses = np.stack([scene.poses for scene in scenes])
+        """`poses` (S, 1 + M, 7) of the object and its M neighbours in the scene frame; `supports` of all scenes."""
+        self.objects, self.plan, self._slabs = objects, plan, slabs(supports)
+        scenes = [
+            _Scene(objects, pose, plan, supports, np.random.default_rng([seed, s])) for s, pose in enumerate(poses)
+        ]
+        self.object_pose = np.asarray(poses, float)[:, 0]
+        self._poses = np.stack([scene.poses for scene in scenes])
         self.looks = [scene.looks for scene in scenes]
         self.shot = Shot(
             world=np.repeat(np.arange(len(poses), dtype=np.int32), plan.placements * plan.eyes),
@@ -83,65 +108,94 @@ class Setting:
         )  # fmt: skip
 
     def shoot(self, run: Run, *, normals: bool = False) -> Pictures:
-        """The pictures; `Pictures.shape` is 0 for the table, 1 for the object, 2 + m for neighbour m."""
-        return self.stage(run.device).shoot(replace(self.shot, normals=normals), run)
+        """The pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
+        return self._named(self.stage(run.device).shoot(replace(self.shot, normals=normals), run))
 
     def shoot_alone(self, run: Run) -> Pictures:
         """One ray per pixel of the object with nothing around it; `Pictures.shape` is 1 where it is seen."""
-        poses = self.poses.copy()
-        poses[:, [k for k in range(poses.shape[1]) if k != 1], 2] = _AWAY_M
-        return self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run)
+        poses = self._poses.copy()
+        poses[:, [k for k in range(poses.shape[1]) if k != len(self._slabs)], 2] = _AWAY_M
+        return self._named(self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run))
 
     def shoot_with(self, drawn: DrawnHand, run: Run) -> Pictures:
         """The same pictures with a hand in them."""
-        key = (*_key(self.objects), drawn.hand.content, len(self.poses), run.device)
-        stage = _kept(key, lambda: [*_solids(self.objects), *hand_solids(drawn.hand)], len(self.poses), run.device)
+        key = (*self._key(), drawn.hand.content, len(self._poses), run.device)
+        stage = _kept(key, lambda: [*self._solids(), *hand_solids(drawn.hand)], len(self._poses), run.device)
         shown = [look_of(drawn.hand, body) for body in drawn_bodies(drawn.hand)]
         stage.place(
-            np.concatenate([self.poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
+            np.concatenate([self._poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
         )
-        return stage.shoot(self.shot, run)
+        return self._named(stage.shoot(self.shot, run))
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
         """The stage of these objects, kept for the next call with the same ones, with everything in its place."""
-        key = (*_key(self.objects), len(self.poses), device)
-        stage = _kept(key, lambda: _solids(self.objects), len(self.poses), device)
-        stage.place(self.poses if poses is None else poses, self.looks)
+        stage = _kept((*self._key(), len(self._poses), device), self._solids, len(self._poses), device)
+        stage.place(self._poses if poses is None else poses, self.looks)
         return stage
+
+    def _named(self, pictures: Pictures) -> Pictures:
+        """All supports are one thing to those who read labels."""
+        extra = len(self._slabs) - 1
+        return replace(pictures, shape=np.where(pictures.shape < 0, -1, np.maximum(pictures.shape - extra, 0)))
+
+    def _key(self) -> tuple[object, ...]:
+        return (tuple(self._slabs), *(obj.content for obj in self.objects))
+
+    def _solids(self) -> list[Solid | Box]:
+        return [*self._slabs, *(Solid(obj.vertices, obj.faces, obj.corner_normals) for obj in self.objects)]
 
 
 class _Scene:
     """What the seed decides about one scene."""
 
     def __init__(
-        self, objects: Sequence[ObjectModel], poses: Floats, plan: CameraPlan, rng: np.random.Generator
+        self,
+        objects: Sequence[ObjectModel],
+        poses: Floats,
+        plan: CameraPlan,
+        supports: Supports,
+        rng: np.random.Generator,
     ) -> None:
         points = apply(poses[0], objects[0].hull_vertices)
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = float(np.linalg.norm(points - centre, axis=1).max())
-        self.extrinsics = plan.extrinsics(centre, radius, rng)
-        self.looks: list[Look] = [table_look(rng), object_look(rng)]
+        self.extrinsics = plan.extrinsics(centre, radius, rng, supports, points)
+        table, thing = table_look(rng), object_look(rng)
         self.lamp = lamp(rng)
         self.turn = float(rng.uniform(0, 2 * np.pi))
         yaw = rng.uniform(0, 2 * np.pi)
-        table = np.array([0, 0, -0.5 * TABLE_SIZE[2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-        self.poses = np.concatenate([table[None], poses])
-        # Drawn last: neighbours do not change how the rest of the scene looks.
-        self.looks += [object_look(rng) for _ in objects[1:]]
+        self.poses = np.concatenate([slab_poses(supports, centre, yaw), poses])
+        # Drawn last: neighbours and walls do not change how the rest of the scene looks.
+        others = [object_look(rng) for _ in objects[1:]]
+        walls = table_look(rng) if len(supports) > 1 else table
+        self.looks: list[Look] = [
+            *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)), thing, *others
+        ]  # fmt: skip
+
+
+def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
+    """Cameras of which each sees the points past boxes; each is drawn again until it does."""
+    drawn = list(draw())
+    if not any(isinstance(s, BoxSupport) for s in supports):
+        return drawn
+
+    def seen(camera: Floats) -> float:
+        return seen_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
+
+    share = [seen(camera) for camera in drawn]
+    for _ in range(_DRAWS):
+        if min(share) >= _SEEN:
+            break
+        for k, camera in enumerate(draw()):
+            if share[k] < _SEEN and (found := seen(camera)) > share[k]:
+                drawn[k], share[k] = camera, found
+    return drawn
 
 
 def _toward_lamp(rng: np.random.Generator) -> Floats:
     # One height for all scenes of a call; each scene turns under the lamp, so azimuths differ.
     elevation = np.radians(rng.uniform(40.0, 65.0))
     return np.array([np.cos(elevation), 0.0, np.sin(elevation)])
-
-
-def _key(objects: Sequence[ObjectModel]) -> tuple[object, ...]:
-    return tuple(obj.content for obj in objects)
-
-
-def _solids(objects: Sequence[ObjectModel]) -> list[Solid | Box]:
-    return [Box(TABLE_SIZE), *(Solid(obj.vertices, obj.faces, obj.corner_normals) for obj in objects)]
 
 
 def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], worlds: int, device: str) -> Tracer:

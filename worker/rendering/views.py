@@ -17,8 +17,9 @@ from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import BASELINE_M, Cameras
 from worker.rendering.channels import occlusion_ratio, ray_distance
 from worker.rendering.hands import DrawnHand
-from worker.rendering.scene_setup import TABLE_SIZE, CameraPlan, Setting
+from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.rendering.scenery import Pictures
+from worker.rendering.standing import TABLE, TABLE_SIZE, Supports
 from worker.run import ALONE, Run
 from worker.scenes.neighbours import Neighbours
 
@@ -41,6 +42,8 @@ class Extras:
     neighbours: Neighbours | None = None
     drawn: DrawnHand | None = None
     """The hand of `image/rgb_hand`; it is in no other picture."""
+    supports: Supports = TABLE
+    """What the object stands on and between; all are labelled as the table."""
 
 
 NO_EXTRAS: Final = Extras()
@@ -92,7 +95,9 @@ def render(
         )
     beside = extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))
     placed = np.concatenate([poses[:, None], beside.poses], axis=1)
-    setting = Setting([obj, *beside.objects], placed, plan, seed=seed, samples=samples)
+    setting = Setting(
+        [obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports
+    )  # fmt: skip
     pictures = setting.shoot(run, normals="normals" in extras.channels)
     result = annotate(setting, pictures, obj, extras.channels)
     if "occlusion" in extras.channels:
@@ -109,7 +114,7 @@ def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: S
     """The datasets of a views shard that follow from the cameras and what they saw."""
     shot, plan = setting.shot, setting.plan
     cameras = Cameras(plan.width, plan.height, shot.intrinsics, shot.extrinsics)
-    count, poses = len(shot.world), setting.poses[shot.world, 1][:, None]
+    count, poses = len(shot.world), setting.object_pose[shot.world][:, None]
     segmentation = (pictures.shape + 1).astype(np.uint8)
     result: Arrays = {
         "camera/intrinsics": np.repeat(shot.intrinsics[None], count, axis=0),

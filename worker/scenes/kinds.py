@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.scene_kinds import BIN_SIZE, SHELF_SIZE, supports_in
 from service.model.scene_spec import Box, SceneSpec
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
 from worker.objects.model import ObjectModel
@@ -17,13 +18,6 @@ from worker.simulation.surroundings import Obstacle
 
 Floats = NDArray[np.float64]
 
-#: Inner size of a bin, height of its walls and their thickness [m].
-BIN_SIZE: Final = (0.40, 0.30)
-BIN_HEIGHT: Final = 0.15
-WALL: Final = 0.02
-#: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
-SHELF_SIZE: Final = (0.80, 0.35)
-SHELF_HEIGHT: Final = 0.35
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01
 #: A face that fewer drops end on is not looked at with `faces all`.
@@ -34,37 +28,9 @@ SUNK: Final = 5e-4
 
 def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
     """Supports in the scene frame; none for a free object."""
-    if spec.kind == "free":
-        return ()
-    if spec.kind == "file":
-        return tuple(
-            Obstacle.box(s.pose, s.size) if isinstance(s, Box) else Obstacle.half_space(s.normal, s.offset)
-            for s in spec.supports
-        )
-    if spec.kind == "table":
-        return (Obstacle.half_space([0, 0, 1], 0.0),)
-    return _bin() if spec.kind == "bin" else _shelf()
-
-
-def _at(x: float, y: float, z: float) -> Floats:
-    return np.array([x, y, z, 1.0, 0, 0, 0])
-
-
-def _bin() -> tuple[Obstacle, ...]:
-    (x, y), z = BIN_SIZE, BIN_HEIGHT / 2
-    along, across = (WALL, y + 2 * WALL, BIN_HEIGHT), (x, WALL, BIN_HEIGHT)
-    walls = [(_at(s * (x + WALL) / 2, 0, z), along) for s in (-1, 1)]
-    walls += [(_at(0, s * (y + WALL) / 2, z), across) for s in (-1, 1)]
-    return (Obstacle.half_space([0, 0, 1], 0.0), *(Obstacle.box(pose, size) for pose, size in walls))
-
-
-def _shelf() -> tuple[Obstacle, ...]:
-    width, depth = SHELF_SIZE
-    board = (depth, width, WALL)
-    return (
-        Obstacle.box(_at(0, 0, -WALL / 2), board),
-        Obstacle.box(_at((depth + WALL) / 2, 0, SHELF_HEIGHT / 2), (WALL, width, SHELF_HEIGHT + 2 * WALL)),
-        Obstacle.box(_at(0, 0, SHELF_HEIGHT + WALL / 2), board),
+    return tuple(
+        Obstacle.box(s.pose, s.size) if isinstance(s, Box) else Obstacle.half_space(s.normal, s.offset)
+        for s in supports_in(spec)
     )
 
 
