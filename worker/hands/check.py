@@ -11,9 +11,10 @@ from service.model.errors import InputError
 from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
 from worker.hands.options import HandOptions, parse_options
+from worker.hands.read import read_robot
+from worker.hands.robot import Robot
 from worker.hands.surface import sample_surface
 from worker.hands.tree import joints_above
-from worker.hands.urdf import Urdf, read_urdf
 
 #: Points with which the outer surface is measured.
 _SURFACE_POINTS = 512
@@ -29,16 +30,16 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     try:
         settings = parse_options(files, options)
         main = main_file(files, settings)
-        urdf = read_urdf(files[main], main)
-        hand = assemble(urdf, settings, files, main, name=name, digest="0" * 32)
+        robot = read_robot(files, main)
+        hand = assemble(robot, settings, files, main, name=name, digest="0" * 32)
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
     except InputError as error:
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
     stated = {
         "palm": settings.palm is not None, "preshape": bool(settings.preshape), "closing": bool(settings.closing),
-        "effort": not assumed_efforts(urdf, hand.dof_names, settings),
+        "effort": not assumed_efforts(robot, hand.dof_names, settings),
     }  # fmt: skip
-    facts = hand_facts(hand, urdf) | {
+    facts = hand_facts(hand, robot) | {
         "surface_area_m2": area,
         "guessed": [key for key, said in stated.items() if not said],
     }
@@ -46,23 +47,23 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
         f"{len(hand.pieces)} convex pieces; palm {hand.root_link!r} facing {_direction(hand)}"
     )
-    notes = [*urdf.notes, *_left_out(urdf, hand, settings)]
+    notes = [*robot.notes, *_left_out(robot, hand, settings)]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
 
 
-def _left_out(urdf: Urdf, hand: HandModel, settings: HandOptions) -> list[str]:
+def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
     """What a user must know of a hand that was cut off its arm without having said so."""
-    above = joints_above(urdf, hand.root_link)
+    above = joints_above(robot, hand.root_link)
     if settings.root or not above:
         return []
-    return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {urdf.root})"]
+    return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {robot.root})"]
 
 
-def hand_facts(hand: HandModel, urdf: Urdf) -> dict[str, Any]:
+def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
     """What a user should look at before trusting a hand; numbers in SI units."""
     return {
-        "links": len(urdf.links),
+        "links": len(robot.links),
         "bodies": hand.bodies,
         "joints": list(hand.joint_names),
         "dofs": list(hand.dof_names),
@@ -77,7 +78,7 @@ def hand_facts(hand: HandModel, urdf: Urdf) -> dict[str, Any]:
         "effort": dict(zip(hand.dof_names, _rounded(hand.effort), strict=True)),
         "mass": float(hand.masses.sum()),
         "pieces": len(hand.pieces),
-        "notes": list(urdf.notes),
+        "notes": list(robot.notes),
     }
 
 

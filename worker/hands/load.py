@@ -21,9 +21,11 @@ from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
 from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
 from worker.hands.primitives import volume
-from worker.hands.shapes import Hulls, find_mesh, make_piece
+from worker.hands.read import read_robot
+from worker.hands.robot import Robot, chain_to
+from worker.hands.shapes import Hulls, make_piece
 from worker.hands.tree import Tree, build_tree, joint_type
-from worker.hands.urdf import Urdf, read_urdf
+from worker.hands.visuals import PlacedShape, Visuals
 
 #: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
 DENSITY = 1000.0
@@ -45,16 +47,17 @@ def load_hand(
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
-    urdf = read_urdf(files[main], main)
-    return assemble(urdf, settings, files, main, name=name, digest=digest)
+    robot = read_robot(files, main)
+    return assemble(robot, settings, files, main, name=name, digest=digest)
 
 
 def assemble(
-    urdf: Urdf, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
+    robot: Robot, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
 ) -> HandModel:
-    """The model of a checked URDF and options."""
-    tree = build_tree(urdf, options)
-    pieces = _pieces(urdf, tree, files, str(PurePosixPath(main).parent).removeprefix("."))
+    """The model of a checked robot and options."""
+    tree = build_tree(robot, options)
+    base = str(PurePosixPath(main).parent).removeprefix(".")
+    pieces = _pieces(robot, tree, files, base)
     if not pieces:
         raise HandError("no link of the hand has collision geometry, so nothing can touch; drop less")
     moving = [tree.drives[joint.name] if joint else None for joint in tree.joint]
@@ -74,7 +77,7 @@ def assemble(
         dof_names=tree.dof_names,
         lower=tree.lower,
         upper=tree.upper,
-        effort=_effort(urdf, tree, options),
+        effort=_effort(robot, tree, options),
         stiffness=_stiffness(tree, options),
         preshape=np.clip(np.zeros(dofs), tree.lower, tree.upper),
         closing=np.zeros(dofs),
@@ -84,7 +87,10 @@ def assemble(
         fingertips=(),
         pieces=pieces,
         neighbours=frozenset(),
-        masses=_masses(urdf, tree, pieces),
+        masses=_masses(robot, tree, pieces),
+        velocity=tree.velocity,
+        arm=chain_to(robot, tree.body_names[0]),
+        visuals=Visuals(_placed_visuals(robot, tree), files, base),
     )
     hand = complete(hand, tree, options)
     return replace(hand, neighbours=resting_neighbours(hand))
@@ -103,33 +109,41 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
     return found[0]
 
 
-def _pieces(urdf: Urdf, tree: Tree, files: Mapping[str, bytes], base: str) -> tuple[ConvexPiece, ...]:
+def _pieces(robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str) -> tuple[ConvexPiece, ...]:
     pieces, hulls = [], Hulls()
     for link, (body, pose) in tree.links.items():
-        for shape in urdf.links[link].shapes:
+        for shape in robot.links[link].shapes:
             placed = compose(pose, shape.pose)
             pieces.append(make_piece(shape, body=body, pose=placed, link=link, files=files, base=base, hulls=hulls))
     return tuple(pieces)
+
+
+def _placed_visuals(robot: Robot, tree: Tree) -> tuple[PlacedShape, ...]:
+    return tuple(
+        PlacedShape(shape, body, compose(pose, shape.pose), link)
+        for link, (body, pose) in tree.links.items()
+        for shape in robot.links[link].visuals
+    )
 
 
 def _body_of(tree: Tree, joint: str) -> int:
     return next(body for body, carried in enumerate(tree.joint) if carried and carried.name == joint)
 
 
-def assumed_efforts(urdf: Urdf, dofs: Sequence[str], options: HandOptions) -> list[str]:
-    """Degrees of freedom whose limit of torque or force nobody states: neither the URDF nor the options."""
+def assumed_efforts(robot: Robot, dofs: Sequence[str], options: HandOptions) -> list[str]:
+    """Degrees of freedom whose limit of torque or force nobody states: neither the robot nor the options."""
     if isinstance(options.effort, float):
         return []
-    return [dof for dof in dofs if dof not in (options.effort or {}) and urdf.joints[dof].effort <= 0]
+    return [dof for dof in dofs if dof not in (options.effort or {}) and robot.joints[dof].effort <= 0]
 
 
-def _effort(urdf: Urdf, tree: Tree, options: HandOptions) -> Floats:
-    """(D,) stated, else the URDF's, else assumed."""
-    assumed = assumed_efforts(urdf, tree.dof_names, options)
+def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
+    """(D,) stated, else the robot's own, else assumed."""
+    assumed = assumed_efforts(robot, tree.dof_names, options)
     values = []
     for dof in tree.dof_names:
         stated = options.effort if isinstance(options.effort, float) else (options.effort or {}).get(dof)
-        effort = stated if stated is not None else DEFAULT_EFFORT if dof in assumed else urdf.joints[dof].effort
+        effort = stated if stated is not None else DEFAULT_EFFORT if dof in assumed else robot.joints[dof].effort
         if effort <= 0:
             raise HandError(f"the effort of {dof!r} is {effort:g}; it must be positive")
         values.append(effort)
@@ -144,10 +158,10 @@ def _stiffness(tree: Tree, options: HandOptions) -> Floats:
     return np.array(values)
 
 
-def _masses(urdf: Urdf, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats:
+def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats:
     masses = np.zeros(len(tree.body_names))
     for link, (body, _) in tree.links.items():
-        mass = urdf.links[link].mass
+        mass = robot.links[link].mass
         if mass is None:
             mine = [p for p in pieces if p.link == link]
             mass = DENSITY * sum(volume(p.kind, p.size, p.vertices, p.faces) for p in mine)
@@ -186,4 +200,4 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
     return path.resolve().stem, files, {} if path.is_dir() else {"file": path.name}
 
 
-__all__ = ["files_from_path", "find_mesh", "hand_from_path", "load_hand"]
+__all__ = ["files_from_path", "hand_from_path", "load_hand"]

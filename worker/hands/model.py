@@ -6,7 +6,7 @@ Frames: body frame = frame of the link that the moving joint carries; root frame
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
 
@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from worker.hands.features import HandFeatures
+from worker.hands.robot import Ints, Joint
+from worker.hands.visuals import NO_VISUALS, Visuals
 from worker.objects.content import content_of
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 
 class JointType(IntEnum):
@@ -120,6 +121,12 @@ class HandModel:
     """Pairs of bodies (a < b) whose contact does not count: adjacent ones and those that touch in every posture."""
     masses: Floats
     """(L,) [kg] of each body, from the URDF or, where it gives none, from volume at 1000 kg/m^3."""
+    velocity: Floats = field(default_factory=lambda: np.zeros(0))
+    """(D,) limit of speed [rad/s or m/s], with those of mimicking joints folded in; 0 where none is stated."""
+    arm: tuple[Joint, ...] = ()
+    """Joints, fixed ones too, from the root of the robot that the hand came on to `root_link`, for export."""
+    visuals: Visuals = NO_VISUALS
+    """What the hand looks like."""
 
     @cached_property
     def content(self) -> str:

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from service.model.errors import HandError
-from worker.hands.model import Floats, Ints
+from service.model.transforms import Floats
+from worker.hands.robot import Ints
 
 #: Corners of a circle in tessellations: the chord stays within 0.5 % of the radius.
 SEGMENTS = 32

@@ -1,19 +1,18 @@
-"""Collision elements of a URDF as convex pieces: primitives stay exact, meshes become reduced convex hulls."""
+"""Collision elements of a robot as convex pieces: primitives stay exact, meshes become reduced convex hulls."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePosixPath
 from typing import Final
 
 import numpy as np
 
-from service.model.errors import HandError, InputError, MeshError
-from service.model.transforms import IDENTITY_POSE, apply
-from service.store.assets import check_path
-from worker.hands.model import ConvexPiece, Floats, Ints
+from service.model.errors import HandError, MeshError
+from service.model.transforms import IDENTITY_POSE, Floats, apply
+from worker.hands.model import ConvexPiece
 from worker.hands.primitives import hull, signed_distance, tessellate, volume
-from worker.hands.urdf import Shape
+from worker.hands.references import find_mesh
+from worker.hands.robot import Ints, Shape
 from worker.objects.formats import read_mesh
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
@@ -34,9 +33,9 @@ def make_piece(
         shape: the element.
         body: index of the body it moves with.
         pose: (7,) pose of the element's frame in the body frame.
-        link: URDF link it comes from.
+        link: link it comes from.
         files: all files of the hand.
-        base: folder of the URDF inside `files`.
+        base: folder of the robot's description inside `files`.
         hulls: hulls of this hand's meshes so far, by name and scale: a fingertip is often used for every finger.
 
     Raises:
@@ -45,6 +44,9 @@ def make_piece(
     if shape.kind != "mesh":
         vertices, faces = tessellate(shape.kind, shape.size)
         return ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)
+    if shape.mesh is not None:
+        vertices, faces = reduce_hull(shape.mesh[0])
+        return ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
     name = find_mesh(shape.filename, files, base, link)
     key = (name, shape.size)
     if key not in hulls:
@@ -64,42 +66,6 @@ def _mesh_hull(name: str, scale: tuple[float, ...], data: bytes, link: str) -> t
             'if it is in millimetres give it scale="0.001 0.001 0.001"'
         )
     return reduce_hull(points)
-
-
-def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Name in `files` of a mesh as the URDF writes it; `package://NAME/rest` is sought as rest and as NAME/rest."""
-    scheme, separator, rest = filename.partition("://")
-    path = rest if separator else filename
-    if separator and scheme not in ("package", "model", "file"):
-        raise HandError(f"mesh {filename!r} of link {link!r} is no file of this hand; put it beside the URDF")
-    try:
-        path = check_path(path.lstrip("/") if scheme == "file" else path) if ".." not in path else _inside(path, base)
-    except InputError:
-        raise HandError(f"mesh {filename!r} of link {link!r} lies outside the hand's folder; put it inside") from None
-    tries = [path]
-    if separator:
-        # The folder of a ROS package may be packed with or without its name.
-        tries += [str(PurePosixPath(*PurePosixPath(path).parts[1:]))]
-    for name in tries:
-        for folder in (base, ""):
-            full = str(PurePosixPath(folder) / name) if folder else name
-            if full in files:
-                return full
-    hint = "unknown package: " if scheme == "package" else ""
-    raise HandError(f"mesh {filename!r} of link {link!r} is not there ({hint}looked for {tries[-1]!r}); add the file")
-
-
-def _inside(path: str, base: str) -> str:
-    """`../meshes/x` resolved against the URDF's folder, if that stays inside the upload."""
-    parts = list(PurePosixPath(base).parts)
-    for part in PurePosixPath(path).parts:
-        if part == "..":
-            if not parts:
-                raise InputError("outside")
-            parts.pop()
-        else:
-            parts.append(part)
-    return check_path("/".join(parts))
 
 
 def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:

@@ -1,4 +1,4 @@
-"""From URDF joints to a tree of bodies: fixed joints merged, mimic chains resolved, dropped links left out."""
+"""From a robot's joints to a tree of bodies: fixed joints merged, mimic chains resolved, dropped links left out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
-from worker.hands.urdf import Joint, Mimic, Urdf
+from worker.hands.robot import Joint, Mimic, Robot, chain_to
 
 
 @dataclass(frozen=True)
@@ -38,28 +38,29 @@ class Tree:
     drives: dict[str, Drive]
     """Each moving joint."""
     joint_names: tuple[str, ...]
-    """Moving joints in URDF order."""
+    """Moving joints in the robot's order."""
     dof_names: tuple[str, ...]
-    """Independent joints in URDF order."""
+    """Independent joints in the robot's order."""
     lower: Floats
     upper: Floats
+    velocity: Floats
     known: frozenset[str]
-    """Names of all joints and links of the URDF, dropped and frozen ones too."""
+    """Names of all joints and links of the robot, dropped and frozen ones too."""
 
 
-def build_tree(urdf: Urdf, options: HandOptions) -> Tree:
+def build_tree(robot: Robot, options: HandOptions) -> Tree:
     """The body tree of a hand.
 
     Raises:
         HandError: an option names a joint or link that is not there, nothing is left to move, or couplings leave a
             degree of freedom no room.
     """
-    _check_names(urdf, options)
-    mimics = {name: joint.mimic for name, joint in urdf.joints.items()}
+    _check_names(robot, options)
+    mimics = {name: joint.mimic for name, joint in robot.joints.items()}
     mimics |= {name: Mimic(c.of, c.multiplier, c.offset) for name, c in options.couplings.items()}
-    root = _pick_root(urdf, options)
-    kept = _kept_joints(urdf, root, set(options.drop))
-    drives = {j.name: _resolve(j.name, mimics, urdf, options) for j in kept if j.type != "fixed"}
+    root = _pick_root(robot, options)
+    kept = _kept_joints(robot, root, set(options.drop))
+    drives = {j.name: _resolve(j.name, mimics, robot, options) for j in kept if j.type != "fixed"}
     frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
     moving = {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
     for name, drive in moving.items():
@@ -67,44 +68,45 @@ def build_tree(urdf: Urdf, options: HandOptions) -> Tree:
             raise HandError(f"joint {name!r} follows {drive.dof!r}, which is dropped; fix it: --fix {name}=0")
     if not moving:
         raise HandError("no moving joint is left; fix or drop less")
-    names = tuple(name for name in urdf.joints if name in moving)
+    names = tuple(name for name in robot.joints if name in moving)
     dofs = tuple(name for name in names if moving[name].dof == name)
-    lower, upper = np.array([_fold_limits(dof, moving, urdf) for dof in dofs]).T
-    known = frozenset(urdf.joints) | frozenset(urdf.links)
-    bodies, parents, joints, origins, links = _walk(urdf, root, kept, frozen)
-    return Tree(bodies, parents, joints, origins, links, moving, names, dofs, lower, upper, known)
+    lower, upper = np.array([_fold_limits(dof, moving, robot) for dof in dofs]).T
+    velocity = np.array([_fold_velocity(dof, moving, robot) for dof in dofs])
+    known = frozenset(robot.joints) | frozenset(robot.links)
+    bodies, parents, joints, origins, links = _walk(robot, root, kept, frozen)
+    return Tree(bodies, parents, joints, origins, links, moving, names, dofs, lower, upper, velocity, known)
 
 
-def _check_names(urdf: Urdf, options: HandOptions) -> None:
+def _check_names(robot: Robot, options: HandOptions) -> None:
     joints = [*options.fix, *options.couplings, *(c.of for c in options.couplings.values())]
     links = [*options.drop, *([options.root] if options.root else [])]
-    for kind, names, known in (("joint", joints, set(urdf.joints)), ("link", links, set(urdf.links))):
+    for kind, names, known in (("joint", joints, set(robot.joints)), ("link", links, set(robot.links))):
         for name in names:
             if name not in known:
                 raise HandError(f"asset.json names the {kind} {name!r}, which the URDF does not have")
-            if kind == "joint" and urdf.joints[name].type == "fixed":
+            if kind == "joint" and robot.joints[name].type == "fixed":
                 raise HandError(f"asset.json names the joint {name!r}, which cannot move")
 
 
-def _pick_root(urdf: Urdf, options: HandOptions) -> str:
+def _pick_root(robot: Robot, options: HandOptions) -> str:
     """The chosen root; else the URDF's, moved down past dropped links, and past the joints of an arm or a wrist."""
     if options.root:
         return options.root
-    root, drop = urdf.root, set(options.drop)
+    root, drop = robot.root, set(options.drop)
     while root in drop:
-        children = [j.child for j in urdf.joints.values() if j.parent == root]
+        children = [j.child for j in robot.joints.values() if j.parent == root]
         if len(children) != 1:
             raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
         root = children[0]
-    return _below_arm(urdf, root, options)
+    return _below_arm(robot, root, options)
 
 
-def _below_arm(urdf: Urdf, root: str, options: HandOptions) -> str:
+def _below_arm(robot: Robot, root: str, options: HandOptions) -> str:
     """Where a hand on an arm begins: behind the last moving joint before the fingers part; else the root itself."""
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:
-        onward = [joint for joint in urdf.joints.values() if joint.parent == at and _moves(urdf, joint, options)]
+        onward = [joint for joint in robot.joints.values() if joint.parent == at and _moves(robot, joint, options)]
         if len(onward) != 1:
             # A tree that never parts is a single finger: nothing above it is an arm.
             return start if onward else root
@@ -115,31 +117,24 @@ def _below_arm(urdf: Urdf, root: str, options: HandOptions) -> str:
     return start
 
 
-def _moves(urdf: Urdf, joint: Joint, options: HandOptions) -> bool:
+def _moves(robot: Robot, joint: Joint, options: HandOptions) -> bool:
     """Whether the joint, or one behind it, moves."""
     if joint.child in options.drop:
         return False
     if joint.type != "fixed" and joint.name not in options.fix:
         return True
-    return any(_moves(urdf, after, options) for after in urdf.joints.values() if after.parent == joint.child)
+    return any(_moves(robot, after, options) for after in robot.joints.values() if after.parent == joint.child)
 
 
-def joints_above(urdf: Urdf, link: str) -> tuple[str, ...]:
-    """Moving joints between the URDF's root and a link, from the root on."""
-    carrier = {joint.child: joint for joint in urdf.joints.values()}
-    found: list[str] = []
-    while link in carrier:
-        joint = carrier[link]
-        if joint.type != "fixed":
-            found.insert(0, joint.name)
-        link = joint.parent
-    return tuple(found)
+def joints_above(robot: Robot, link: str) -> tuple[str, ...]:
+    """Moving joints between the robot's root and a link, from the root on."""
+    return tuple(joint.name for joint in chain_to(robot, link) if joint.type != "fixed")
 
 
-def _kept_joints(urdf: Urdf, root: str, drop: set[str]) -> list[Joint]:
-    """Joints below the root and not below a dropped link, in URDF order."""
+def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
+    """Joints below the root and not below a dropped link, in the robot's order."""
     children: dict[str, list[Joint]] = {}
-    for joint in urdf.joints.values():
+    for joint in robot.joints.values():
         children.setdefault(joint.parent, []).append(joint)
     kept: set[str] = set()
     stack = [root]
@@ -148,10 +143,10 @@ def _kept_joints(urdf: Urdf, root: str, drop: set[str]) -> list[Joint]:
             if joint.child not in drop:
                 kept.add(joint.name)
                 stack.append(joint.child)
-    return [joint for joint in urdf.joints.values() if joint.name in kept]
+    return [joint for joint in robot.joints.values() if joint.name in kept]
 
 
-def _resolve(name: str, mimics: dict[str, Mimic | None], urdf: Urdf, options: HandOptions) -> Drive | float:
+def _resolve(name: str, mimics: dict[str, Mimic | None], robot: Robot, options: HandOptions) -> Drive | float:
     """The drive of a joint through a chain of mimics, or its constant value if the chain ends at a fixed joint.
 
     q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
@@ -173,13 +168,13 @@ def _resolve(name: str, mimics: dict[str, Mimic | None], urdf: Urdf, options: Ha
     return Drive(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
 
 
-def _fold_limits(dof: str, moving: dict[str, Drive], urdf: Urdf) -> tuple[float, float]:
+def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot) -> tuple[float, float]:
     """Range of a dof in which every joint that follows it stays inside its own limits."""
     lower, upper = -math.inf, math.inf
     for name, drive in moving.items():
         if drive.dof != dof:
             continue
-        joint = urdf.joints[name]
+        joint = robot.joints[name]
         ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
         lower, upper = max(lower, ends[0]), min(upper, ends[1])
     if lower > upper:
@@ -189,8 +184,18 @@ def _fold_limits(dof: str, moving: dict[str, Drive], urdf: Urdf) -> tuple[float,
     return lower, upper
 
 
+def _fold_velocity(dof: str, moving: dict[str, Drive], robot: Robot) -> float:
+    """Speed of a dof at which no joint that follows it exceeds its own limit; 0 where none is stated."""
+    stated = [
+        robot.joints[name].velocity / abs(drive.multiplier)
+        for name, drive in moving.items()
+        if drive.dof == dof and robot.joints[name].velocity > 0
+    ]
+    return min(stated, default=0.0)
+
+
 def _walk(
-    urdf: Urdf, root: str, kept: list[Joint], frozen: dict[str, float]
+    robot: Robot, root: str, kept: list[Joint], frozen: dict[str, float]
 ) -> tuple[
     tuple[str, ...], tuple[int, ...], tuple[Joint | None, ...], tuple[Floats, ...], dict[str, tuple[int, Floats]]
 ]:

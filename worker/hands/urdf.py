@@ -1,15 +1,14 @@
 """Read a URDF written by a stranger: every value is checked here, so that nothing behind this module has to.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
-wrongly; this reader refuses each by name. It knows only what a hand needs: links with collision shapes and masses, and
-joints.
+wrongly; this reader refuses each by name. It knows only what a hand needs: links with shapes and masses, and joints.
 """
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,72 +17,15 @@ from defusedxml.common import DefusedXmlException
 
 from service.model.errors import HandError, LimitError
 from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
+from worker.hands.robot import MAX_LENGTH_M, MOVING, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
-MAX_LINKS: Final = 256
-MAX_SHAPES: Final = 1024
-#: No part of a robot hand lies farther than this from its parent [m]; larger numbers are a unit mistake.
-MAX_LENGTH_M: Final = 10.0
-MOVING: Final = ("revolute", "continuous", "prismatic")
+#: Visual elements beyond this many are not drawn.
+MAX_VISUALS: Final = 1024
+Colour = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Shape:
-    """One collision element. Size: box x y z; sphere r; cylinder and capsule r, length [m]; mesh: its scale."""
-
-    kind: str
-    size: tuple[float, ...]
-    pose: Floats
-    filename: str = ""
-
-
-@dataclass(frozen=True)
-class Link:
-    """A link; mass is None where the URDF gives none."""
-
-    name: str
-    shapes: tuple[Shape, ...]
-    mass: float | None
-
-
-@dataclass(frozen=True)
-class Mimic:
-    """value = multiplier * value of `joint` + offset."""
-
-    joint: str
-    multiplier: float
-    offset: float
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A joint; the axis has length 1, limits are finite and ordered for moving joints."""
-
-    name: str
-    type: str
-    parent: str
-    child: str
-    origin: Floats
-    axis: Floats
-    lower: float
-    upper: float
-    effort: float
-    mimic: Mimic | None
-
-
-@dataclass(frozen=True)
-class Urdf:
-    """A checked URDF: links and joints form one tree."""
-
-    name: str
-    links: dict[str, Link]
-    joints: dict[str, Joint]
-    root: str
-    notes: tuple[str, ...] = field(default=())
-    """Oddities that were taken but should be told to the user."""
-
-
-def read_urdf(data: bytes, filename: str = "the URDF") -> Urdf:
+def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
     """Checked contents of a URDF.
 
     Raises:
@@ -92,27 +34,10 @@ def read_urdf(data: bytes, filename: str = "the URDF") -> Urdf:
     """
     robot = _parse_xml(data, filename)
     notes: list[str] = []
-    links: dict[str, Link] = {}
-    for element in robot.findall("link"):
-        link = _read_link(element)
-        if link.name in links:
-            raise HandError(f"{filename}: duplicate link name {link.name!r}; rename one of them")
-        links[link.name] = link
-    joints: dict[str, Joint] = {}
-    for element in robot.findall("joint"):
-        joint = _read_joint(element, notes)
-        if joint.name in joints:
-            raise HandError(f"{filename}: duplicate joint name {joint.name!r}; rename one of them")
-        joints[joint.name] = joint
-    if len(links) > MAX_LINKS or sum(len(link.shapes) for link in links.values()) > MAX_SHAPES:
-        raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
-    root = _check_tree(links, joints, filename)
-    _check_mimics(joints, filename)
-    if not any(joint.type in MOVING for joint in joints.values()):
-        raise HandError(f"{filename}: no moving joint; a hand needs at least one revolute or prismatic joint")
-    if not any(link.shapes for link in links.values()):
-        raise HandError(f"{filename}: no link has collision geometry, so nothing can touch; add <collision> elements")
-    return Urdf(robot.get("name", ""), links, joints, root, tuple(notes))
+    materials = {element.get("name", ""): _colour(element) for element in robot.findall("material")}
+    links = [_read_link(element, materials) for element in robot.findall("link")]
+    joints = [_read_joint(element, notes) for element in robot.findall("joint")]
+    return build_robot(robot.get("name", ""), links, joints, notes, filename)
 
 
 def _parse_xml(data: bytes, filename: str) -> ElementTree.Element:
@@ -129,20 +54,44 @@ def _parse_xml(data: bytes, filename: str) -> ElementTree.Element:
     return root
 
 
-def _read_link(element: ElementTree.Element) -> Link:
+def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]) -> Link:
     name = _name(element, "link")
-    shapes = tuple(_read_shape(collision, name) for collision in element.findall("collision"))
+    shapes = tuple(_read_shape(collision, f"collision of link {name!r}") for collision in element.findall("collision"))
     mass_element = element.find("inertial/mass")
     mass = None if mass_element is None else _number(mass_element, "value", f"mass of link {name!r}")
     if mass is not None and mass < 0:
         raise HandError(f"mass of link {name!r} is negative; give it in kilograms")
-    return Link(name, shapes, mass if mass else None)
+    return Link(name, shapes, mass if mass else None, _read_visuals(element, name, materials))
 
 
-def _read_shape(collision: ElementTree.Element, link: str) -> Shape:
-    what = f"collision of link {link!r}"
-    pose = _origin(collision, what)
-    geometry = collision.find("geometry")
+def _read_visuals(element: ElementTree.Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
+    """Visual elements with their colours. What cannot be used is left out: nothing but pictures needs them."""
+    found = []
+    for visual in element.findall("visual")[:MAX_VISUALS]:
+        try:
+            shape = _read_shape(visual, f"visual of link {link!r}")
+        except HandError:
+            continue
+        material = visual.find("material")
+        colour = None if material is None else _colour(material) or materials.get(material.get("name", ""))
+        found.append(replace(shape, colour=colour))
+    return tuple(found)
+
+
+def _colour(material: ElementTree.Element) -> Colour | None:
+    node = material.find("color")
+    try:
+        values = [float(part) for part in (node.get("rgba") or "")[:200].split()] if node is not None else []
+    except ValueError:
+        return None
+    if len(values) not in (3, 4) or not all(0 <= value <= 1 for value in values):
+        return None
+    return values[0], values[1], values[2]
+
+
+def _read_shape(element: ElementTree.Element, what: str) -> Shape:
+    pose = _origin(element, what)
+    geometry = element.find("geometry")
     shape = None if geometry is None else next(iter(geometry), None)
     if shape is None:
         raise HandError(f"{what} has no geometry; give a box, cylinder, sphere, capsule or mesh")
@@ -181,8 +130,19 @@ def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
         return Joint(name, kind, parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
     lower, upper, effort = _limits(element, kind, what)
     return Joint(
-        name, kind, parent, child, origin, _axis(element, what, notes), lower, upper, effort, _mimic(element, what)
-    )
+        name, kind, parent, child, origin, _axis(element, what, notes), lower, upper, effort, _mimic(element, what),
+        velocity=_velocity(element),
+    )  # fmt: skip
+
+
+def _velocity(element: ElementTree.Element) -> float:
+    """Limit of speed [rad/s or m/s]; 0 where none that makes sense is stated: grasps do not need it."""
+    limit = element.find("limit")
+    try:
+        value = abs(float(limit.get("velocity", "0"))) if limit is not None else 0.0
+    except ValueError:
+        return 0.0
+    return value if math.isfinite(value) else 0.0
 
 
 def _axis(element: ElementTree.Element, what: str, notes: list[str]) -> Floats:
@@ -221,43 +181,6 @@ def _mimic(element: ElementTree.Element, what: str) -> Mimic | None:
     multiplier = _number(node, "multiplier", f"mimic of {what}", default=1.0)
     offset = _number(node, "offset", f"mimic of {what}", default=0.0)
     return Mimic(node.get("joint", ""), multiplier, offset)
-
-
-def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str) -> str:
-    """Name of the one root link; every other link hangs on it by exactly one joint."""
-    parent_of: dict[str, str] = {}
-    for joint in joints.values():
-        for end, link in (("parent", joint.parent), ("child", joint.child)):
-            if link not in links:
-                raise HandError(f"{filename}: joint {joint.name!r} names the {end} link {link!r}, which is not there")
-        if joint.child in parent_of:
-            raise HandError(f"{filename}: link {joint.child!r} has two parents, a kinematic loop; cut one joint")
-        parent_of[joint.child] = joint.parent
-    roots = [name for name in links if name not in parent_of]
-    if len(roots) != 1:
-        found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
-        raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
-    for link in links:
-        seen, at = {link}, link
-        while at in parent_of:
-            at = parent_of[at]
-            if at in seen:
-                raise HandError(f"{filename}: the joints around link {at!r} form a loop without a root")
-            seen.add(at)
-    return roots[0]
-
-
-def _check_mimics(joints: dict[str, Joint], filename: str) -> None:
-    for joint in joints.values():
-        seen, at = {joint.name}, joint
-        while at.mimic is not None:
-            target = joints.get(at.mimic.joint)
-            if target is None or target.type not in MOVING:
-                raise HandError(f"{filename}: joint {at.name!r} mimics {at.mimic.joint!r}, which is no moving joint")
-            if target.name in seen:
-                raise HandError(f"{filename}: joint {target.name!r} mimics itself through a cycle; free one joint")
-            seen.add(target.name)
-            at = target
 
 
 def _name(element: ElementTree.Element, what: str) -> str:

@@ -38,6 +38,8 @@ def _parts(value: Any) -> Iterator[bytes]:
         yield f"{type(value).__name__}{len(value)}".encode()
         for held in sorted(value) if isinstance(value, frozenset) else value:
             yield from _parts(held)
+    elif is_dataclass(value) and isinstance(told := getattr(value, "content", None), str):
+        yield told.encode()
     elif is_dataclass(value) and not isinstance(value, type):
         yield from _parts({f.name: getattr(value, f.name) for f in fields(value)})
     elif isinstance(value, (str, int, float, np.generic)) or value is None:

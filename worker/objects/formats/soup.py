@@ -21,6 +21,18 @@ class Soup:
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
+    colours: NDArray[np.float64] | None = None
+    """(F, 3) sRGB colour of each face, 0 .. 1, NaN where none is stated; None: no face has one."""
+
+    def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
+        """Each colour with the indices of its faces; None for those without."""
+        if self.colours is None:
+            return [(None, np.arange(len(self.faces)))]
+        known, index = np.unique(np.round(self.colours, 3), axis=0, return_inverse=True, equal_nan=True)
+        return [
+            (None if np.isnan(rgb).any() else (float(rgb[0]), float(rgb[1]), float(rgb[2])), np.flatnonzero(index == i))
+            for i, rgb in enumerate(known)
+        ]
 
 
 def check_soup(soup: Soup) -> Soup:

@@ -1,0 +1,171 @@
+"""What the readers of URDF and MJCF agree on: links with shapes and masses, and the joints that make one tree of them.
+
+Every value was checked by the reader, so that nothing behind it has to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import HandError, LimitError
+from service.model.transforms import Floats
+
+Ints = NDArray[np.int32]
+
+MAX_LINKS: Final = 256
+MAX_SHAPES: Final = 1024
+#: No part of a robot hand lies farther than this from its parent [m]; larger numbers are a unit mistake.
+MAX_LENGTH_M: Final = 10.0
+MOVING: Final = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One element of a link. Size: box x y z; sphere r; cylinder and capsule r, length [m]; mesh: its scale."""
+
+    kind: str
+    size: tuple[float, ...]
+    pose: Floats
+    filename: str = ""
+    """Of a mesh that lies in a file."""
+    mesh: tuple[Floats, Ints] | None = None
+    """Vertices (V, 3) and triangles (F, 3) of a mesh whose file the reader of the robot has read itself."""
+    colour: tuple[float, float, float] | None = None
+    """sRGB, 0 .. 1, of a visual element; None: not stated, or in the file of its mesh."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A link; mass is None where the robot's description gives none."""
+
+    name: str
+    shapes: tuple[Shape, ...]
+    """Collision elements."""
+    mass: float | None
+    visuals: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """value = multiplier * value of `joint` + offset."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint; the axis has length 1, limits are finite and ordered for moving joints."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: Floats
+    axis: Floats
+    lower: float
+    upper: float
+    effort: float
+    """[N m or N]; 0: not stated."""
+    mimic: Mimic | None
+    velocity: float = 0.0
+    """Limit [rad/s or m/s]; 0: not stated."""
+    stiffness: float = 0.0
+    """Position gain of the joint's servo [N m/rad or N/m]; 0: not stated."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A checked description: links and joints form one tree."""
+
+    name: str
+    links: dict[str, Link]
+    joints: dict[str, Joint]
+    root: str
+    notes: tuple[str, ...] = field(default=())
+    """Oddities that were taken but should be told to the user."""
+    format: str = "URDF"
+
+
+def build_robot(
+    name: str, links: Iterable[Link], joints: Iterable[Joint], notes: Iterable[str], filename: str, fmt: str = "URDF"
+) -> Robot:
+    """A robot of links and joints whose own values were checked.
+
+    Raises:
+        HandError: a name comes twice, the joints form no tree, mimics no chain, or nothing moves or can touch.
+        LimitError: more links or shapes than a hand has.
+    """
+    link_of: dict[str, Link] = {}
+    for link in links:
+        if link.name in link_of:
+            raise HandError(f"{filename}: duplicate link name {link.name!r}; rename one of them")
+        link_of[link.name] = link
+    joint_of: dict[str, Joint] = {}
+    for joint in joints:
+        if joint.name in joint_of:
+            raise HandError(f"{filename}: duplicate joint name {joint.name!r}; rename one of them")
+        joint_of[joint.name] = joint
+    if len(link_of) > MAX_LINKS or sum(len(link.shapes) for link in link_of.values()) > MAX_SHAPES:
+        raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
+    root = _check_tree(link_of, joint_of, filename)
+    _check_mimics(joint_of, filename)
+    if not any(joint.type in MOVING for joint in joint_of.values()):
+        raise HandError(f"{filename}: no moving joint; a hand needs at least one revolute or prismatic joint")
+    if not any(link.shapes for link in link_of.values()):
+        add = "add <collision> elements" if fmt == "URDF" else "give geoms a contype and conaffinity"
+        raise HandError(f"{filename}: no link has collision geometry, so nothing can touch; {add}")
+    return Robot(name, link_of, joint_of, root, tuple(notes), fmt)
+
+
+def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
+    """All joints, fixed ones too, from the root to a link, in this order."""
+    carrier = {joint.child: joint for joint in robot.joints.values()}
+    found: list[Joint] = []
+    while link in carrier:
+        found.insert(0, carrier[link])
+        link = carrier[link].parent
+    return tuple(found)
+
+
+def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str) -> str:
+    """Name of the one root link; every other link hangs on it by exactly one joint."""
+    parent_of: dict[str, str] = {}
+    for joint in joints.values():
+        for end, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in links:
+                raise HandError(f"{filename}: joint {joint.name!r} names the {end} link {link!r}, which is not there")
+        if joint.child in parent_of:
+            raise HandError(f"{filename}: link {joint.child!r} has two parents, a kinematic loop; cut one joint")
+        parent_of[joint.child] = joint.parent
+    roots = [name for name in links if name not in parent_of]
+    if len(roots) != 1:
+        found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
+        raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
+    for link in links:
+        seen, at = {link}, link
+        while at in parent_of:
+            at = parent_of[at]
+            if at in seen:
+                raise HandError(f"{filename}: the joints around link {at!r} form a loop without a root")
+            seen.add(at)
+    return roots[0]
+
+
+def _check_mimics(joints: dict[str, Joint], filename: str) -> None:
+    for joint in joints.values():
+        seen, at = {joint.name}, joint
+        while at.mimic is not None:
+            target = joints.get(at.mimic.joint)
+            if target is None or target.type not in MOVING:
+                raise HandError(f"{filename}: joint {at.name!r} mimics {at.mimic.joint!r}, which is no moving joint")
+            if target.name in seen:
+                raise HandError(f"{filename}: joint {target.name!r} mimics itself through a cycle; free one joint")
+            seen.add(target.name)
+            at = target

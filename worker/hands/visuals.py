@@ -1,0 +1,124 @@
+"""What a hand looks like: the visual elements of its links with their colours, read when somebody draws them.
+
+Nothing but pictures needs them, so none of them can make a hand unusable: what cannot be read is left out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from service.model.errors import InputError
+from service.model.transforms import Floats, apply
+from worker.hands.primitives import tessellate
+from worker.hands.references import find_mesh
+from worker.hands.robot import Ints, Shape
+from worker.objects.formats import Soup, read_mesh
+
+#: A hand's visual meshes together [faces]: beyond that a picture shows no more.
+MAX_FACES: Final = 400_000
+
+
+@dataclass(frozen=True)
+class VisualMesh:
+    """A triangle mesh of one colour on a body."""
+
+    body: int
+    vertices: Floats
+    """(V, 3) in the body frame [m]."""
+    faces: Ints
+    """(F, 3)"""
+    colour: tuple[float, float, float] | None
+    """sRGB, 0 .. 1; None: not stated."""
+
+
+@dataclass(frozen=True)
+class PlacedShape:
+    """A visual element, the body it moves with, its (7,) pose in the body's frame, and the link it comes from."""
+
+    shape: Shape
+    body: int
+    pose: Floats
+    link: str
+
+
+@dataclass(frozen=True)
+class Visuals:
+    """The visual elements of a hand; `meshes` reads their files at the first use."""
+
+    placed: Sequence[PlacedShape] = ()
+    files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+    base: str = ""
+    """Folder of the robot's description inside `files`."""
+
+    @cached_property
+    def content(self) -> str:
+        """Digest of all that the meshes follow from."""
+        whole = hashlib.sha256()
+        for item in self.placed:
+            shape = item.shape
+            whole.update(repr((item.body, item.link, shape.kind, shape.size, shape.filename, shape.colour)).encode())
+            whole.update(np.round(item.pose, 12).tobytes())
+            for part in shape.mesh or ():
+                whole.update(np.ascontiguousarray(part).tobytes())
+            if shape.filename and (name := _file_of(item, self.files, self.base)):
+                whole.update(hashlib.sha256(self.files[name]).digest())
+        return whole.hexdigest()[:32]
+
+    @cached_property
+    def meshes(self) -> tuple[VisualMesh, ...]:
+        """All that can be read, up to `MAX_FACES` triangles."""
+        found: list[VisualMesh] = []
+        soups: dict[str, Soup] = {}
+        left = MAX_FACES
+        for item in self.placed:
+            for mesh in _meshes(item, self.files, self.base, soups):
+                left -= len(mesh.faces)
+                if left >= 0:
+                    found.append(mesh)
+        return tuple(found)
+
+
+NO_VISUALS: Final = Visuals()
+
+
+def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dict[str, Soup]) -> list[VisualMesh]:
+    shape = item.shape
+    if shape.kind != "mesh":
+        vertices, faces = tessellate(shape.kind, shape.size)
+        return [VisualMesh(item.body, apply(item.pose, vertices), faces, shape.colour)]
+    if shape.mesh is not None:
+        return [VisualMesh(item.body, apply(item.pose, shape.mesh[0]), shape.mesh[1], shape.colour)]
+    name = _file_of(item, files, base)
+    try:
+        if name and name not in soups:
+            soups[name] = read_mesh(name, files[name])
+    except InputError:
+        return []
+    if not name:
+        return []
+    soup, scale = soups[name], np.asarray(shape.size)
+    vertices = apply(item.pose, soup.vertices * scale)
+    faces = (soup.faces if np.prod(scale) > 0 else soup.faces[:, ::-1]).astype(np.int32)
+    return [
+        VisualMesh(item.body, *_used(vertices, faces[chosen]), shape.colour or colour)
+        for colour, chosen in soup.by_colour()
+    ]
+
+
+def _used(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """The vertices that some faces name, and those faces."""
+    keep, index = np.unique(faces, return_inverse=True)
+    return vertices[keep], index.reshape(-1, 3).astype(np.int32)
+
+
+def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
+    try:
+        return find_mesh(item.shape.filename, files, base, item.link)
+    except InputError:
+        return ""
