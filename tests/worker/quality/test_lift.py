@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from service.model.transforms import quat_rotate
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet, Posture
@@ -88,3 +89,28 @@ def test_two_lifts_of_one_grasp_say_the_same() -> None:
     test = lift_test()
     first, second = test.lift(grasp(0.05), 0), test.lift(grasp(0.05), 0)
     assert first == second
+
+
+def test_a_box_whose_mesh_has_its_origin_elsewhere_stands_still_and_is_lifted_alike() -> None:
+    away = np.array([0.02, 0.01, HEIGHT])
+    box = object_from_mesh(
+        trimesh.creation.box((2 * HALF, 0.04, HEIGHT), trimesh.transformations.translation_matrix(away))
+    )
+    pose = PLACED.object_pose.copy()
+    pose[:, :3] -= quat_rotate(pose[:, 3:], away)
+    placed = Placed(PLACED.supports, pose, PLACED.index)
+    scene = build(HAND, box, ConvexPieces((box.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions(), placed.supports)
+    test, given = Lift(scene, placed), grasp(0.05)
+    for part in (given.grasp, given.pregrasp, given.squeeze, given.lift):
+        assert part is not None
+        part.hand_pose[:, :3] += away
+    assert given.approach is not None
+    given.approach[..., :3] += away
+    # Where the object is follows its mesh's origin, which a turn moves more where it is farther from the centre.
+    assert test.lift(given, 0).margin == pytest.approx(lift_test().lift(grasp(0.05), 0).margin, abs=0.02)
+    # Nobody near: what stands on a table keeps standing for a second. A contact gives by 0.1 mm.
+    test._begin(given, 0)
+    test._put(given.grasp.hand_pose[0] - [0, 0, 1, 0, 0, 0, 0], given.coming[0])
+    test._run(1.0)
+    moved, turned = test._motion()
+    assert moved < 5e-4 and turned < 1e-3

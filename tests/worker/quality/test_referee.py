@@ -288,6 +288,30 @@ def test_object_weighs_100_grams_with_its_own_inertia() -> None:
     assert sorted(body.inertia) == pytest.approx(sorted(OBJECT_MASS * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
 
 
+def test_the_mass_lies_in_the_centre_of_mass_wherever_the_mesh_has_its_origin() -> None:
+    away = np.array([0.03, -0.02, 0.2])
+    moved = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05), trimesh.transformations.translation_matrix(away)))
+    scene = build(PADS, moved, ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, *(part[0] for part in (CONTACT.hand_pose + 5, CONTACT.joint_positions)))
+    mujoco.mj_kinematics(scene.model, data)
+    mujoco.mj_comPos(scene.model, data)
+    np.testing.assert_allclose(data.xipos[scene.object_body], moved.centre_of_mass, atol=1e-9)
+
+
+def test_a_verdict_does_not_depend_on_the_origin_of_the_mesh() -> None:
+    away = np.array([0.03, -0.02, 0.2])
+    moved = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05), trimesh.transformations.translation_matrix(away)))
+    there = ConvexPieces((moved.hull_vertices,), 1.0, 0.0, "box")
+    grasps = many_grasps()
+    here = judge(PADS, BOX, grasps, level="letter", pieces=WHOLE)
+    parts = (grasps.grasp, grasps.pregrasp, grasps.squeeze)
+    shifted = [Posture(p.hand_pose + np.append(away, np.zeros(4)), p.joint_positions) for p in parts]
+    found = judge(PADS, moved, GraspSet(*shifted, grasps.stability_loss), level="letter", pieces=there)
+    assert 0 < here.success.sum() < len(grasps)
+    np.testing.assert_array_equal(found.success, here.success)
+
+
 def test_hand_masses_are_the_model_s() -> None:
     model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PADS.masses)

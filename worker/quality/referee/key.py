@@ -21,7 +21,7 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 Level = Literal["letter", "certificate", "screen"]
 
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
-REVISION: Final = 4
+REVISION: Final = 5
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "LOST_ROTATION")
 #: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules

@@ -196,7 +196,7 @@ def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction:
     if not mine:
         body.mass = mass
         body.inertia = np.full(3, 0.4 * mass * _BARE_RADIUS**2)
-        body.explicitinertial = True
+        body.ipos, body.explicitinertial = [0, 0, 0], True
         return
     share = np.array([float(np.prod(np.ptp(p.vertices, axis=0))) for _, p in mine])
     for (i, p), part in zip(mine, share / share.sum(), strict=True):
@@ -287,7 +287,8 @@ def add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list
     """A free body named `object` of a given mass [kg], its frame in the object's centre of mass."""
     body = spec.worldbody.add_body(name="object", pos=obj.centre_of_mass)
     body.add_freejoint(name="object")
-    body.mass = mass
+    # Where nothing is said, MuJoCo takes the place of the body in its parent for the place of the mass in the body.
+    body.mass, body.ipos = mass, [0, 0, 0]
     inertia = mass * obj.inertia
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     body.explicitinertial = True
