@@ -126,16 +126,20 @@ def scored(
     grasps: GraspSet,
     request: JobOptions,
     *,
+    scenes: Scenes | None = None,
     pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
     run: Run = ALONE,
 ) -> Certified:
     """Grasps that are there already, judged and measured as `request` says; all of them are kept.
+
+    With `scenes` they are judged in these, `grasps.scene` saying in which.
 
     Raises:
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
     work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, run)
+    work.scenes = scenes
     with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
         work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
         work.tried = len(grasps)

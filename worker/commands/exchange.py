@@ -158,7 +158,7 @@ def _bench(
     case = load_case(source, hand=hand, obj=obj)
     mask, _ = choose(read_shard(source, kind="base"), unjudged=unjudged, every=every)
     rows = np.flatnonzero(mask)
-    written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output)
+    written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
     return {"grasps": len(written), "files": len(written)}
 
 

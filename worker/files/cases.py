@@ -100,9 +100,10 @@ def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
         raise InputError("a DexGraspBench folder does not hold the hand and the object; name both: --hand and --object")
     sets = dexgraspbench.read(path, hand=hand, obj=obj)
     if len(sets) > 1:
-        scales = ", ".join(f"{one.scale:g}" for one in sets)
-        raise InputError(f"{path} holds grasps for the object at {len(sets)} scales ({scales}); give the folder of one")
-    return Case(path.name, sets[0].hand, sets[0].obj, sets[0].grasps, published=sets[0].published)
+        kinds = ", ".join(f"scale {one.scale:g}{' on a table' if one.placed else ''}" for one in sets)
+        raise InputError(f"{path} holds {len(sets)} kinds of grasps ({kinds}); give the folder of one")
+    found = sets[0]
+    return Case(path.name, found.hand, found.obj, found.grasps, published=found.published, placed=found.placed)
 
 
 def _check_joints(path: Path, hand: HandModel, grasp: Posture) -> None:

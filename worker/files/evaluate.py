@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -105,10 +106,12 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
 
 def _lifted(case: Case, placed: Placed, level: str, hard: bool, pieces: ConvexPieces, run: Run) -> dict[str, Any]:
     chosen: Any = "lift" if level == "certificate" else level
-    verdicts = judge_lifts(
-        case.hand, case.obj, case.grasps, placed, level=chosen, hard=hard, pieces=pieces, run=run
-    )  # fmt: skip
-    clear = plan_way(case.hand, case.obj, case.grasps, placed).clear
+    way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
+    if grasps.approach is None or grasps.coming is None:
+        # Files of others say where a grasp is, seldom how the hand comes.
+        grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+    verdicts = judge_lifts(case.hand, case.obj, grasps, placed, level=chosen, hard=hard, pieces=pieces, run=run)
+    clear = way.clear
     held = int(verdicts.success.sum())
     rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, clear, strict=True)
     return {

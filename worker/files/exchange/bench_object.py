@@ -1,4 +1,4 @@
-"""An object as DexGraspBench keeps it: mesh, convex pieces, facts, and a scene in which it floats at its scale 1."""
+"""An object as DexGraspBench keeps it: mesh, convex pieces, facts, and scenes: afloat at scale 1, and on a table."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from service.model.transforms import IDENTITY_POSE
+from worker.files.exchange.bench_scene import TABLETOP
 from worker.files.exchange.objects import mesh_file, write_obj
 from worker.hands.primitives import hull, volume
 from worker.objects.model import ObjectModel
@@ -46,7 +47,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     (root / folder / "urdf" / "coacd.urdf").write_text(_urdf(name, len(pieces)))
     solid = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
     (root / folder / "info" / "simplified.json").write_text(json.dumps(_facts(obj, solid), indent=1) + "\n")
-    np.save(root / scene, np.array(_scene(name), dtype=object), allow_pickle=True)
+    _save(root / scene, _scene(name, f"floating/{SCALE}", IDENTITY_POSE))
     _add_to_split(root / SET / "valid_split" / "all.json", name)
     return folder, scene
 
@@ -60,15 +61,35 @@ def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _scene(name: str) -> dict[str, Any]:
+def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
+    """Write the scene in which an object that is there already stands at `pose` (7,) on a table.
+
+    Returns:
+        the scene's file, relative to `root`.
+    """
+    place = f"{TABLETOP}/{SCALE}_pose{number:03}"
+    file = SET / "scene_cfg" / name / f"{place}.npy"
+    (root / file.parent).mkdir(parents=True, exist_ok=True)
+    table = {"type": "plane", "pose": IDENTITY_POSE.copy(), "size": np.array([0.0, 0.0, 1.0])}
+    scene = _scene(name, place, pose)
+    scene["scene"]["table"] = table
+    _save(root / file, scene)
+    return file
+
+
+def _save(file: Path, record: dict[str, Any]) -> None:
+    np.save(file, np.array(record, dtype=object), allow_pickle=True)
+
+
+def _scene(name: str, place: str, pose: Floats) -> dict[str, Any]:
     folder = f"../../../processed_data/{name}"
     thing = {
-        "type": "rigid_object", "scale": np.ones(3), "pose": IDENTITY_POSE.copy(),
+        "type": "rigid_object", "scale": np.ones(3), "pose": np.array(pose, float),
         "file_path": f"{folder}/mesh/simplified.obj", "info_path": f"{folder}/info/simplified.json",
         "urdf_path": f"{folder}/urdf/coacd.urdf",
     }  # fmt: skip
     return {
-        "scene_id": f"{name}/floating/{SCALE}", "scene": {name: thing},
+        "scene_id": f"{name}/{place}", "scene": {name: thing},
         "task": {"type": "force_closure", "obj_name": name},
     }  # fmt: skip
 

@@ -2,13 +2,15 @@
 
 Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
 position, root quaternion w x y z, joints. Root and object stand in one world frame. Root and order of the joints are
-those of the model that a benchmark's configuration names; a mapping beside the grasps says how ours lie in it.
+those of the model that a benchmark's configuration names; a mapping beside the grasps says how ours lie in it. Grasps
+on a table have more, see `bench_scene`.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +21,8 @@ from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, compose, invert
 from worker.files.exchange.bench_hand import joint_order, write_hand
 from worker.files.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
-from worker.files.exchange.bench_object import SCALE, write_object
+from worker.files.exchange.bench_object import SCALE, write_object, write_table
+from worker.files.exchange.bench_scene import TABLETOP, check_table, is_tabletop, placed_of, tabletop_fields, with_way
 from worker.files.exchange.imported import Imported, plain_name
 from worker.files.exchange.objects import scaled_object
 from worker.files.exchange.pickles import load_npy
@@ -27,8 +30,10 @@ from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
+Row = dict[str, Any]
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Prefix of the configurations of our hands, and name of the experiment that the grasps are.
@@ -36,7 +41,7 @@ NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
-    """Grasps of one hand on one object, a set for each scale of the object.
+    """Grasps of one hand on one object, a set for each scale of the object, those on tables apart from the others.
 
     Args:
         path: a file, or a folder searched whole.
@@ -54,28 +59,36 @@ def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
     if len(mappings) > 1:
         names = ", ".join(sorted(one.config if one else "another" for one in mappings))
         raise InputError(f"{path} holds grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
-    by_scale: dict[float, list[dict[str, Any]]] = defaultdict(list)
+    sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
     for file in files:
         row = _row(file)
-        by_scale[_scale(row)].append(row)
+        sets[_scale(row), is_tabletop(row)].append(row)
     model, mapping = hand_from_path(hand), mappings.pop()
     return [
-        _set(path, model, scaled_object(obj, scale), rows, scale, mapping) for scale, rows in sorted(by_scale.items())
+        _set(path, model, scaled_object(obj, scale), rows, scale, mapping, on_table=on_table)
+        for (scale, on_table), rows in sorted(sets.items(), key=lambda item: item[0])
     ]
 
 
-def write(hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path) -> list[Path]:
+def write(
+    hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[int], folder: Path,
+    placed: Placed | None = None,
+) -> list[Path]:  # fmt: skip
     """Write grasps with all that DexGraspBench's evaluator reads: laid over its checkout, the folder is complete.
 
-    The object stands at scale 1 in the origin. The hand goes with it as a model of our own; where the benchmark has a
-    model of the same hand, the grasps are written for that one as well.
+    The object has scale 1. It stands in the origin, or, where the grasps are `placed`, on its table, as the tabletop
+    test wants it; both go to experiments of their own. The hand goes with it as a model of our own; where the benchmark
+    has a model of the same hand, the grasps are written for that one as well.
 
     Returns:
         the files of the grasps, one each, for our model of the hand.
 
     Raises:
+        InputError: the grasps' scenes are more than a table.
         MeshError: the object's convex pieces are no picture of it.
     """
+    if placed is not None:
+        check_table(placed)
     name, config = plain_name(obj.name), f"{NAME}_{plain_name(hand.name)}"
     obj_path, scene = write_object(obj, name, folder)
     model = write_hand(hand, config, folder)
@@ -84,27 +97,42 @@ def write(hand: HandModel, obj: ObjectModel, grasps: GraspSet, rows: Sequence[in
         hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), tuple((j, j) for j in order),
         link_names(hand),
     )  # fmt: skip
+    scenes = {0: (IDENTITY_POSE, scene)}
+    number = np.zeros(len(grasps), np.intp)
+    if placed is not None:
+        number = placed.index
+        poses = np.asarray(placed.object_pose, float)
+        scenes = {k: (poses[k], write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))}
     paths: list[Path] = []
     for mapping in filter(None, (ours, of_the_benchmark(hand))):
-        out = folder / "output" / f"{NAME}_{mapping.config}"
-        place = out / GRASPS / name / f"{SCALE}_pose000"
-        place.mkdir(parents=True, exist_ok=True)
+        out = folder / "output" / f"{NAME if placed is None else f'{NAME}_{TABLETOP}'}_{mapping.config}"
+        out.mkdir(parents=True, exist_ok=True)
         mapping.write(out)
-        written = [place / f"{row}.npy" for row in rows]
+        written = [out / GRASPS / name / f"{SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
         for row, file in zip(rows, written, strict=True):
-            record: dict[str, Any] = {
-                "obj_path": obj_path.as_posix(), "obj_scale": 1.0, "obj_pose": IDENTITY_POSE.copy(),
-                "scene_path": scene.as_posix(),
+            pose, path = scenes[number[row]]
+            record: Row = {
+                "obj_path": obj_path.as_posix(), "obj_scale": 1.0, "obj_pose": pose.copy(),
+                "scene_path": path.as_posix(),
             }  # fmt: skip
-            for posture in POSTURES:
-                found: Posture = getattr(grasps, posture)
-                record[f"{posture}_qpos"] = mapping.qpos(hand, found.hand_pose[row], found.joint_positions[row])
+            record |= _postures(mapping, hand, grasps, row, None if placed is None else pose)
+            file.parent.mkdir(parents=True, exist_ok=True)
             np.save(file, np.array(record, dtype=object), allow_pickle=True)
         paths = paths or written
     return paths
 
 
-def _row(file: Path) -> dict[str, Any]:
+def _postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
+    """The `..._qpos` of a grasp: around the origin, or where the object stands at `pose` (7,) on a table."""
+    record: Row = {}
+    for name in POSTURES:
+        found: Posture = getattr(grasps, name)
+        root = found.hand_pose[row] if pose is None else compose(pose, found.hand_pose[row])
+        record[f"{name}_qpos"] = mapping.qpos(hand, root, found.joint_positions[row])
+    return record if pose is None else record | tabletop_fields(mapping, hand, grasps, row, pose)
+
+
+def _row(file: Path) -> Row:
     found = load_npy(file)
     if not isinstance(found, dict):
         raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
@@ -113,23 +141,27 @@ def _row(file: Path) -> dict[str, Any]:
     return found
 
 
-def _scale(row: dict[str, Any]) -> float:
+def _scale(row: Row) -> float:
     return float(np.ravel(row.get("obj_scale", 1.0))[0])
 
 
 def _set(
-    path: Path, hand: HandModel, obj: ObjectModel, rows: list[dict[str, Any]], scale: float, mapping: HandMapping | None
-) -> Imported:
+    path: Path, hand: HandModel, obj: ObjectModel, rows: list[Row], scale: float, mapping: HandMapping | None, *,
+    on_table: bool,
+) -> Imported:  # fmt: skip
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
     parts = {name: _posture(path, hand, name, rows, pose, mapping) for name in POSTURES}
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
     name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
-    return Imported(hand, obj, grasps, name, scale, published)
+    placed = placed_of(pose) if on_table else None
+    if placed is not None:
+        grasps = replace(with_way(hand, grasps, rows, pose, mapping), scene=placed.index)
+    return Imported(hand, obj, grasps, name, scale, published, placed)
 
 
 def _posture(
-    path: Path, hand: HandModel, name: str, rows: list[dict[str, Any]], obj_pose: Floats, mapping: HandMapping | None
+    path: Path, hand: HandModel, name: str, rows: list[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> Posture:
     try:
         qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)

@@ -15,6 +15,7 @@ from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import pregrasp, squeeze
+from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +43,8 @@ class Imported:
     """Factor that the source puts on the object's mesh."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
+    placed: Placed | None = None
+    """The scenes that the grasps are for, if any."""
 
 
 def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:

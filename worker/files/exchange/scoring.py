@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from service.model.digests import digest_files, digest_json
 from service.model.domain import AssetKind, JobRequest
 from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute, write_shard
 from worker.certified import scored
@@ -15,12 +18,15 @@ from worker.files.exchange.imported import Imported, Origin, plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
 from worker.run import ALONE, Run
+from worker.simulation.surroundings import Scenes
 
 
 def write_scored(
     found: Imported, origin: Origin, folder: Path, *, referee: str, friction: float, ordinal: int = 0, run: Run = ALONE
 ) -> Path:
     """Judge and measure a set of grasps and write it as a base shard, its object's mesh beside it.
+
+    Grasps in scenes are lifted out of them; the way of the hand is planned anew, as for grasps of our own.
 
     Args:
         found: the grasps.
@@ -49,7 +55,8 @@ def write_scored(
         )  # fmt: skip
     except ValueError:
         raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
-    made = scored(found.hand, found.obj, found.grasps, request, run=run)
+    scenes = None if found.placed is None else Scenes(found.placed.supports, found.placed.object_pose)
+    made = scored(found.hand, found.obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
     attributes: dict[str, Attribute] = {
@@ -61,7 +68,13 @@ def write_scored(
         "batch": ordinal,
     }  # fmt: skip
     attributes |= base_attributes(found.hand, request, tried=made.tried, verdict_key=made.verdict_key)
-    path.write_bytes(write_shard("base", {**made.grasps.to_columns(), **made.columns}, attributes))
+    arrays = {**made.grasps.to_columns(), **made.columns}
+    if scenes is not None:
+        # A table is the only scene that other formats have.
+        attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
+        arrays["scene/object_pose"] = scenes.object_pose
+        arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)
+    path.write_bytes(write_shard("base", arrays, attributes))
     return path
 
 

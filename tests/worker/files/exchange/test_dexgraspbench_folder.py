@@ -1,22 +1,17 @@
-"""A folder that DexGraspBench's evaluator takes as it is: each file that its loader reads, read here on our own.
-
-What the loader does was read in its source (evaluation, base class of the tests, hand and object specs) and is written
-anew in `Loaded`; MuJoCo then loads what it would load.
-"""
+"""A folder that DexGraspBench's evaluator takes as it is: each file that its loader reads, read by `bench_loader`."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-import yaml
 
 from service.model.transforms import quat_to_matrix
+from tests.worker.files.exchange.bench_loader import PREFIX, files_of, load
 from worker.files.exchange import dexgraspbench
 from worker.files.exchange.bench_hand import body_names
 from worker.grasps import GraspSet, Posture
@@ -27,79 +22,6 @@ from worker.objects.model import ObjectModel
 
 #: Rounding of a pose in float64 through text of 12 digits [m].
 ROUNDING_M = 1e-8
-PREFIX = "child-"
-
-
-@dataclass
-class Loaded:
-    """One grasp as the evaluator holds it."""
-
-    grasp: dict[str, Any]
-    hand: dict[str, Any]
-    model: Any
-    data: Any
-
-    def at(self, qpos: np.ndarray) -> None:
-        """Hand and object where the evaluator puts them: hand first, object last."""
-        self.data.qpos[: len(qpos)] = qpos
-        self.data.qpos[-7:] = self.grasp["obj_pose"]
-        mujoco.mj_forward(self.model, self.data)
-
-    def controls(self, qpos: np.ndarray) -> np.ndarray:
-        """Actuators' targets: their moments times the hand's joints."""
-        dense = np.zeros((self.model.nu, self.model.nv))
-        data = self.data
-        mujoco.mju_sparse2dense(
-            dense, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )  # fmt: skip
-        return dense[:, 6:-6] @ qpos[7:]
-
-
-def load(root: Path, npy: Path, config: str, *, mass: float = 0.1) -> Loaded:
-    """As the evaluator does, in a checkout at `root`: all paths in the files are relative to it."""
-    grasp = np.load(npy, allow_pickle=True).item()
-    info = json.loads((root / grasp["obj_path"] / "info" / "simplified.json").read_text())
-    volume = info["mass"] / (info["density"] * info["scale"] ** 3)
-    density = mass / (volume * grasp["obj_scale"] ** 3)
-    hand = yaml.safe_load((root / "config" / "hand" / f"{config}.yaml").read_text())
-    spec = mujoco.MjSpec()
-    spec.meshdir = str(root)
-    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    _add_hand(spec, root, hand["xml_path"])
-    _add_object(spec, root / grasp["obj_path"] / "urdf" / "meshes", grasp["obj_scale"], density)
-    for geom in spec.geoms:
-        geom.condim = 4
-        geom.friction[:2] = [0.6, 0.02]
-    model = spec.compile()
-    return Loaded(grasp, hand, model, mujoco.MjData(model))
-
-
-def _add_hand(spec: Any, root: Path, file: str) -> None:
-    child = mujoco.MjSpec.from_file(str(root / file))
-    for mesh in child.meshes:
-        mesh.file = str(Path(file).parent / child.meshdir / mesh.file)
-    child.meshdir = spec.meshdir
-    base = spec.worldbody.add_frame().attach_body(child.worldbody, PREFIX, "")
-    base.add_freejoint(name="hand_freejoint")
-    spec.worldbody.add_body(name="mocap_body", mocap=True)
-    hold = np.zeros(mujoco.mjNEQDATA)
-    hold[10] = 1
-    spec.add_equality(
-        type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap_body", name2=f"{PREFIX}world",
-        data=hold,
-    )  # fmt: skip
-
-
-def _add_object(spec: Any, pieces: Path, scale: float, density: float) -> None:
-    body = spec.worldbody.add_body(name="object")
-    body.add_freejoint(name="obj_freejoint")
-    for file in pieces.iterdir():
-        name = file.name.replace(".obj", "")
-        spec.add_mesh(name=name, file=str(file), scale=[scale] * 3)
-        number = name.replace("convex_piece_", "")
-        geom: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name}
-        body.add_geom(name=f"object_visual_{number}", density=0, contype=0, conaffinity=0, **geom)
-        body.add_geom(name=f"object_collision_{number}", density=density, **geom)
 
 
 @pytest.fixture(scope="module")
@@ -107,11 +29,6 @@ def bench(hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path_factor
     root = tmp_path_factory.mktemp("bench")
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), root)
     return root
-
-
-def files_of(root: Path, config: str) -> list[Path]:
-    """What the evaluator finds with `hand=config exp_name=graspd`."""
-    return sorted((root / "output" / f"graspd_{config}" / "graspdata").glob("**/*.npy"))
 
 
 def test_a_grasp_has_each_field_that_is_read(bench: Path, hand: HandModel, grasps: GraspSet) -> None:
