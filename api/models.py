@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.index.views import AttemptView, GraspView, ShardView, StageProgress, WorkerView
 from service.model.domain import JobRequest, Stage, State
 from service.model.metric_fields import OfferedName, filters, means, with_fields
+from service.model.scene_spec import Box, HalfSpace, SceneKind
 
 
 class StageStatus(StageProgress):
@@ -97,6 +98,38 @@ class Posture(BaseModel):
     joint_positions: list[float] = Field(description="order of joint_names [rad or m]")
 
 
+class Waypoint(BaseModel):
+    """One posture of the way of a grasp, in the frame of the object at rest."""
+
+    name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty: between two of them")
+    place: float = Field(description="on a slider: named ones at 0, 1, 2, ..., others evenly between")
+    hand_pose: list[float] = Field(description="root link: x y z [m], quaternion w x y z")
+    joint_positions: list[float] = Field(description="order of joint_names [rad or m]")
+    carried: list[float] = Field(description="how far the object was carried from its rest: x y z [m]")
+
+
+class Neighbour(BaseModel):
+    """Another object of a scene."""
+
+    name: str
+    digest: str
+    pose: list[float] = Field(description="in the scene: x y z [m], quaternion w x y z")
+
+
+class GraspScene(BaseModel):
+    """The scene that a grasp was planned in; its frame has z up."""
+
+    kind: SceneKind
+    number: int = Field(description="row of the scene in its shard")
+    object_pose: list[float] = Field(description="of the object at rest: x y z [m], quaternion w x y z")
+    supports: list[HalfSpace | Box]
+    neighbours: list[Neighbour] = Field(default_factory=list)
+    clearance_m: float | None = Field(None, description="least distance of the hand from what stands there, on its way")
+    lift: str | None = Field(None, description="what the lift test came to; None: not tried")
+    lift_hard: bool | None = Field(None, description="whether it lifts at half the friction; None: not tested")
+    pushes: bool | None = Field(None, description="whether it holds the six pushes; None: not tested")
+
+
 class Push(BaseModel):
     """What one push of the referee did to a grasp."""
 
@@ -113,6 +146,8 @@ class GraspDetail(GraspView):
     postures: dict[str, Posture] = Field(description="pregrasp, grasp, squeeze")
     thresholds_m: list[float] = Field(description="contact thresholds of the sweep")
     sweep: dict[str, list[float | None]] = Field(description="metric at each of the thresholds")
+    way: list[Waypoint] = Field(description="from the standoff, where it has one, to the squeeze or the lift")
+    scene: GraspScene | None = Field(None, description="where it was planned; None: around a free object")
     pushes: list[Push] = Field(description="verdict per direction of push; empty: the referee did not judge")
     verdict_margin: float | None = Field(None, description="worst motion over its limit; below 1: held")
     audit: bool | None = Field(None, description="verdict by the letter of the protocol; None: not audited")

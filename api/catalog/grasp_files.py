@@ -7,6 +7,7 @@ import re
 from functools import lru_cache
 from typing import Any, Final
 
+from api.catalog.grasp_scenes import scene, way
 from api.models import GraspDetail, Posture, Push
 from service.index.views import GraspView, ShardView
 from service.model.errors import InputError, NotFoundError
@@ -54,6 +55,8 @@ class GraspFiles:
                 for metric in GRASP_METRICS
                 if metric.swept and metric.path in file.arrays
             },
+            way=way(file, row),
+            scene=scene(file, row),
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
             audit=_verdict(file, "quality/audit", row),

@@ -77,6 +77,7 @@ def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shar
         "grasp.html",
         page="/grasps",
         grasp=grasp,
+        stops=[point.name for point in grasp.way if point.name],
         shard=shard,
         job=shards.job_of(shard_id),
         metrics=_metrics(grasp),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +20,7 @@ from service.store.attributes import Attribute
 from service.store.library import publish_builtins
 from service.store.manifests import ShardManifest, manifest_of, publish_shard
 from service.store.records import put_record
-from service.store.shards import check_columns, write_shard
+from service.store.shards import check_columns, read_shard, write_shard
 
 JOINTS = 16
 Arrays = dict[str, NDArray[np.generic]]
@@ -51,7 +53,6 @@ def add_job(parts: Parts, **fields: object) -> JobRecord:
 def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
     """A task's shard, with columns of the right shapes and random values, as a worker publishes it."""
     random = np.random.default_rng(task.batch)
-    kind = names.SHARD_KINDS[task.stage]
     arrays = _ARRAYS[task.stage](random, task.count, record.request)
     attributes: dict[str, Attribute] = {"hand": record.request.hand, "object": record.request.object}
     attributes |= {"shard_id": task.output, "batch": task.batch}
@@ -59,6 +60,14 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
         attributes["base_shard" if task.stage is Stage.SCENE else "scene_shard"] = task.inputs[0]
     if task.stage is Stage.SYNTHESIZE:
         attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
+    return publish(parts, record, task, arrays, attributes)
+
+
+def publish(
+    parts: Parts, record: JobRecord, task: PlannedTask, arrays: Arrays, attributes: dict[str, Attribute]
+) -> ShardManifest:
+    """A task's shard of these columns, in the store and in the index."""
+    kind = names.SHARD_KINDS[task.stage]
     data = write_shard(kind, arrays, attributes)
     message = message_of(record, task, attempt=1, max_attempt=3)
     manifest = manifest_of(
@@ -67,6 +76,16 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
     publish_shard(parts.store, manifest, data)
     parts.index.write.add_manifest(manifest)
     return manifest
+
+
+def finish_with(parts: Parts, file: Path, **fields: object) -> ShardManifest:
+    """A job whose grasps are those of a base shard that `graspd synth` wrote of a built-in hand and object."""
+    shard = read_shard(file, kind="base")
+    said = {name: str(shard.attributes[name]) for name in ("hand", "object")}
+    record = add_job(parts, **said, grasps=len(shard["quality/valid"]), **fields)
+    task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
+    attributes = shard.attributes | {"shard_id": task.output, "batch": task.batch}
+    return publish(parts, record, task, shard.arrays, attributes)
 
 
 def finish_all(parts: Parts, record: JobRecord) -> list[ShardManifest]:

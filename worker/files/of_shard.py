@@ -12,7 +12,7 @@ import numpy as np
 
 from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError
-from service.model.scene_spec import SceneSpec
+from service.readers.ways import scene_spec_of
 from service.store.shards import Shard
 from worker.files.origin import Found, Sought, at, find, options_of
 from worker.hands.load import hand_from_path, load_hand
@@ -117,10 +117,8 @@ def placed_of_shard(shard: Shard) -> Placed | None:
     """
     if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
         return None
-    try:
-        spec = SceneSpec(**json.loads(str(shard.attributes.get("scene", ""))))
-    except (ValueError, TypeError):
-        raise InputError("the shard has grasps in scenes, but its attribute scene does not say which") from None
+    if (spec := scene_spec_of(shard)) is None:
+        raise InputError("the shard has grasps in scenes, but its attribute scene does not say which")
     poses = np.asarray(shard["scene/object_pose"], float)
     return Scenes(supports_of(spec), poses).placed(np.asarray(shard["grasp/scene_index"], np.intp))
 

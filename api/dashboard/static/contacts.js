@@ -103,13 +103,14 @@ function colourOf(distance, out) {
   return out.set(STOPS[last][1]);
 }
 
-/** Dots on the hand where it is near the object. Those behind something shine through faintly. */
+/** Dots on the hand where it is near the object, in the object's frame. Those behind something shine through faintly. */
 export class Contacts {
   constructor(hand, thing) {
     this.hand = hand;
+    this.frame = thing.group;
     this.field = new DistanceField(thing.geometry);
     let count = 0;
-    hand.eachPoint(() => { count += 1; });
+    hand.eachPoint(this.frame, () => { count += 1; });
     const dot = new SphereGeometry(DOT_M, 8, 6);
     this.front = new InstancedMesh(dot, new MeshBasicMaterial(), count);
     this.behind = new InstancedMesh(dot, new MeshBasicMaterial({ transparent: true, opacity: 0.5, depthTest: false }), count);
@@ -127,7 +128,7 @@ export class Contacts {
     const place = new Matrix4();
     const colour = new Color();
     let shown = 0, touching = 0, lowest = Infinity;
-    this.hand.eachPoint((point) => {
+    this.hand.eachPoint(this.frame, (point) => {
       const distance = this.field.distance(point);
       if (distance > REACH_M) return;
       lowest = Math.min(lowest, distance);

@@ -1,5 +1,5 @@
 // A hand that takes postures and an object, as three.js groups. Metres; poses are x y z, then quaternion w x y z.
-import { Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
+import { Group, Matrix4, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 
 const COLOURS = { palm: 0x59636f, finger: 0x7b8794, tip: 0x2bb5a8, object: 0xe8b878 };
 
@@ -65,12 +65,13 @@ export class Hand {
     }
   }
 
-  /** Calls back with each surface point in the frame of the group's parent. */
-  eachPoint(callback) {
-    const point = new Vector3();
+  /** Calls back with each surface point in the frame of a group. */
+  eachPoint(frame, callback) {
+    const point = new Vector3(), within = new Matrix4(), outward = frame.matrixWorld.clone().invert();
     for (const { group, points } of this.bodies) {
+      within.multiplyMatrices(outward, group.matrixWorld);
       for (let i = 0; points && i < points.length; i += 3) {
-        callback(point.fromArray(points, i).applyMatrix4(group.matrixWorld));
+        callback(point.fromArray(points, i).applyMatrix4(within));
       }
     }
   }

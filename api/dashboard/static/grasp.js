@@ -1,12 +1,14 @@
-// The page of one grasp: hand and object in 3D, contacts by distance, a slider from pregrasp over grasp to squeeze.
-import { Group } from "./vendor/three.min.js";
+// The page of one grasp: hand and object in 3D, in their scene if they have one, contacts by distance, and a slider for
+// the way: standoff, pregrasp, grasp, squeeze, lift.
+import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
-import { between, Hand, Thing } from "./figures.js";
+import { Hand, Thing } from "./figures.js";
 import { Contacts } from "./contacts.js";
+import { freeSide, staged } from "./scenery.js";
 import { besideHand, LiveStage } from "./stage.js";
+import { Way } from "./way.js";
 
-const POSTURES = ["pregrasp", "grasp", "squeeze"];
-const PLAY_MS = 2600;
+const STOP_MS = 1300;
 
 async function start(figure) {
   const canvas = figure.querySelector("canvas");
@@ -18,59 +20,74 @@ async function start(figure) {
   ]);
   const stage = new LiveStage(canvas);
   const hand = new Hand(handModel), thing = new Thing(objectModel);
-  const all = new Group();
-  all.add(hand.group, thing.group);
+  const { all, scenery } = staged(grasp, hand, thing);
   stage.scene.add(all);
+  if (scenery) {
+    stage.scene.add(scenery.group);
+    scenery.addNeighbours(grasp.scene, () => stage.invalidate());
+  }
   const contacts = new Contacts(hand, thing);
-  stage.scene.add(contacts.group);
+  thing.group.add(contacts.group);
 
+  const way = new Way(grasp.way, grasp.joint_names);
   const slider = figure.querySelector("input[type=range]");
+  const doing = figure.querySelector("[data-stage]");
   const show = () => {
-    const at = Number(slider.value);
-    const first = Math.min(Math.floor(at), 1);
-    const { pose, positions } = between(grasp.postures[POSTURES[first]], grasp.postures[POSTURES[first + 1]], at - first, grasp.joint_names);
+    const place = Number(slider.value);
+    const { pose, positions, carried } = way.at(place);
+    thing.group.position.fromArray(carried);
+    thing.group.updateMatrixWorld(true);
     hand.pose(pose, positions);
     const { touching, lowest } = contacts.update();
     const depth = lowest < 0 ? `deepest ${(-1000 * lowest).toFixed(2)} mm inside` : lowest < 0.005 ? `nearest ${(1000 * lowest).toFixed(2)} mm away` : "nothing within 5 mm";
     said.textContent = `${touching} surface points within 1 mm, ${depth}`;
-    slider.setAttribute("aria-valuetext", at < 0.02 ? "pregrasp" : Math.abs(at - 1) < 0.02 ? "grasp" : at > 1.98 ? "squeeze" : at < 1 ? `${Math.round(100 * at)} % of the way from pregrasp to grasp` : `${Math.round(100 * (at - 1))} % of the way from grasp to squeeze`);
+    doing.textContent = way.say(place);
+    slider.setAttribute("aria-valuetext", way.say(place));
+    for (const button of figure.querySelectorAll("[data-posture]")) {
+      button.setAttribute("aria-current", String(Math.abs(Number(button.dataset.posture) - place) < 0.02));
+    }
     stage.invalidate();
   };
+  slider.value = String(way.place("grasp"));
   show();
-  stage.frame(all, besideHand(hand), 0.7);
-  wire(figure, { stage, hand, thing, contacts, slider, show });
+  const beside = besideHand(hand);
+  const middle = all.localToWorld(new Vector3());
+  stage.frame(all, grasp.scene ? freeSide(beside, grasp.scene, middle) : beside, way.place("grasp") > 1 ? 1.2 : 0.7);
+  wire(figure, { stage, hand, thing, scenery, contacts, slider, way, show });
   figure.dataset.state = "ready";
 }
 
-function wire(figure, { stage, hand, thing, contacts, slider, show }) {
-  slider.addEventListener("input", show);
+function wire(figure, { stage, hand, thing, scenery, contacts, slider, way, show }) {
+  const play = figure.querySelector("[data-play]");
+  let playing = null;
+  const stop = () => { cancelAnimationFrame(playing); playing = null; play.setAttribute("aria-pressed", "false"); };
+  slider.addEventListener("input", () => { stop(); show(); });
   for (const button of figure.querySelectorAll("[data-posture]")) {
-    button.addEventListener("click", () => { slider.value = button.dataset.posture; show(); });
+    button.addEventListener("click", () => { stop(); slider.value = button.dataset.posture; show(); });
   }
   const toggles = {
     contacts: (on) => { contacts.group.visible = on; },
     glass: (on) => hand.setGlass(on),
     wire: (on) => thing.setWire(on),
+    scenery: (on) => { scenery.group.visible = on; },
   };
   for (const [name, apply] of Object.entries(toggles)) {
     const box = figure.querySelector(`[data-toggle=${name}]`);
+    if (!box) continue;
     const change = () => { apply(box.checked); stage.invalidate(); };
     box.addEventListener("change", change);
     change();
   }
   figure.querySelector("[data-reset]").addEventListener("click", () => stage.reset());
-  const play = figure.querySelector("[data-play]");
-  let playing = null;
-  const stop = () => { cancelAnimationFrame(playing); playing = null; play.setAttribute("aria-pressed", "false"); };
   play.addEventListener("click", () => {
     if (playing !== null) return stop();
     play.setAttribute("aria-pressed", "true");
     const began = performance.now();
     const step = (now) => {
-      const share = Math.min((now - began) / PLAY_MS, 1);
-      slider.value = String(2 * share);
+      const place = Math.min(Math.max(now - began, 0) / STOP_MS, way.last);
+      slider.value = String(place);
       show();
-      if (share < 1) playing = requestAnimationFrame(step); else stop();
+      if (place < way.last) playing = requestAnimationFrame(step); else stop();
     };
     playing = requestAnimationFrame(step);
   });

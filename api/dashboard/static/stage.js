@@ -1,6 +1,6 @@
 // A lit stage with a camera that orbits. Draws only when something changed, so an idle page costs nothing.
 import {
-  Box3, DirectionalLight, HemisphereLight, NoToneMapping, PCFShadowMap, PerspectiveCamera, Scene, Sphere, Vector3,
+  Box3, DirectionalLight, HemisphereLight, NoToneMapping, PCFShadowMap, PerspectiveCamera, Quaternion, Scene, Sphere, Vector3,
   WebGLRenderer, OrbitControls,
 } from "./vendor/three.min.js";
 
@@ -150,7 +150,8 @@ export class LiveStage extends Stage {
 
 /** Where to stand to see a grasp: beside the hand, a little above and behind it. */
 export function besideHand(hand) {
-  const approach = new Vector3(...(hand.extras.palm?.approach ?? [0, 0, 1])).applyQuaternion(hand.group.quaternion);
+  const turn = hand.group.getWorldQuaternion(new Quaternion());
+  const approach = new Vector3(...(hand.extras.palm?.approach ?? [0, 0, 1])).applyQuaternion(turn);
   const up = new Vector3(0, 0, 1);
   const side = new Vector3().crossVectors(up, approach);
   if (side.length() < 0.2) side.set(1, 0.4, 0);

@@ -1,7 +1,8 @@
 // Pictures of grasps in lists: one small stage draws them one after another as they come into view.
-import { Group } from "./vendor/three.min.js";
+import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { between, Hand, Thing } from "./figures.js";
+import { freeSide, staged } from "./scenery.js";
 import { besideHand, Stage } from "./stage.js";
 
 const SIDE = 220;
@@ -24,16 +25,19 @@ async function draw(canvas) {
   const ratio = Math.min(devicePixelRatio, 2);
   const { pose, positions } = between(grasp.postures.grasp, grasp.postures.grasp, 0, grasp.joint_names);
   hand.pose(pose, positions);
-  const all = new Group();
-  all.add(hand.group, thing.group);
+  thing.group.position.set(0, 0, 0);
+  const { all, scenery } = staged(grasp, hand, thing);
   stage.scene.add(all);
+  if (scenery) stage.scene.add(scenery.group);
   stage.size(SIDE, SIDE * 0.8, ratio);
-  stage.frame(all, besideHand(hand), 0.74);
+  const beside = besideHand(hand);
+  stage.frame(all, grasp.scene ? freeSide(beside, grasp.scene, all.localToWorld(new Vector3())) : beside, 0.74);
   stage.draw();
   canvas.width = stage.renderer.domElement.width;
   canvas.height = stage.renderer.domElement.height;
   canvas.getContext("2d").drawImage(stage.renderer.domElement, 0, 0);
   stage.scene.remove(all);
+  if (scenery) stage.scene.remove(scenery.group);
   canvas.dataset.state = "ready";
 }
 

@@ -1,0 +1,133 @@
+// What stands around an object: tables, walls and boards, and other objects; and from where one sees past them.
+import { BufferAttribute, BufferGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
+import { loadGlb } from "./glb.js";
+import { Thing } from "./figures.js";
+
+/** A half-space is shown as a disc [m]. */
+const DISC_M = 0.32;
+const CORNERS = 96;
+const COLOURS = { support: 0xcfd4d6, wall: 0x8fa3b0, neighbour: 0xb4aebf };
+/** Sides that are looked from: each this far from the one before, and these far above the horizon. */
+const STEP = Math.PI / 8;
+const HEIGHTS = [0.45, 0.8, 1.15];
+const FAR_M = 0.6;
+
+/** A group of vertices with normals as a mesh. */
+function mesh(position, normal, index, look) {
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(position), 3));
+  geometry.setAttribute("normal", new BufferAttribute(new Float32Array(normal), 3));
+  geometry.setIndex(new BufferAttribute(new Uint16Array(index), 1));
+  const made = new Mesh(geometry, look);
+  made.receiveShadow = true;
+  return made;
+}
+
+/** The plane of a half-space as a disc about the foot of `middle`; from below one sees through it. */
+function disc({ normal, offset }, middle) {
+  const position = [0, 0, 0], normals = [0, 0, 1], index = [];
+  for (let i = 0; i < CORNERS; i++) {
+    const angle = (2 * Math.PI * i) / CORNERS;
+    position.push(DISC_M * Math.cos(angle), DISC_M * Math.sin(angle), 0);
+    normals.push(0, 0, 1);
+    index.push(0, 1 + i, 1 + ((i + 1) % CORNERS));
+  }
+  const made = mesh(position, normals, index, new MeshStandardMaterial({ color: COLOURS.support, roughness: 0.9 }));
+  const up = new Vector3(...normal), length = up.length();
+  up.divideScalar(length);
+  made.quaternion.setFromUnitVectors(new Vector3(0, 0, 1), up);
+  made.position.copy(middle).addScaledVector(up, offset / length - up.dot(middle));
+  return made;
+}
+
+function box({ size, pose }) {
+  const position = [], normals = [], index = [];
+  for (const axis of [0, 1, 2]) {
+    for (const sign of [-1, 1]) {
+      const [u, v] = sign > 0 ? [(axis + 1) % 3, (axis + 2) % 3] : [(axis + 2) % 3, (axis + 1) % 3];
+      const first = position.length / 3;
+      for (const [a, b] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
+        const corner = [0, 0, 0], normal = [0, 0, 0];
+        corner[axis] = sign * size[axis] / 2;
+        corner[u] = a * size[u] / 2;
+        corner[v] = b * size[v] / 2;
+        normal[axis] = sign;
+        position.push(...corner);
+        normals.push(...normal);
+      }
+      index.push(first, first + 1, first + 2, first, first + 2, first + 3);
+    }
+  }
+  const look = new MeshStandardMaterial({ color: COLOURS.wall, roughness: 0.9, transparent: true, opacity: 0.34, depthWrite: false });
+  const made = place(mesh(position, normals, index, look), pose);
+  made.renderOrder = 1;
+  return made;
+}
+
+/** Put something at a pose x y z, quaternion w x y z. */
+export function place(thing, [x, y, z, w, i, j, k]) {
+  thing.position.set(x, y, z);
+  thing.quaternion.set(i, j, k, w).normalize();
+  return thing;
+}
+
+/** Everything of a scene but the hand and the object that is grasped. */
+export class Scenery {
+  constructor(scene) {
+    this.group = new Group();
+    const middle = new Vector3(...scene.object_pose);
+    for (const support of scene.supports) this.group.add(support.kind === "box" ? box(support) : disc(support, middle));
+  }
+
+  /** Other objects come as their models do; one that has none is left out. */
+  async addNeighbours(scene, changed) {
+    await Promise.all(scene.neighbours.map(async ({ digest, pose }) => {
+      const model = await loadGlb(`/v1/objects/${digest}/model`).catch(() => null);
+      if (!model) return;
+      const thing = new Thing(model);
+      thing.look.color.set(COLOURS.neighbour);
+      this.group.add(place(thing.group, pose));
+      changed();
+    }));
+  }
+}
+
+/** Hand and object as they stand in the scene (where there is one), and what stands around them. */
+export function staged(grasp, hand, thing) {
+  const all = new Group();
+  all.add(hand.group, thing.group);
+  if (grasp.scene) place(all, grasp.scene.object_pose);
+  all.updateMatrixWorld(true);
+  return { all, scenery: grasp.scene ? new Scenery(grasp.scene) : null };
+}
+
+/** Of the sides about a wanted one, the nearest from which no wall hides the object and the eye is above what it stands on. */
+export function freeSide(wanted, scene, centre) {
+  const around = Math.atan2(wanted.y, wanted.x);
+  const planes = scene.supports.filter((support) => support.kind === "half_space");
+  const walls = scene.supports.filter((support) => support.kind === "box");
+  for (const height of HEIGHTS) {
+    for (let k = 0; k < 16; k++) {
+      const angle = around + STEP * (k % 2 ? (k + 1) / 2 : -k / 2);
+      const side = new Vector3(Math.cos(angle) * Math.cos(height), Math.sin(angle) * Math.cos(height), Math.sin(height));
+      const eye = centre.clone().addScaledVector(side, FAR_M);
+      if (planes.every(({ normal, offset }) => eye.dot(new Vector3(...normal)) > offset) && !walls.some((wall) => crosses(eye, centre, wall))) return side;
+    }
+  }
+  return wanted;
+}
+
+/** Whether the line between two points goes through a box (slabs test of Kay and Kajiya 1986). */
+function crosses(from, to, { size, pose }) {
+  const [x, y, z, w, i, j, k] = pose;
+  const back = new Quaternion(i, j, k, w).normalize().invert();
+  const start = from.clone().sub(new Vector3(x, y, z)).applyQuaternion(back);
+  const step = to.clone().sub(new Vector3(x, y, z)).applyQuaternion(back).sub(start);
+  let enter = 0, leave = 1;
+  ["x", "y", "z"].forEach((axis, n) => {
+    const ends = [-1, 1].map((sign) => ((sign * size[n]) / 2 - start[axis]) / (Math.abs(step[axis]) < 1e-9 ? 1e-9 : step[axis]));
+    enter = Math.max(enter, Math.min(...ends));
+    leave = Math.min(leave, Math.max(...ends));
+  });
+  return enter < leave;
+}

@@ -1,0 +1,95 @@
+"""The way of a grasp as a base shard tells it: from the standoff, or the pregrasp, to the lift, as postures in turn."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
+from service.model.transforms import slerp
+from service.store.shards import Shard
+
+Floats = NDArray[np.float64]
+
+#: Names of the postures at which something begins or ends. What lies between them has none.
+STOPS: Final = ("standoff", "pregrasp", "grasp", "squeeze", "lift")
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """One posture of the way, in the frame in which the object rested."""
+
+    name: str
+    """One of `STOPS`, or nothing."""
+    hand_pose: Floats
+    """(7,) root link: x y z [m], unit quaternion w x y z."""
+    joint_positions: Floats
+    """(J,) [rad or m]"""
+    carried: Floats
+    """(3,) how far the object was carried from its rest [m]."""
+
+
+def way_of(shard: Shard, row: int) -> list[Waypoint]:
+    """The way of a grasp: pregrasp, grasp, squeeze, and what the shard says of the approach and the lift.
+
+    The last waypoint of an approach and the pregrasp have one hand pose: there the open fingers take the pregrasp.
+    """
+    rest = np.zeros(3)
+
+    def posture(name: str) -> Waypoint:
+        pose, joints = (np.asarray(shard[f"{name}/{part}"][row], float) for part in ("hand_pose", "joint_positions"))
+        return Waypoint(name, pose, joints, rest)
+
+    way = [posture("pregrasp"), posture("grasp"), posture("squeeze")]
+    if "grasp/approach" in shard.arrays:
+        joints = np.asarray(shard["grasp/approach_joint_positions"][row], float)
+        poses = np.asarray(shard["grasp/approach"][row], float)
+        way[:0] = [Waypoint("" if k else "standoff", pose, joints, rest) for k, pose in enumerate(poses)]
+    if "grasp/lift" in shard.arrays:
+        pose, squeeze = np.asarray(shard["grasp/lift"][row], float), way[-1]
+        way.append(Waypoint("lift", pose, squeeze.joint_positions, pose[:3] - squeeze.hand_pose[:3]))
+    return way
+
+
+def stop_places(way: Sequence[Waypoint]) -> Floats:
+    """(W,) where each waypoint stands on a slider: stops at 0, 1, 2, ..., others evenly between two of them."""
+    stops = [k for k, point in enumerate(way) if point.name]
+    return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
+
+
+def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
+    """The posture at a place of the slider: straight for positions and joints, by the shorter arc for the rotation."""
+    places = stop_places(way)
+    place = float(np.clip(place, places[0], places[-1]))
+    k = min(int(np.searchsorted(places, place, side="right")) - 1, len(way) - 2)
+    a, b = way[k], way[k + 1]
+    share = (place - places[k]) / (places[k + 1] - places[k])
+
+    def mix(first: Floats, second: Floats) -> Floats:
+        return np.asarray((1 - share) * first + share * second)
+
+    turn = slerp(a.hand_pose[3:], b.hand_pose[3:], float(share))
+    name = a.name if share == 0 else b.name if share == 1 else ""
+    pose = np.concatenate([mix(a.hand_pose[:3], b.hand_pose[:3]), turn])
+    return Waypoint(name, pose, mix(a.joint_positions, b.joint_positions), mix(a.carried, b.carried))
+
+
+def scene_spec_of(shard: Shard) -> SceneSpec | None:
+    """The scene that a shard says its grasps, poses or pictures are of; None: it says nothing.
+
+    Raises:
+        InputError: what it says is no scene.
+    """
+    said = shard.attributes.get("scene")
+    if said is None:
+        return None
+    try:
+        return SceneSpec(**json.loads(str(said)))
+    except (ValueError, TypeError):
+        raise InputError("the shard's attribute scene says no scene") from None

@@ -1,0 +1,82 @@
+"""The way of a grasp: its postures in turn, and those between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
+from service.model.transforms import quat_from_axis_angle
+from service.readers.ways import Waypoint, point_at, scene_spec_of, stop_places, way_of
+from service.store.shards import Shard, json_attribute
+
+WAYPOINTS = 4
+
+
+def shard(*, in_scene: bool) -> Shard:
+    """One grasp whose hand comes along x, closes two joints, and rises along z."""
+    arrays: dict[str, np.ndarray] = {}
+    for k, name in enumerate(("pregrasp", "grasp", "squeeze")):
+        arrays[f"{name}/hand_pose"] = np.array([[0.1, 0, 0, 1, 0, 0, 0]], float)
+        arrays[f"{name}/joint_positions"] = np.full((1, 2), 0.1 * k)
+    if in_scene:
+        coming = np.tile([0.1, 0, 0, 1, 0, 0, 0], (1, WAYPOINTS, 1)).astype(float)
+        coming[0, :, 0] = np.linspace(0.2, 0.1, WAYPOINTS)
+        arrays |= {
+            "grasp/approach": coming,
+            "grasp/approach_joint_positions": np.full((1, 2), -0.3),
+            "grasp/lift": np.array([[0.1, 0, 0.1, 1, 0, 0, 0]]),
+        }
+    return Shard("base", {}, arrays)
+
+
+def test_a_free_grasp_goes_from_the_pregrasp_over_the_grasp_to_the_squeeze():
+    way = way_of(shard(in_scene=False), 0)
+    assert [point.name for point in way] == ["pregrasp", "grasp", "squeeze"]
+    assert stop_places(way).tolist() == [0, 1, 2]
+
+
+def test_a_grasp_in_a_scene_comes_from_its_standoff_and_carries_the_object_up():
+    way = way_of(shard(in_scene=True), 0)
+    assert [point.name for point in way if point.name] == ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
+    assert way[0].hand_pose[0] == 0.2
+    assert all((point.joint_positions == -0.3).all() for point in way[:WAYPOINTS])
+    assert way[-1].carried.tolist() == [0, 0, 0.1]
+    assert not any(point.carried.any() for point in way[:-1])
+
+
+def test_stops_stand_at_whole_places_and_other_waypoints_evenly_between():
+    way = way_of(shard(in_scene=True), 0)
+    np.testing.assert_allclose(stop_places(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("place", "x", "joint"), [(-1, 0.2, -0.3), (0, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)]
+)
+def test_between_two_postures_positions_and_joints_go_straight(place, x, joint):
+    point = point_at(way_of(shard(in_scene=True), 0), place)
+    assert point.hand_pose[0] == pytest.approx(x)
+    assert point.joint_positions == pytest.approx([joint, joint])
+
+
+def test_half_way_up_the_object_is_half_way_up():
+    assert point_at(way_of(shard(in_scene=True), 0), 3.5).carried == pytest.approx([0, 0, 0.05])
+
+
+def test_a_turn_is_divided_evenly():
+    ends = quat_from_axis_angle(np.array([0, 0, 1.0]), np.array([0.0, 1.2]))
+    first, last = (
+        Waypoint(name, np.concatenate([np.zeros(3), q]), np.zeros(0), np.zeros(3))
+        for name, q in zip(("grasp", "squeeze"), ends, strict=True)
+    )
+    third = point_at([first, last], 1 / 3).hand_pose[3:]
+    assert third == pytest.approx(quat_from_axis_angle(np.array([0, 0, 1.0]), np.array(0.4)))
+
+
+def test_a_shard_says_its_scene_or_none_and_nonsense_is_refused():
+    spec = SceneSpec(kind="bin")
+    assert scene_spec_of(Shard("base", {}, {})) is None
+    assert scene_spec_of(Shard("base", {"scene": json_attribute(spec.model_dump(mode="json"))}, {})) == spec
+    with pytest.raises(InputError, match="says no scene"):
+        scene_spec_of(Shard("base", {"scene": '{"kind": "moon"}'}, {}))
