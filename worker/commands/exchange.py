@@ -18,7 +18,9 @@ from worker.run import Run
 
 app = typer.Typer(no_args_is_help=True)
 
-EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench")
+#: Formats of robots and their simulators; the first of them goes by two names.
+ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "isaac", "csv")
+EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *ROBOTS)
 IMPORTS: Final = ("dexgraspbench", "dexgraspnet", "multidex", "ddgc", "reference")
 
 
@@ -34,6 +36,12 @@ def export(
     unjudged: UnjudgedOption = False,
     every: EveryOption = False,
     depth: Annotated[str, typer.Option(help="exr: metres as floats; png: 16 bits, steps of 0.1 mm.")] = "exr",
+    best: Annotated[int, typer.Option(min=0, help="For robots: at most so many, the best by epsilon; 0: all.")] = 0,
+    tool: Annotated[
+        str | None,
+        typer.Option("--tool-frame", help="For robots: a link of the hand, or x y z qw qx qy qz in its root link."),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits that is used.")] = 0.5,
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
@@ -42,16 +50,25 @@ def export(
         raise InputError(f"there is no export format {format_!r}; choose one of {', '.join(EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
-    if format_ == "webdataset":
+    notes: list[str] = []
+    if format_ in ROBOTS:
+        from worker.files.robot_export import Wishes, export_grasps
+
+        wishes = Wishes(hand, object_, unjudged, every, best, tool, speed)
+        done = export_grasps(source, format_, wishes, output)
+        written, notes = done.counts, done.notes
+    elif format_ == "webdataset":
         written = _webdataset(source, output, unjudged=unjudged, every=every)
     elif format_ == "dexgraspbench":
         written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
     else:
         written = _pictures(source, format_, depth, output)
     if json:
-        emit({"folder": str(output), "format": format_, **written})
-    else:
-        typer.echo(f"{output}: " + ", ".join(f"{number} {what}" for what, number in written.items()))
+        emit({"folder": str(output), "format": format_, **written, **({"notes": notes} if notes else {})})
+        return
+    typer.echo(f"{output}: " + ", ".join(f"{number} {what}" for what, number in written.items()))
+    for note in notes:
+        typer.echo(note, err=True)
 
 
 @app.command(

@@ -15,7 +15,7 @@ from service.model.errors import ConflictError, InputError
 from service.readers.ways import scene_spec_of
 from service.store.shards import Shard
 from worker.files.origin import Found, Sought, at, find, options_of
-from worker.hands.load import hand_from_path, load_hand
+from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object, object_from_path
@@ -41,6 +41,14 @@ def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
     wanted = _wanted(shard, AssetKind.HAND)
     found = find(wanted)
     return load_hand(found.files, name=wanted.name, digest=wanted.digest, options=found.options)
+
+
+def hand_files_of_shard(shard: Shard, given: str | None) -> Found:
+    """The files of `hand_of_shard`, with the options to read them with."""
+    if given:
+        _, files, stated = files_from_path(given)
+        return Found(files, stated)
+    return find(_wanted(shard, AssetKind.HAND))
 
 
 def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:

@@ -1,18 +1,20 @@
-"""The hand's way in a scene: from a standoff to the pregrasp, closing, the lift; and what it stays clear of.
+"""The hand's way: from a standoff to the pregrasp, closing, the lift; and what it stays clear of.
 
+In a scene the lift goes against gravity. Around a free object it is the way back, as the hand came.
 Against half-spaces distances are exact. Against boxes and neighbours' pieces they are those of the hand's features from
 the obstacle's planes: exact where a corner is nearest, else a lower bound of the features' distance.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import IDENTITY_POSE, quat_from_axis_angle, quat_rotate
 from worker.grasps import GraspSet, Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -33,6 +35,11 @@ _LOOKS: Final = 4
 #: Directions of retreat that are tried: the palm's own, mixed with these shares of the direction against gravity.
 SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
 _POINTS: Final = 600
+#: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.
+TILTS: Final = (0.4, 0.8, 1.2)
+SIDES: Final = 8
+#: Points of hand and object with which a way around a free object is looked at.
+_FREE_POINTS: Final = (2000, 3000)
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,9 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         between = obstacle_distances(hand, approach(mine.grasp, mine.pregrasp), scene).reshape(len(rows), -1)
         before = obstacle_distances(hand, approach(mine.pregrasp, wide.take(rows)), scene).reshape(len(rows), -1)
         contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
-        path[rows], coming[rows], touching[rows] = _coming(probe, wide.take(rows), scene)
+        back = -quat_rotate(wide.hand_pose[rows, 3:], hand.palm.approach)
+        ways = [_unit((1 - share) * back + share * scene.up, scene.up) for share in SHARES_UP]
+        path[rows], coming[rows], touching[rows], _ = _coming(probe, wide.take(rows), scene, ways)
         rise = RISE_M * scene.up
         raised[rows, :3] += rise
         lifted = np.repeat(mine.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
@@ -97,26 +106,72 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
     return Way(path, wide.joint_positions, lift, contact, closing, coming, lifting, touching)
 
 
-def _coming(probe: Probe, pregrasp: Posture, scene: Surroundings) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Waypoints (n, W, 7), least distance from obstacles (n,) and whether the object is touched (n,)."""
+def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
+    """The way of grasps of an object that stands alone: a retreat of `STANDOFF_M` that is free of the object.
+
+    The palm's own direction of retreat is tried first, then others ever farther from it. `lift` is the squeeze posture
+    after that retreat, object in hand. Nothing stands around, so all distances from obstacles are infinite.
+    """
+    hand_points, object_points = _FREE_POINTS
+    probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
+    nowhere = Placed((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
+    wide = _opened(probe, grasps.pregrasp, wide_open(hand, obj, grasps.pregrasp, nowhere))
+    pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
+    ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
+    path, _, touching, chosen = _coming(probe, wide, nowhere.scenes[0], ways, both=True)
+    raised = np.array(grasps.squeeze.hand_pose, float)
+    raised[:, :3] += STANDOFF_M * chosen
+    lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
+    endless = np.full(len(grasps), np.inf)
+    return Way(path, wide.joint_positions, lift, endless, endless, endless, endless, touching)
+
+
+def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
+    """Pregrasps with fingers opened to `joints` (n, J), but where that would bring them nearer to the object."""
+    start = np.asarray(pregrasp.joint_positions, float)
+    room = np.minimum(OBJECT_MARGIN_M, _gaps(probe, pregrasp, True)) - 5e-4
+    nearer = np.zeros(len(start), bool)
+    for share in (1 / 3, 2 / 3, 1.0):
+        nearer |= _gaps(probe, Posture(pregrasp.hand_pose, start + share * (joints - start)), True) < room
+    return Posture(np.array(pregrasp.hand_pose, float), np.where(nearer[:, None], start, joints))
+
+
+def _unit(ways: Floats, instead: Floats) -> Floats:
+    """(n, 3) directions of length 1; `instead` where there is none."""
+    length = np.linalg.norm(ways, axis=1, keepdims=True)
+    return np.where(length > 1e-6, ways / np.maximum(length, 1e-6), instead)
+
+
+def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
+    """(n, 3) unit vectors turned by `tilt` [rad] away from axes (n, 3), towards one of `SIDES` sides."""
+    least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
+    across = _unit(np.cross(axis, least), least)
+    leaning = quat_rotate(quat_from_axis_angle(across, np.full(len(axis), tilt)), axis)
+    return quat_rotate(quat_from_axis_angle(axis, np.full(len(axis), 2 * np.pi * side / SIDES)), leaning)
+
+
+def _coming(
+    probe: Probe, pregrasp: Posture, scene: Surroundings, ways: Sequence[Floats], *, both: bool = False
+) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
+    """Waypoints (n, W, 7), least distance from obstacles (n,), whether the object is touched (n,), and the direction of
+    retreat (n, 3): the first of `ways`, (n, 3) each, that is free, or else the freest.
+
+    With `both`, points of the object are looked at from the hand's pieces as well.
+    """
     count, looks = len(pregrasp), (WAYPOINTS - 1) * _LOOKS + 1
-    back = -quat_rotate(pregrasp.hand_pose[:, 3:], probe.hand.palm.approach)
     best = np.full(count, -np.inf)
     least = np.zeros(count)
     touching = np.ones(count, bool)
     chosen = np.zeros((count, 3))
     open_ = np.arange(count)
-    for share in SHARES_UP:
-        way = (1 - share) * back[open_] + share * scene.up
-        length = np.linalg.norm(way, axis=1, keepdims=True)
-        way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), scene.up)
+    for tried in ways:
+        way = tried[open_]
         poses = np.repeat(pregrasp.hand_pose[open_, None], looks, axis=1)
         poses[..., :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_distances(probe.hand, postures, scene).reshape(len(open_), looks).min(axis=1)
-        points = probe.posed_points(body_poses(probe.hand, postures.hand_pose, postures.joint_positions))
-        gap = probe.signed_distance(points.reshape(-1, 3))[0].reshape(len(open_), looks, -1).min(axis=2)
+        gap = _gaps(probe, postures, both).reshape(len(open_), looks)
         # The pregrasp itself may stand nearer than the margin: coming must not be nearer than it is.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
         score = np.minimum(room, MARGIN_M) - hits
@@ -128,4 +183,13 @@ def _coming(probe: Probe, pregrasp: Posture, scene: Surroundings) -> tuple[Float
             break
     poses = np.repeat(pregrasp.hand_pose[:, None], WAYPOINTS, axis=1)
     poses[..., :3] += np.linspace(STANDOFF_M, 0.0, WAYPOINTS)[:, None] * chosen[:, None]
-    return poses, least, touching
+    return poses, least, touching, chosen
+
+
+def _gaps(probe: Probe, postures: Posture, both: bool) -> Floats:
+    """(P,) least distance of the hand's points from the object, and with `both` of the object's from the hand [m]."""
+    if both:
+        found = probe.measure(postures)
+        return np.minimum(found.distance.min(axis=1), found.piece_distance.min(axis=1))
+    points = probe.posed_points(body_poses(probe.hand, postures.hand_pose, postures.joint_positions))
+    return np.asarray(probe.signed_distance(points.reshape(-1, 3))[0].reshape(len(postures), -1).min(axis=1))

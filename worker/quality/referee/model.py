@@ -104,23 +104,7 @@ def build(
     hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions, supports: Sequence[Obstacle] = ()
 ) -> Scene:
     """Compile the scene of a hand and an object, with the supports that it stands on or between, if any."""
-    spec = mujoco.MjSpec()
-    # MJCF angles are degrees by default: radians there freeze every finger silently.
-    spec.compiler.degree = False
-    option = spec.option
-    option.timestep = physics.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = 10.0
-    option.noslip_iterations = physics.noslip_iterations
-    spec.memory = ARENA
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | NOT_IN_3_3_2
-    friction = [*physics.friction, 1e-4]
-    _add_hand(spec, hand, friction, physics.root)
-    add_object(spec, obj, pieces, friction, OBJECT_MASS)
-    if supports:
-        _add_supports(spec, supports, friction)
-    model = spec.compile()
+    model = scene_spec(hand, obj, pieces, physics, supports).compile()
     gain, shift = _leading(hand)
     body_of_geom = model.geom_bodyid
     object_body = model.body("object").id
@@ -139,6 +123,29 @@ def build(
         centre=obj.centre_of_mass,
         support_geoms=np.asarray(support),
     )
+
+
+def scene_spec(
+    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions, supports: Sequence[Obstacle] = ()
+) -> Any:
+    """What `build` compiles: bodies `body0` ..., joints `joint1` ..., actuators `dof0` ..., object, supports."""
+    spec = mujoco.MjSpec()
+    # MJCF angles are degrees by default: radians there freeze every finger silently.
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = physics.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10.0
+    option.noslip_iterations = physics.noslip_iterations
+    spec.memory = ARENA
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | NOT_IN_3_3_2
+    friction = [*physics.friction, 1e-4]
+    _add_hand(spec, hand, friction, physics.root)
+    add_object(spec, obj, pieces, friction, OBJECT_MASS)
+    if supports:
+        _add_supports(spec, supports, friction)
+    return spec
 
 
 def _leading(hand: HandModel) -> tuple[Floats, Floats]:

@@ -1,0 +1,27 @@
+"""Real grasps, of a free block and of a mug on a table, as shards that robots are to carry out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.worker.robots.shards import FREE, TABLE, make
+from worker.engines import backend
+
+
+@pytest.fixture(scope="session", autouse=True)
+def engine() -> None:
+    backend.start()
+
+
+@pytest.fixture(scope="session")
+def free_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Barrett grasps of a free block, sound or not, as they come."""
+    return make(FREE, tmp_path_factory.mktemp("free") / "grasps.h5")
+
+
+@pytest.fixture(scope="session")
+def table_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Barrett grasps of a mug that stands on tables, as they come."""
+    return make(TABLE, tmp_path_factory.mktemp("table") / "grasps.h5")

@@ -1,0 +1,74 @@
+"""What the writers of robots' formats are given, and what they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from service.model.transforms import compose, invert
+from worker.files.exchange.imported import plain_name
+from worker.hands.description import Description
+from worker.hands.model import Floats
+from worker.robots.execution import Executions
+from worker.robots.timing import Trajectory
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Grasps with their trajectories, ready to be written."""
+
+    found: Executions
+    trajectories: list[Trajectory]
+    """One for each grasp; its joints are the arm's, if there is one, then the hand's."""
+    description: Description
+    base_link: str = ""
+    """Name of the arm's base; empty: no arm."""
+    base: Floats | None = None
+    """(7,) the arm's base in the frame of the grasps."""
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame in which poses are written: the arm's base, the scene, or the object."""
+        if self.base is not None:
+            return self.base_link
+        return "scene" if self.found.placed is not None else plain_name(self.found.obj.name)
+
+    def seen(self, pose: Floats) -> Floats:
+        """Poses (..., 7) in the frame `frame`."""
+        return np.asarray(pose, float) if self.base is None else compose(invert(self.base), pose)
+
+    def seen_tool(self, root_pose: Floats) -> Floats:
+        """Poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
+        return self.seen(compose(root_pose, self.found.tool.pose))
+
+    def name(self, row: int) -> str:
+        """Name of a grasp, after its row in the shard."""
+        return f"grasp_{self.found.rows[row]:04}"
+
+    @property
+    def steered(self) -> list[int]:
+        """Columns of the hand's joints that are commanded: those that the URDF does not couple to others."""
+        names = self.found.hand.joint_names
+        return [k for k, name in enumerate(names) if name not in self.description.mimics]
+
+
+class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """YAML without anchors, which not every reader of messages knows."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def dump_yaml(file: Path, value: Any) -> Path:
+    """Write a value as YAML, in the order of its keys."""
+    file.write_text(yaml.dump(value, Dumper=_Plain, sort_keys=False, default_flow_style=None, width=120))
+    return file
+
+
+def numbers(values: Any) -> list[float]:
+    """Plain rounded floats: a nanometre, a nanoradian; never a negative zero."""
+    return [round(float(value), 9) + 0.0 for value in np.ravel(values)]

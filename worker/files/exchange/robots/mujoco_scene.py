@@ -1,0 +1,143 @@
+"""Grasps as a MuJoCo scene: hand, object and supports with the referee's physics, and a key frame for each posture.
+
+The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators bear the
+names of the degrees of freedom. In a scene gravity pulls the object alone; a free object floats.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from service.model.transforms import compose
+from worker.files.exchange.imported import plain_name
+from worker.files.exchange.robots.bundle import Bundle
+from worker.hands.model import HandModel
+from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.model import MujocoOptions, Scene, build, scene_spec
+from worker.robots.execution import POSTURES, Executions
+
+#: As the lift test pulls: a force of 1 N on 0.1 kg [m/s^2].
+GRAVITY: Final = 10.0
+_COLOURS: Final = {"hand": "0.36 0.45 0.58 1", "object": "0.87 0.45 0.2 1", "support": "0.75 0.75 0.72 1"}
+#: Attributes that name bodies, joints or actuators.
+_NAMING: Final = ("name", "body1", "body2", "joint", "joint1", "joint2", "target")
+
+
+def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
+    """Write `scene.xml`, which needs no other file, and `replay.py`, which plays and judges its grasps.
+
+    Args:
+        bundle: the grasps.
+        folder: where to write.
+        pieces: the object's convex pieces, as the referee has them.
+    """
+    found = bundle.found
+    folder.mkdir(parents=True, exist_ok=True)
+    supports = () if found.placed is None else found.placed.supports
+    physics = MujocoOptions()
+    scene = build(found.hand, found.obj, pieces, physics, supports)
+    spec = scene_spec(found.hand, found.obj, pieces, physics, supports)
+    spec.modelname = f"{plain_name(found.hand.name)} and {plain_name(found.obj.name)}"
+    tree = ElementTree.fromstring(spec.to_xml())
+    site = {"name": "object_frame", "pos": _text(-scene.centre), "size": "0.002", "group": "4"}
+    SubElement(_one(tree, ".//body[@name='object']"), "site", site)
+    _settle(tree, found)
+    _dress(tree, found)
+    _add_keys(tree, bundle, scene)
+    _rename(tree, _names(found.hand))
+    ElementTree.indent(tree)
+    file, script = folder / "scene.xml", folder / "replay.py"
+    file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
+    script.write_text(Path(__file__).with_name("replay.py").read_text())
+    return [file, script]
+
+
+def _settle(tree: Element, found: Executions) -> None:
+    """Supports stand still in the world; gravity as in the lift test: on the object alone."""
+    option = _one(tree, "option")
+    support = tree.find(".//body[@name='supports']")
+    if support is not None:
+        support.attrib.pop("mocap", None)
+    if found.placed is None:
+        option.set("gravity", "0 0 0")
+    else:
+        option.set("gravity", f"0 0 {-GRAVITY:g}")
+        for body in _one(tree, ".//body[@name='body0']").iter("body"):
+            body.set("gravcomp", "1")
+    flag = option.find("flag")
+    if flag is not None:
+        flag.attrib.pop("gravity", None)
+
+
+def _dress(tree: Element, found: Executions) -> None:
+    """Colours, light and a camera: nothing of it moves a body."""
+    for name, colour in (("body0", "hand"), ("object", "object"), ("supports", "support")):
+        for body in tree.findall(f".//body[@name='{name}']"):
+            for geom in body.iter("geom"):
+                geom.set("rgba", _COLOURS[colour])
+    world, size = _one(tree, "worldbody"), 2 * found.obj.radius + 0.3
+    middle = found.object_pose[0, :3]
+    world.insert(
+        0, Element("light", pos=_text(middle + np.array([0.5, -0.5, 2.0])), dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9")
+    )
+    visual = SubElement(tree, "visual")
+    SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.4 0.4 0.4")
+    SubElement(visual, "global", azimuth="130", elevation="-25", offwidth="1280", offheight="960")
+    SubElement(tree, "statistic", center=_text(middle), extent=_text([size]))
+
+
+def _add_keys(tree: Element, bundle: Bundle, scene: Scene) -> None:
+    keys = SubElement(tree, "keyframe")
+    for row in range(len(bundle.found)):
+        for posture in POSTURES:
+            name = f"{bundle.name(row)}/{posture}"
+            SubElement(keys, "key", {"name": name, **_key(bundle.found, scene, posture, row)})
+
+
+def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
+    """State and targets. A squeeze is only commanded: the fingers stand where the grasp has them."""
+    command = found.postures[posture]
+    stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command
+    pose = command.hand_pose[row]
+    qpos = np.zeros(scene.model.nq)
+    qpos[scene.joint_qpos] = stands.joint_positions[row]
+    qpos[scene.root_qpos : scene.root_qpos + 7] = pose
+    at = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
+    qpos[scene.object_qpos : scene.object_qpos + 7] = compose(at, np.array([*scene.centre, 1, 0, 0, 0]))
+    control = found.hand.reduce(command.joint_positions[row]) * scene.dof_gain + scene.dof_shift
+    return {"qpos": _text(qpos), "ctrl": _text(control), "mpos": _text(pose[:3]), "mquat": _text(pose[3:])}
+
+
+def _names(hand: HandModel) -> Mapping[str, str]:
+    """The hand's own names for those of the referee's model; `object`, `supports`, `root` and `mocap` are taken."""
+    taken = {"object", "supports", "root", "mocap", "world"}
+    found: dict[str, str] = {}
+    for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):
+        found |= {f"{prefix}{k}": name if name not in taken else f"hand_{name}" for k, name in names}
+    joints = zip(hand.joint_body, hand.joint_names, strict=True)
+    return found | {f"joint{b}": name if name not in taken else f"hand_{name}" for b, name in joints}
+
+
+def _rename(tree: Element, names: Mapping[str, str]) -> None:
+    for element in tree.iter():
+        if element.tag in ("mesh", "geom", "key", "site"):
+            continue
+        for attribute in _NAMING:
+            if element.get(attribute) in names:
+                element.set(attribute, names[element.attrib[attribute]])
+
+
+def _one(tree: Element, path: str) -> Element:
+    found = tree.find(path)
+    assert found is not None, path
+    return found
+
+
+def _text(values: Any) -> str:
+    return " ".join(f"{float(value):.12g}" for value in np.ravel(values))

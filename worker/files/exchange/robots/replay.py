@@ -1,0 +1,208 @@
+"""Replay exported grasps in MuJoCo and judge them: a script that needs mujoco and numpy, and nothing of graspd.
+
+    python replay.py scene.xml                 every grasp, a line each
+    python replay.py scene.xml --view [NAME]   watch one
+    python replay.py scene.xml --json
+
+Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must touch
+nothing while it comes, closes in 0.8 s, and then: where gravity pulls, it rises within 0.4 s and holds for 2 s; else
+the object is pushed with ten times its mass in newton in six directions for 2 s each. The object may end 5 cm and 15
+degrees from where it should be. Without --full a hold ends as soon as the object's present rates keep it there for 2 s.
+"""
+
+import argparse
+import json
+import math
+import time
+from typing import Any
+
+import mujoco
+import numpy as np
+
+STAGES, STAGE_S, HOLD_S, FIRST_LOOK_S, LOOK_S = 10, 0.04, 2.0, 0.08, 0.04
+MAX_MOVED_M, MAX_TURNED = 0.05, math.radians(15)
+MAX_DEPTH_M, OVERHANG_M, LOOKS = 0.010, 0.002, 20
+PUSHES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+
+
+class Replay:
+    """One scene, stepped grasp by grasp; `watch` is called after every step."""
+
+    def __init__(self, path: Any, full: bool = False, watch: Any = None) -> None:
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.data = mujoco.MjData(self.model)
+        self.full, self.watch = full, watch
+        self.object = self.model.body("object").id
+        self.at = int(self.model.jnt_qposadr[self.model.body("object").jntadr[0]])
+        owner = self.model.body_rootid[self.model.geom_bodyid]
+        self.of_object = owner == self.object
+        self.of_hand = owner == self.model.jnt_bodyid[self.model.joint("root").id]
+        self.falls = bool(np.linalg.norm(self.model.opt.gravity) > 0)
+        self.grasps: list[str] = []
+        for number in range(self.model.nkey):
+            name = self.model.key(number).name.partition("/")[0]
+            if name not in self.grasps:
+                self.grasps.append(name)
+
+    def key(self, grasp: str, posture: str) -> Any:
+        return self.model.key(f"{grasp}/{posture}")
+
+    def reset(self, grasp: str, posture: str) -> None:
+        mujoco.mj_resetDataKeyframe(self.model, self.data, self.key(grasp, posture).id)
+
+    def judge(self, grasp: str) -> str:
+        """What becomes of a grasp: `held`, or what went wrong."""
+        self.reset(grasp, "pregrasp")
+        start = self.data.qpos[self.at : self.at + 7].copy()
+        mujoco.mj_forward(self.model, self.data)
+        if self.deepest() > MAX_DEPTH_M:
+            return "penetration"
+        if self.touches(grasp):
+            return "touched on the way"
+        self.reset(grasp, "pregrasp")
+        self.move(grasp, "pregrasp", "grasp")
+        self.move(grasp, "grasp", "squeeze")
+        if self.falls:
+            self.move(grasp, "squeeze", "lift")
+            goal = start.copy()
+            goal[:3] += self.key(grasp, "lift").mpos[:3] - self.key(grasp, "squeeze").mpos[:3]
+            return self.hold(goal)
+        size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION)
+        closed = np.empty(size)
+        mujoco.mj_getState(self.model, self.data, closed, mujoco.mjtState.mjSTATE_INTEGRATION)
+        for push in PUSHES:
+            mujoco.mj_setState(self.model, self.data, closed, mujoco.mjtState.mjSTATE_INTEGRATION)
+            force = 10 * self.model.body_mass[self.object]
+            self.data.xfrc_applied[self.object, :3] = force * np.array(push)
+            if (found := self.hold(start)) != "held":
+                return f"{found} under a push {push}"
+        return "held"
+
+    def move(self, grasp: str, a: str, b: str) -> None:
+        """Command the way from one key frame's targets to another's."""
+        first, last = self.key(grasp, a), self.key(grasp, b)
+        for stage in range(1, STAGES + 1):
+            share = stage / STAGES
+            self.data.mocap_pos[0] = (1 - share) * first.mpos[:3] + share * last.mpos[:3]
+            self.data.mocap_quat[0] = slerp(first.mquat[:4], last.mquat[:4], share)
+            self.data.ctrl[:] = (1 - share) * first.ctrl + share * last.ctrl
+            self.run(STAGE_S)
+
+    def hold(self, goal: Any) -> str:
+        """As the referee holds: over as soon as the present rates keep the object in its limits until the end."""
+        self.run(FIRST_LOOK_S - LOOK_S)
+        elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
+        while elapsed < HOLD_S - 1e-9:
+            self.run(LOOK_S)
+            elapsed += LOOK_S
+            moved, turned = now = self.offset(goal)
+            if not np.linalg.norm(moved) < MAX_MOVED_M:
+                return "lost"
+            if not turned < MAX_TURNED:
+                return "turned"
+            more = (HOLD_S - elapsed) / LOOK_S
+            ahead = np.linalg.norm(moved + more * (moved - before[0]))
+            if not self.full and ahead < MAX_MOVED_M and turned + more * (turned - before[1]) < MAX_TURNED:
+                return "held"
+            before = now
+        return "held"
+
+    def offset(self, goal: Any) -> tuple[Any, float]:
+        """(3,) from where the object's own frame, the mesh's, should be [m], and how far it is turned [rad]."""
+        origin = self.model.site("object_frame").pos
+        now = self.data.qpos[self.at : self.at + 7]
+        places = []
+        for pose in (now, goal):
+            place = np.empty(3)
+            mujoco.mju_rotVecQuat(place, origin, pose[3:])
+            places.append(pose[:3] + place)
+        turn = np.empty(3)
+        mujoco.mju_subQuat(turn, now[3:], goal[3:])
+        return places[0] - places[1], float(np.linalg.norm(turn))
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / self.model.opt.timestep)):
+            mujoco.mj_step(self.model, self.data)
+            if self.watch:
+                self.watch(self)
+
+    def deepest(self) -> float:
+        return max((-contact.dist for contact in self.data.contact if self.hands(contact)), default=0.0)
+
+    def hands(self, contact: Any) -> bool:
+        return bool(self.of_hand[contact.geom].any())
+
+    def touches(self, grasp: str) -> bool:
+        """Whether the open hand on its way reaches into the object or anything else."""
+        for a, b in (("standoff", "arrival"), ("arrival", "pregrasp")):
+            first, last = self.key(grasp, a), self.key(grasp, b)
+            for look in range(LOOKS):
+                share = look / LOOKS
+                qpos = (1 - share) * first.qpos + share * last.qpos
+                root = self.model.jnt_qposadr[self.model.joint("root").id]
+                qpos[root + 3 : root + 7] = slerp(
+                    first.qpos[root + 3 : root + 7], last.qpos[root + 3 : root + 7], share
+                )
+                self.data.qpos[:] = qpos
+                mujoco.mj_kinematics(self.model, self.data)
+                mujoco.mj_collision(self.model, self.data)
+                if self.watch:
+                    self.watch(self)
+                for contact in self.data.contact:
+                    ours = self.of_hand[contact.geom]
+                    if not ours.any() or ours.all():
+                        continue
+                    allowed = OVERHANG_M if self.of_object[contact.geom].any() else 0.0
+                    if contact.dist < -allowed:
+                        return True
+        return False
+
+
+def slerp(a: Any, b: Any, share: float) -> Any:
+    """Quaternion a share of the way from a to b."""
+    b = b if a @ b >= 0 else -b
+    angle = math.acos(min(1.0, float(a @ b)))
+    if angle < 1e-6:
+        mixed = (1 - share) * a + share * b
+    else:
+        mixed = (math.sin((1 - share) * angle) * a + math.sin(share * angle) * b) / math.sin(angle)
+    return mixed / np.linalg.norm(mixed)
+
+
+def view(path: str, name: str) -> None:
+    """Play one grasp over and over in MuJoCo's own window."""
+    import mujoco.viewer
+
+    replay = Replay(path, full=True)
+    grasp = name or replay.grasps[0]
+    with mujoco.viewer.launch_passive(replay.model, replay.data) as window:
+
+        def watch(state: Any) -> None:
+            window.sync()
+            time.sleep(state.model.opt.timestep)
+
+        replay.watch = watch
+        while window.is_running():
+            replay.judge(grasp)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene")
+    parser.add_argument("--view", nargs="?", const="", help="watch a grasp, by default the first")
+    parser.add_argument("--full", action="store_true", help="hold for 2 s even where the end can be foreseen")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    if options.view is not None:
+        view(options.scene, options.view)
+        return
+    replay = Replay(options.scene, options.full)
+    found = {grasp: replay.judge(grasp) for grasp in replay.grasps}
+    if options.json:
+        print(json.dumps(found))
+    else:
+        print("\n".join(f"{grasp}: {what}" for grasp, what in found.items()))
+
+
+if __name__ == "__main__":
+    main()

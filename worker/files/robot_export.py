@@ -1,0 +1,128 @@
+"""From a shard to the files of a robot: chosen grasps, their ways and trajectories, written in one format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.store.shards import Shard, read_shard
+from worker.files.cases import load_case
+from worker.files.choice import choose
+from worker.files.exchange.robots.bundle import Bundle
+from worker.files.of_shard import hand_files_of_shard
+from worker.hands.description import Description, describe
+from worker.rendering.pages.sheets import best as best_of
+from worker.robots.execution import Executions, executions
+from worker.robots.frames import tool_frame
+from worker.robots.timing import ASSUMED_M_S, ASSUMED_RAD_S, Limits, Trajectory, hand_limits, straight_paths, timed
+
+FORMATS: Final = ("mujoco", "moveit", "isaac", "csv")
+#: Other names of formats.
+ALIASES: Final = {"urdf+yaml": "moveit"}
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a user asks for, as the command line has it."""
+
+    hand: str | None = None
+    obj: str | None = None
+    unjudged: bool = False
+    every: bool = False
+    best: int = 0
+    """At most so many, the best by epsilon first; 0: all, in the order of the shard."""
+    tool: str | None = None
+    speed: float = 0.5
+    """Share of the velocity limits that trajectories use."""
+
+
+@dataclass
+class Written:
+    """What came of an export."""
+
+    counts: dict[str, int]
+    notes: list[str] = field(default_factory=list)
+    """Lines for the user: what was assumed, what was left out and why."""
+
+
+def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path) -> Written:
+    """Write grasps of a base shard as a robot or its simulator reads them.
+
+    Raises:
+        InputError: unknown format, no such grasps, a tool frame that is none, no grasp that can be reached, or an extra
+            package that a format needs is absent.
+    """
+    format_ = ALIASES.get(format_, format_)
+    if format_ not in FORMATS:
+        raise InputError(f"there is no robot format {format_!r}; choose one of {', '.join(FORMATS)}")
+    if not 0 < wishes.speed <= 1:
+        raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
+    shard = read_shard(source, kind="base")
+    files = hand_files_of_shard(shard, wishes.hand)
+    description = describe(files.files, files.options)
+    written = Written({})
+    found = _found(source, shard, description, wishes, written)
+    limits = hand_limits(found.hand)
+    written.notes += _assumptions(limits)
+    found = found.take(np.arange(len(found))[: wishes.best or None])
+    bundle = Bundle(found, [_trajectory(found, row, limits, wishes.speed) for row in range(len(found))], description)
+    paths = _write(bundle, format_, folder, files.files)
+    written.counts = {"grasps": len(found), "files": len(paths)}
+    return written
+
+
+def _found(source: Path, shard: Shard, description: Description, wishes: Wishes, written: Written) -> Executions:
+    case = load_case(source, hand=wishes.hand, obj=wishes.obj)
+    mask, word = choose(shard, unjudged=wishes.unjudged, every=wishes.every)
+    rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
+    tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
+    found = executions(
+        case.hand, case.obj, case.grasps.take(rows), rows=rows, tool=tool, quality=_quality(shard, rows),
+        placed=None if case.placed is None else case.placed.take(rows),
+    )  # fmt: skip
+    if lost := len(rows) - len(found):
+        written.notes.append(f"{lost} of {len(rows)} {word} have no straight way of 10 cm free of the object: left out")
+    return found
+
+
+def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+    arrays = shard.arrays
+    success = np.asarray(arrays.get("quality/success", np.full(len(arrays["quality/valid"]), -1)))
+    thresholds = np.asarray(arrays["quality/thresholds_m"], float)
+    epsilon = np.asarray(arrays["quality/epsilon"], float)[:, int(np.argmin(np.abs(thresholds - 0.005)))]
+    return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon[rows]}
+
+
+def _trajectory(found: Executions, row: int, limits: Limits, speed: float) -> Trajectory:
+    return timed(straight_paths(found, row), found.hand.joint_names, limits.velocity, speed=speed)
+
+
+def _assumptions(limits: Limits) -> list[str]:
+    if not limits.assumed:
+        return []
+    names = ", ".join(limits.assumed[:3]) + (", ..." if len(limits.assumed) > 3 else "")
+    return [
+        f"{len(limits.assumed)} joints have no velocity limit ({names}): {ASSUMED_RAD_S:g} rad/s and {ASSUMED_M_S:g} "
+        "m/s were assumed"
+    ]
+
+
+def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, bytes]) -> list[Path]:
+    from worker.files.exchange.robots import isaac, moveit, mujoco_scene, tables
+
+    if format_ == "csv":
+        return tables.write(bundle, folder)
+    if format_ == "isaac":
+        return isaac.write(bundle, folder)
+    if format_ == "moveit":
+        return moveit.write(bundle, folder, hand_files)
+    if format_ == "mujoco":
+        from worker.quality.referee.decomposition import decompose
+
+        return mujoco_scene.write(bundle, folder, decompose(bundle.found.obj))
+    raise InputError(format_)

@@ -1,0 +1,152 @@
+"""Grasps ready to be carried out: six postures each, in one frame, and how the hand gets from one to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.transforms import IDENTITY_POSE, compose
+from worker.grasps import GraspSet, Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel
+from worker.objects.model import ObjectModel
+from worker.robots.frames import ToolFrame
+from worker.scenes.way import plan_free_way
+from worker.simulation.surroundings import STANDOFF_M, Placed
+
+#: Postures of a grasp in their order. The hand comes from `standoff` to `arrival` with open fingers, takes the shape of
+#: `pregrasp`, closes to `grasp`, is commanded to `squeeze`, and rises to `lift`.
+POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
+#: Motions from one posture to the next.
+PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
+
+
+@dataclass(frozen=True)
+class Executions:
+    """N grasps of one hand on one object with all their postures.
+
+    Poses stand in the frame named `frame`: the object's own, or the scene's (z up) where they were planned in one.
+    """
+
+    hand: HandModel
+    obj: ObjectModel
+    tool: ToolFrame
+    frame: str
+    rows: NDArray[np.intp]
+    """(N,) row of each grasp in its shard."""
+    object_pose: Floats
+    """(N, 7) the object at rest."""
+    postures: dict[str, Posture]
+    """The N postures of each of `POSTURES`; hand poses are those of the root link."""
+    placed: Placed | None
+    """The scene of each grasp, if they have one."""
+    quality: dict[str, NDArray[Any]]
+    """(N,) verdicts and metrics: valid, success, epsilon."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def scene_index(self) -> NDArray[np.intp]:
+        """(N,) number of each grasp's scene; 0 around a free object."""
+        return np.zeros(len(self), np.intp) if self.placed is None else self.placed.index
+
+    def tool_pose(self, posture: str) -> Floats:
+        """(N, 7) of the tool frame in a posture."""
+        return compose(self.postures[posture].hand_pose, self.tool.pose)
+
+    @property
+    def approach(self) -> Floats:
+        """(N, 3) unit vectors along which the hand comes."""
+        return self._direction("standoff", "arrival")
+
+    @property
+    def retreat(self) -> Floats:
+        """(N, 3) unit vectors along which the hand leaves with the object."""
+        return self._direction("squeeze", "lift")
+
+    def _direction(self, start: str, end: str) -> Floats:
+        way = self.postures[end].hand_pose[:, :3] - self.postures[start].hand_pose[:, :3]
+        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+
+    @property
+    def lifted_object_pose(self) -> Floats:
+        """(N, 7) the object after the lift, held as it was grasped."""
+        pose = np.array(self.object_pose, float)
+        pose[:, :3] += self.postures["lift"].hand_pose[:, :3] - self.postures["squeeze"].hand_pose[:, :3]
+        return pose
+
+    def take(self, rows: NDArray[np.intp]) -> Executions:
+        """Some of the grasps, in the order of `rows`."""
+        return replace(
+            self,
+            rows=self.rows[rows],
+            object_pose=self.object_pose[rows],
+            postures={name: part.take(rows) for name, part in self.postures.items()},
+            placed=None if self.placed is None else self.placed.take(rows),
+            quality={name: values[rows] for name, values in self.quality.items()},
+        )
+
+
+def executions(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    rows: NDArray[np.intp],
+    placed: Placed | None,
+    tool: ToolFrame,
+    quality: dict[str, NDArray[Any]],
+) -> Executions:
+    """Grasps with their ways: those they were planned with in their scene, or around a free object planned here.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        rows: (N,) their rows in the shard.
+        placed: the scene of each, None around a free object.
+        tool: the tool frame.
+        quality: (N,) columns that are handed on.
+
+    Returns:
+        Those that have a way. Around a free object it may be that no straight retreat of 10 cm is free of it.
+
+    Raises:
+        InputError: none has a way.
+    """
+    frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
+    free = np.ones(len(grasps), bool)
+    if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
+        way = plan_free_way(hand, obj, grasps)
+        free, coming = ~way.touching, way.open
+        ends, lift = (way.approach[:, 0], way.approach[:, -1]), way.lift
+    else:
+        frame, at = "scene", np.asarray(placed.object_pose, float)[placed.index]
+        coming, ends, lift = grasps.coming, (grasps.approach[:, 0], grasps.approach[:, -1]), grasps.lift
+    found = {
+        "standoff": Posture(ends[0], coming),
+        "arrival": Posture(ends[1], coming),
+        "pregrasp": grasps.pregrasp,
+        "grasp": grasps.grasp,
+        "squeeze": grasps.squeeze,
+        "lift": lift,
+    }
+    postures = {name: Posture(compose(at, part.hand_pose), part.joint_positions) for name, part in found.items()}
+    whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
+    if not free.any():
+        raise InputError(
+            f"none of {len(grasps)} grasps can be reached along a straight way of {100 * STANDOFF_M:.0f} cm that is "
+            "free of the object"
+        )
+    return whole.take(np.flatnonzero(free))
+
+
+def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
+    """(L, 7) poses of the hand's bodies in one posture of one grasp."""
+    part = found.postures[posture]
+    return np.asarray(body_poses(found.hand, part.hand_pose[row], part.joint_positions[row])[0])
