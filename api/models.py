@@ -87,6 +87,13 @@ class GraspQuery(BaseModel):
     object: str | None = Field(None, max_length=64)
     valid: bool | None = None
     success: bool | None = None
+    scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
+        None, description="kind of the scene it was planned in; any: whichever, but not free"
+    )
+    lift_hard: bool | None = Field(None, description="lifted at half the friction")
+    pushes_held: bool | None = Field(
+        None, description="planned in a scene, and holds against the six pushes without it"
+    )
     sort: OfferedName = "epsilon"
     order: Literal["asc", "desc"] = "desc"
 

@@ -24,10 +24,11 @@ from service.index.changes.rows import attempt_row, job_row, shard_row, task_row
 from service.index.changes.states import settle
 from service.index.database import upsert
 from service.index.index import Index
-from service.index.tables import METRICS, attempts, grasps, jobs, shards, tasks
+from service.index.tables import attempts, grasps, jobs, shards, tasks
 from service.model import names
 from service.model.digests import digest_json, job_id
 from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.model.metrics import Indexed, indexed
 from service.model.planning import PlannedTask, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
@@ -39,7 +40,9 @@ from service.store.store import Store, open_store
 _CHUNK: Final = 20_000
 #: Of a hundred jobs so many are in each state; the running ones are half done.
 _MIX: Final = {State.SUCCEEDED: 88, State.RUNNING: 4, State.QUEUED: 3, State.FAILED: 3, State.CANCELLED: 2}
-_SCALES: Final = dict(zip(METRICS, (0.25, 0.8, 9.0, 0.3, 0.8, 0.1, 0.05), strict=True))
+#: Metrics that every grasp has.
+_NAMES: Final = tuple(metric.name for metric in indexed(Indexed.SORTED) if not metric.optional)
+_SCALES: Final = dict(zip(_NAMES, (0.25, 0.8, 9.0, 0.3, 0.8, 0.1, 0.05), strict=True))
 
 
 def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 1000, seed: int = 0) -> dict[str, int]:

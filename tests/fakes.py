@@ -53,14 +53,20 @@ def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
         "quality/sound": np.ones(n),
         "quality/success": valid,
     }
+    if message.request.in_scene:
+        assert context.store.exists(names.shard_manifest(Stage.SCENE, message.inputs[0]))
+        quality |= {"quality/clearance_m": rng.random(n), "quality/lift_hard": valid, "quality/pushes": 1 - valid}
     return Output({**postures, **quality}, {"joint_names": ["a", "b"]})
 
 
 def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
     """A scene shard of as many rows as a real one would have."""
     _pretend_to_work(context)
-    assert context.store.exists(names.shard_manifest(Stage.SYNTHESIZE, message.inputs[0]))
     scenes, rows = message.request.scenes, message.request.scenes * message.count
+    if message.request.in_scene:
+        rows = 0
+    else:
+        assert context.store.exists(names.shard_manifest(Stage.SYNTHESIZE, message.inputs[0]))
     return Output(
         {
             "scene/object_pose": np.repeat(_POSE, scenes, axis=0),

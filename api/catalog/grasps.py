@@ -72,6 +72,9 @@ def grasp_filter(query: GraspQuery) -> GraspFilter:
         object=query.object,
         valid=query.valid,
         success=query.success,
+        scene=query.scene,
+        lift_hard=query.lift_hard,
+        pushes_held=query.pushes_held,
         at_least=bounds["min"],
         at_most=bounds["max"],
     )

@@ -21,6 +21,7 @@ from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.domain import AssetKind, State
 from service.model.errors import InputError
+from service.model.scene_spec import scene_option
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -47,7 +48,11 @@ def submit(
         str, typer.Option(help="With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest that meets it is taken.")
     ] = "",
     seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
-    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps.")] = 0,
+    scene: Annotated[
+        str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
+    ] = "free",
+    faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
+    scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps; 4 where a scene is named.")] = 0,
     views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
     stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
     width: Annotated[int, typer.Option(help="Picture width [px].")] = 320,
@@ -75,6 +80,8 @@ def submit(
                 "fidelity": fidelity,
                 "target": target,
                 "seed": seed,
+                "scene": scene_option(scene),
+                "faces": faces,
                 "scenes": scenes,
                 "views": views,
                 "stereo": stereo,

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from api.client.job_options import pairs, validated
 from service.model.domain import JobOptions, Name
 from service.model.errors import InputError
+from service.model.scene_spec import scene_option
 
 SpecOption = Annotated[
     Path | None, typer.Option("--spec", help="TOML or JSON file that says it; options go over what it says.")
@@ -73,6 +74,8 @@ def wanted(
     given = {key: value for key, value in options.items() if value is not False}  # a flag that was not set
     if "options" in given:
         given["options"] = pairs(given["options"])
+    if "scene" in given:
+        given["scene"] = scene_option(given["scene"])
     said = read_spec(spec) if spec is not None else {}
     total = None if "grasps" in given else said.pop("total_grasps", None)
     said.pop("total_grasps", None)
@@ -99,6 +102,8 @@ def read_spec(file: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")
     try:
+        if isinstance(found.get("scene"), str):
+            found["scene"] = scene_option(found["scene"], beside=file.parent)
         spec: Spec = validated(Spec, found)
     except InputError as error:
         raise InputError(f"{file}: {str(error).removeprefix('--')}") from None

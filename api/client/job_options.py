@@ -22,6 +22,8 @@ _HELP: Final = {
     "target": "With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; for each cell the cheapest that meets it is taken.",
     "method": "Planner.",
     "seed": "The same seed gives the same grasps.",
+    "scene": "Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.",
+    "faces": "In a scene: drawn, as drops fall, or all, a scene for each stable face.",
 }
 _SHORT: Final = {"grasps": "-n"}
 _FLAGS: Final = {"options": "--option"}

@@ -22,7 +22,8 @@ router = APIRouter(include_in_schema=False)
 
 DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
-    "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240, "want": "valid", "referee": "certificate",
+    "scene": "free", "faces": "drawn", "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240,
+    "want": "valid", "referee": "certificate",
 }  # fmt: skip
 
 
@@ -105,7 +106,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
 def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
-        # A rule over several fields has no place of its own; the only one says that views need scenes.
+        # A rule over several fields has no place of its own; those that a form can break are about scenes.
         name = str(entry["loc"][0]) if entry["loc"] else "scenes"
         errors.setdefault(name, entry["msg"].removeprefix("Value error, "))
     return errors

@@ -21,6 +21,10 @@ class GraspFilter(Model):
     shard: str | None = None
     valid: bool | None = None
     success: bool | None = None
+    scene: str | None = None
+    """Kind of the scene that it was planned in; any: whichever, but not free."""
+    lift_hard: bool | None = None
+    pushes_held: bool | None = None
     at_least: dict[Metric, float] = Field(default_factory=dict)
     at_most: dict[Metric, float] = Field(default_factory=dict)
 

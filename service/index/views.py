@@ -114,7 +114,8 @@ class ShardView(View):
     sha256: str
     size_bytes: int
     count: int = Field(
-        description="grasps of a base shard, transferred grasps of a scene shard, pictures of a view shard"
+        description="grasps of a base shard; transferred grasps of a scene shard, or its scenes where these come "
+        "first; pictures of a view shard"
     )
     hand: str
     object: str
@@ -141,6 +142,11 @@ class GraspView(View):
     valid: bool
     success: bool | None = Field(description="verdict of the referee; None: not tested")
     verdict_level: str | None = Field(description="level of the referee that gave it")
+    scene_kind: str = Field("free", description="kind of the scene it was planned in; free: around a floating object")
+    lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction; None: not tested")
+    pushes_held: bool | None = Field(
+        None, description="in a scene: held against the six pushes without it; None: not tested"
+    )
     created: str
 
     if TYPE_CHECKING:

@@ -67,7 +67,7 @@ def shard_id(
 ) -> str:
     """Address of the shard that a stage makes of its inputs.
 
-    Only what moves the result enters: scenes do not change the grasps, views do not change the scenes.
+    Only what moves the result enters: scenes after the grasps do not change them, views do not change the scenes.
     """
     inputs_of: dict[str, object] = {
         "stage": stage,
@@ -90,6 +90,9 @@ def shard_id(
         }
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
+        if request.in_scene:
+            # Made before the grasps, of the object as they meet it.
+            inputs_of |= {"scene": request.place.model_dump(mode="json"), "face_error_m": request.knobs.face_error_m}
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
     return digest_json(inputs_of)

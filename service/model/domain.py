@@ -6,9 +6,11 @@ Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: positio
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from service.model.scene_spec import SceneOption, SceneSpec, scene_of
 
 BATCH_SIZE: Final = 32
 #: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
@@ -124,6 +126,12 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
     return FIDELITIES[value]
 
 
+#: Methods of graspd's own that know no scene; what those of other packages know, a worker tells.
+FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
+#: Scenes of a batch that is planned in scenes, where the request does not say how many.
+SCENES: Final = 4
+
+
 class JobOptions(Model):
     """What a job says besides its hand and object: how many grasps, how made, with which scenes and views."""
 
@@ -131,6 +139,19 @@ class JobOptions(Model):
     method: Name = "fast_graspd"
     fidelity: str | Fidelity = "standard"
     seed: int = Field(0, ge=0, lt=2**31)
+    # What is left at its default stays out of every document, so that ids and records of jobs without it stay.
+    scene: SceneOption = Field(
+        "free",
+        exclude_if=lambda value: value == "free",
+        description="where the grasps are used: free (around an object that floats), table, bin, shelf, or a document "
+        "with supports. If not free they are planned, judged and rendered there, and `grasps` counts those valid there",
+    )
+    faces: Literal["drawn", "all"] = Field(
+        "drawn",
+        exclude_if=lambda value: value == "drawn",
+        description="faces that the object lies on in its scenes. drawn: as often as drops end on them; all: one scene "
+        "for each stable face, whatever `scenes` says",
+    )
     scenes: int = Field(0, ge=0, le=64, description="scenes per batch of grasps")
     views: int = Field(0, ge=0, le=256, description="camera placements per scene")
     stereo: bool = Field(False, description="a left and a right picture per placement instead of one")
@@ -187,6 +208,23 @@ class JobOptions(Model):
             raise ValueError("a target goes with fidelity auto")
         return self
 
+    @model_validator(mode="before")
+    @classmethod
+    def _some_scenes(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("scene", "free") != "free" and data.get("scenes", 0) in (0, "0", ""):
+            return {**data, "scenes": SCENES}
+        return data
+
+    @model_validator(mode="after")
+    def _planned_in_its_scene(self) -> Self:
+        if self.place.kind == "free":
+            return self
+        if self.method in FREE_ONLY_METHODS:
+            raise ValueError(f"method {self.method} plans around free objects only: with a scene take fast_graspd")
+        if self.robustness:
+            raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
+        return self
+
     @model_validator(mode="after")
     def _views_need_scenes(self) -> Self:
         if self.views and not self.scenes:
@@ -198,6 +236,16 @@ class JobOptions(Model):
         if self.robustness and self.referee == "none":
             raise ValueError("robustness counts verdicts: choose a referee")
         return self
+
+    @property
+    def place(self) -> SceneSpec:
+        """The scene."""
+        return scene_of(self.scene, faces=self.faces)
+
+    @property
+    def in_scene(self) -> bool:
+        """Whether grasps are planned in the scene they are for; else they may be put into scenes afterwards."""
+        return self.scene != "free"
 
     @property
     def knobs(self) -> Fidelity:

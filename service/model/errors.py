@@ -6,6 +6,7 @@
     │   ├── ConflictError         the request clashes with what is there: exit 2, HTTP 409
     │   ├── MeshError             an object mesh that cannot be used
     │   ├── HandError             a hand description that cannot be used
+    │   ├── SceneError            a scene without room, or in which no grasp can be found
     │   ├── LimitError            too large, too many: exit 2, HTTP 413
     │   └── QuotaError            the key has all it may have: exit 2, HTTP 429
     ├── UnavailableError          a part of the service does not answer: exit 1, HTTP 503
@@ -67,6 +68,12 @@ class HandError(InputError):
     """A hand description that cannot be read or used."""
 
     slug, title = "bad-hand", "The hand cannot be used"
+
+
+class SceneError(InputError):
+    """A scene that the object does not fit in, or in which no grasp is found."""
+
+    slug, title = "bad-scene", "The scene cannot be used"
 
 
 class LimitError(InputError):
@@ -161,8 +168,8 @@ class TaskRefused(TaskError):
 ERRORS: Final[dict[str, type[GraspdError]]] = {
     error.slug: error
     for error in (
-        InputError, NotFoundError, ConflictError, MeshError, HandError, LimitError, QuotaError, UnavailableError,
-        QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError, DamagedError,
-        DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
+        InputError, NotFoundError, ConflictError, MeshError, HandError, SceneError, LimitError, QuotaError,
+        UnavailableError, QueueUnavailable, StoreUnavailable, IndexUnavailable, IndexDamaged, RateError, BusyError,
+        DamagedError, DamagedShard, TaskError, TaskCancelled, TaskRefused, GraspdError,
     )
 }  # fmt: skip

@@ -119,6 +119,11 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         bounds=(0, 1), digits=2, plot="whole",
     ),
     GraspMetric(
+        "clearance_m", "m", "least distance of the hand from supports: coming, closing and lifting",
+        title="Clearance in its scene", short="Clearance", optional=True, indexed=Indexed.OFFERED,
+        bounds=(-1, 1), digits=4,
+    ),
+    GraspMetric(
         "contact_links", "1", "hand bodies within 2 mm of the object", title="Links in contact", whole=True,
         indexed=Indexed.KEPT, digits=0,
     ),

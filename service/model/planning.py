@@ -1,6 +1,7 @@
 """From a job to its tasks, and from what is known of the tasks to their states. Pure functions: no store, no clock.
 
-A job is cut into batches of `BATCH_SIZE` grasps; each batch is a chain synthesize -> scene -> render, as far as asked.
+A job is cut into batches of `BATCH_SIZE` grasps; each batch is a chain of stages, as far as asked: synthesize -> scene
+-> render, or where grasps are planned in scenes, scene -> synthesize -> render.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ from service.model.domain import (
 from service.model.records import JobRecord
 from service.model.version import TASK_SCHEMA
 
-#: Order of the stages within a batch.
-CHAIN: Final = (Stage.SYNTHESIZE, Stage.SCENE, Stage.RENDER)
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
@@ -68,8 +67,11 @@ def lane_of(request: JobRequest) -> Lane:
 
 
 def stages_of(request: JobOptions) -> tuple[Stage, ...]:
-    """The stages each batch of the job passes through."""
-    return CHAIN[: 1 + bool(request.scenes) + bool(request.views)]
+    """The stages each batch of the job passes through, in their order."""
+    render = (Stage.RENDER,) if request.views else ()
+    if request.in_scene:
+        return (Stage.SCENE, Stage.SYNTHESIZE, *render)
+    return (Stage.SYNTHESIZE, *((Stage.SCENE,) if request.scenes else ()), *render)
 
 
 def task_id(job: str, stage: Stage, batch: int) -> str:

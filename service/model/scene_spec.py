@@ -1,4 +1,4 @@
-"""The scene that grasps are for, as a user says it: a kind, or a file of supports and the target's pose.
+"""The scene that grasps are for, as a user says it: a kind, or a document of supports and the target's pose.
 
 The scene frame has z up. A support is a half-space (everything below a plane) or a box.
 """
@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from service.model.errors import InputError
 
@@ -65,11 +65,42 @@ class Box(_Part):
         return self
 
 
+Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
+
+
+class SceneDocument(_Part):
+    """A scene that a request holds whole."""
+
+    supports: Supports = Field(
+        min_length=1, max_length=MOST_SUPPORTS, description="what the object stands on and among, scene frame, z up [m]"
+    )
+    target: Pose | None = Field(
+        None, description="frame of the object in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
+    )
+
+    @model_validator(mode="after")
+    def _turned(self) -> Self:
+        if self.target is not None:
+            _check_quaternion(self.target)
+        return self
+
+
+def _form(value: object) -> str:
+    return "document" if isinstance(value, dict | SceneDocument) else "kind"
+
+
+#: A scene as a request says it: a kind, or a document. One of two forms, so that a mistake is told of the one meant.
+SceneOption = Annotated[
+    Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
+    Discriminator(_form),
+]
+
+
 class SceneSpec(_Part):
     """What stands around the object."""
 
     kind: SceneKind = "free"
-    supports: tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...] = Field((), max_length=MOST_SUPPORTS)
+    supports: Supports = Field((), max_length=MOST_SUPPORTS)
     """Only with kind `file`."""
     target: Pose | None = None
     """Frame of the object in the scene; None: it is dropped onto the support under it."""
@@ -89,6 +120,36 @@ class SceneSpec(_Part):
             if self.faces == "all":
                 raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
         return self
+
+
+def scene_of(option: str | SceneDocument, *, faces: Literal["drawn", "all"] = "drawn") -> SceneSpec:
+    """The scene that a request means.
+
+    Raises:
+        ValueError: the faces do not go with it, in one line.
+    """
+    try:
+        if isinstance(option, SceneDocument):
+            return SceneSpec(kind="file", supports=option.supports, target=option.target, faces=faces)
+        return SceneSpec(kind=option, faces=faces)
+    except ValidationError as error:
+        raise ValueError(_first(error)) from None
+
+
+def scene_option(text: str, *, beside: Path | None = None) -> str | dict[str, Any]:
+    """What a request says for a scene that a user names: the kind, or the document in a file.
+
+    Args:
+        text: one of `KINDS`, or a JSON or YAML file.
+        beside: folder in which the file lies; None: this one.
+
+    Raises:
+        InputError: as `parse_scene`.
+    """
+    if text in KINDS:
+        return text
+    path = Path(text) if beside is None else beside / text
+    return parse_scene(str(path)).model_dump(mode="json", include={"supports", "target"}, exclude_none=True)
 
 
 def parse_scene(text: str, *, faces: str = "drawn") -> SceneSpec:
@@ -144,8 +205,8 @@ def _first(error: ValidationError | TypeError) -> str:
     if isinstance(error, TypeError):
         return str(error)
     one = error.errors()[0]
-    place = ".".join(str(part) for part in one["loc"])
-    return f"{place}: {one['msg']}" if place else str(one["msg"])
+    place, words = ".".join(str(part) for part in one["loc"]), one["msg"].removeprefix("Value error, ")
+    return f"{place}: {words}" if place else words
 
 
 def _check_quaternion(pose: tuple[float, ...]) -> None:

@@ -96,7 +96,8 @@ class Pictures(Sequence[dict[str, Any]]):
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
-            scene_shard = str(opened.attrs["scene_shard"])
+            # Grasps that were planned in their scenes bring these along in their base shard.
+            scene_shard = str(opened.attrs.get("base_shard") or opened.attrs["scene_shard"])
             if absent := [name for name in self.columns if name not in opened]:
                 raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")
         held = self._scenes_of(scene_shard)
@@ -113,22 +114,27 @@ class Pictures(Sequence[dict[str, Any]]):
 
 
 class _Scenes:
-    """The scenes of one scene shard with their grasps."""
+    """The scenes of one shard with their grasps: of a scene shard, or of a base shard with grasps planned in scenes."""
 
     def __init__(
         self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool, valid: bool, unjudged: bool
     ) -> None:
-        scene = read_shard(shards.path(shards.by_id(shard)), kind="scene")
-        self._base_id = str(scene.attributes["base_shard"])
-        base = read_shard(shards.path(shards.by_id(self._base_id)), kind="base")
-        mask = np.asarray(scene["grasp/valid"]) == 1 if clear else np.ones(len(scene["grasp/valid"]), bool)
+        file = shards.by_id(shard)
+        scenes = read_shard(shards.path(file), kind=file.kind)
+        planned = file.kind == "base"
+        self._base_id = shard if planned else str(scenes.attributes["base_shard"])
+        base = scenes if planned else read_shard(shards.path(shards.by_id(self._base_id)), kind="base")
+        self._object = np.asarray(scenes["scene/object_pose"], float)
+        scene = np.asarray(scenes["grasp/scene_index"])
+        row = np.arange(len(scene)) if planned else np.asarray(scenes["grasp/base_index"])
+        free = np.asarray(base["quality/success"]) >= 0 if planned else np.asarray(scenes["grasp/valid"]) == 1
+        mask = free if clear else np.ones(len(scene), bool)
         if valid or unjudged:
-            mask &= standing.chosen(base.arrays, unjudged=unjudged)[np.asarray(scene["grasp/base_index"])]
+            mask = mask & standing.chosen(base.arrays, unjudged=unjudged)[row]
         kept = np.flatnonzero(mask)
-        self._scene = np.asarray(scene["grasp/scene_index"])[kept]
-        self._row = np.asarray(scene["grasp/base_index"])[kept]
-        self._pose = np.asarray(scene["grasp/hand_pose"], float)[kept]
-        self._object = np.asarray(scene["scene/object_pose"], float)
+        self._scene, self._row = scene[kept], row[kept]
+        pose = np.asarray(scenes["grasp/hand_pose"], float)[kept]
+        self._pose = transforms.compose(self._object[self._scene], pose) if planned else pose
         self._columns = {
             name: np.asarray(base[name])[self._row]
             for name in ("grasp/joint_positions", *quality)

@@ -63,11 +63,15 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
         "digest of all that its verdicts follow from; verdicts of different keys must not be mixed in one number",
         _BASE,
     ),
-    "scene": RootAttribute("text", "where the grasps were planned, if not around a free object, as JSON", _BASE),
+    "scene": RootAttribute(
+        "text", "where the grasps were planned, if not around a free object, as JSON", ("base", "scene", "views")
+    ),
     "source": RootAttribute("text", "imported grasps: an address or a citation", _BASE),
     "licence": RootAttribute("text", "imported grasps: the terms on which they may be used", _BASE),
-    "base_shard": RootAttribute("text", "the shard whose grasps were carried over", ("scene",)),
-    "scene_shard": RootAttribute("text", "the shard whose scenes are shown", ("views",)),
+    "base_shard": RootAttribute(
+        "text", "the shard whose grasps were carried over, or were planned in the scenes that are shown", _SCENES
+    ),
+    "scene_shard": RootAttribute("text", "the shard whose scenes are shown, or hold the grasps", ("base", "views")),
     "neighbours": RootAttribute("texts", "names of the objects beside it", _SCENES),
     "neighbour_digests": RootAttribute("texts", "digests of their files", _SCENES),
     "neighbour_sources": RootAttribute("texts", "where a command of this machine read them; empty: built in", _SCENES),

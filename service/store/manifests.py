@@ -36,6 +36,8 @@ class GraspSummary(BaseModel):
     valid: bool
     success: bool | None = None
     verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
+    lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction")
+    pushes_held: bool | None = Field(None, description="in a scene: held against the six pushes without it")
 
 
 class ShardManifest(BaseModel):
@@ -90,8 +92,9 @@ class ShardManifest(BaseModel):
 
     @property
     def count(self) -> int:
-        """Rows that matter to a reader: grasps, transferred grasps or pictures."""
-        return self.counts.get({"base": "N", "scene": "K", "views": "V"}[self.kind], 0)
+        """Rows that matter to a reader: grasps; transferred grasps, or scenes to plan grasps in; pictures."""
+        scenes = "S" if self.request.in_scene else "K"
+        return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
 
 
 def manifest_of(
@@ -165,6 +168,8 @@ def summarise(
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
     level = (attributes or {}).get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
+    for name, path in (("lift_hard", "quality/lift_hard"), ("pushes_held", "quality/pushes")):
+        columns[name] = [_verdict(int(v)) for v in arrays.get(path, np.full(count, -1))]
     rows = zip(*columns.values(), strict=True)
     return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)
 

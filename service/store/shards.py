@@ -139,14 +139,6 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "N J", "f8", "rad or m", "joint", "joints of the open hand that comes, order in joint_names", optional=True
         ),
         "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
-        "quality/clearance_m": Column(
-            "N",
-            "f8",
-            "m",
-            "scene",
-            "least distance of the hand from supports: coming, closing and lifting",
-            optional=True,
-        ),
         "quality/lift_outcome": Column(
             "N",
             "u1",

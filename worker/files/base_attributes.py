@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from service.model.domain import JobOptions
 from service.store.attributes import Attribute
+from service.store.shards import json_attribute
 from worker.hands.model import HandModel
 
 
 def base_attributes(
     hand: HandModel, request: JobOptions, *, tried: int, verdict_key: str | None
 ) -> dict[str, Attribute]:
-    """The hand's joints, what was asked for, how many grasps were tried, and who judged them.
+    """The hand's joints, what was asked for, in which scene, how many grasps were tried, and who judged them.
 
     Args:
         hand: the hand.
-        request: friction, want and referee.
+        request: friction, want, referee and scene.
         tried: grasps tried until the last one kept.
         verdict_key: digest of the terms of the verdicts; None: nobody judged.
     """
@@ -25,6 +26,8 @@ def base_attributes(
         "want": request.want,
         "tried": tried,
     }
+    if request.in_scene:
+        said["scene"] = json_attribute(request.place.model_dump(mode="json"))
     if verdict_key is None:
         return said | {"verdict_level": "none"}
     return said | {"verdict_level": request.referee, "verdict_key": verdict_key}

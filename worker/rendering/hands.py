@@ -27,7 +27,7 @@ class DrawnHand:
 
     hand: HandModel
     grasp: NDArray[np.int32]
-    """(S,) row of the grasp in the scene shard; -1: this scene shows no hand."""
+    """(S,) row of the grasp in the scene shard (in the base shard, where it was planned in its scene); -1: no hand."""
     hand_pose: Floats
     """(S, 7) root link in the table frame; ignored where there is no grasp."""
     joint_positions: Floats

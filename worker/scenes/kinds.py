@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.errors import InputError
+from service.model.errors import SceneError
 from service.model.scene_kinds import BIN_SIZE, SHELF_SIZE, supports_in
 from service.model.scene_spec import Box, SceneSpec
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
@@ -41,7 +41,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
 
     Raises:
-        InputError: the object does not fit between the supports, or stands in one.
+        SceneError: the object does not fit between the supports, or stands in one.
         MeshError: it never comes to rest.
     """
     if spec.target is not None:
@@ -91,14 +91,14 @@ def _inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.r
     """The pose moved to a random place within a rectangle of x by y [m] about the origin.
 
     Raises:
-        InputError: the object is too large for it.
+        SceneError: the object is too large for it.
     """
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP
     if (high - low > 2 * room).any():
         need, have = 1e3 * (high - low), 1e3 * 2 * room
-        raise InputError(
+        raise SceneError(
             f"{obj.name} lies {need[0]:.0f} x {need[1]:.0f} mm and there is room for {have[0]:.0f} x {have[1]:.0f} mm "
             "between the walls; choose scene table, or a file with larger supports"
         )
@@ -111,7 +111,7 @@ def _check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...])
         for number, support in enumerate(supports):
             depth = -float(support.distance(corners).min())
             if depth > SUNK:
-                raise InputError(
+                raise SceneError(
                     f"{obj.name} stands {1e3 * depth:.1f} mm deep in support {number} of its scene; move the target or "
                     "the support"
                 )

@@ -1,32 +1,60 @@
-"""From a scene shard to pictures of it: a views shard."""
+"""From scenes to pictures of them: a views shard."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from service.model.domain import Stage, TaskMessage
+from service.model.scene_kinds import supports_in
+from service.model.transforms import compose
+from service.store import standing
+from service.store.attributes import Attribute
 from service.store.manifests import load_shard
+from service.store.shards import Shard, json_attribute
 from worker.rendering import Extras, render
-from worker.stages.assets import object_of
+from worker.rendering.hands import DrawnHand
+from worker.rendering.pages.sheets import best_in_scenes
+from worker.stages.assets import hand_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Render `request.views` camera placements of each scene."""
-    scene = load_shard(context.store, Stage.SCENE, message.inputs[0])
-    obj = object_of(context.store, message)
-    context.check()
+    """Render `request.views` camera placements of each scene, with the hand too where grasps were planned in them."""
     request = message.request
+    stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
+    shard = load_shard(context.store, stage, message.inputs[0])
+    obj = object_of(context.store, message)
+    said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
+    extras = Extras(channels=request.channels)
+    if request.in_scene:
+        drawn = _drawn(shard, message, context)
+        extras = Extras(channels=request.channels, supports=supports_in(request.place), drawn=drawn)
+        said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.model_dump(mode="json"))}
+    context.check()
     pictures = render(
         obj,
-        np.asarray(scene["scene/object_pose"], float),
+        np.asarray(shard["scene/object_pose"], float),
         views=request.views,
         stereo=request.stereo,
         width=request.width,
         height=request.height,
         seed=batch_seed(message),
         run=context.run.part(0.0, 1.0),
-        extras=Extras(channels=request.channels),
+        extras=extras,
     )
-    return Output(pictures, {"scene_shard": message.inputs[0]})
+    return Output(pictures, said)
+
+
+def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
+    """The best valid grasp of each scene; None where there is no grasp at all."""
+    hand = hand_of(context.store, message)
+    among = standing.chosen(base.arrays, unjudged=message.request.referee == "none")
+    rows = best_in_scenes(base.arrays, among)
+    if not len(among):
+        return None
+    poses = np.asarray(base["scene/object_pose"], float)
+    return DrawnHand(
+        hand, rows, compose(poses, np.asarray(base["grasp/hand_pose"], float)[rows]),
+        np.asarray(base["grasp/joint_positions"], float)[rows],
+    )  # fmt: skip

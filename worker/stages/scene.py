@@ -1,21 +1,63 @@
-"""From a base shard to scenes: the object at rest on a table, and each grasp's clearance there."""
+"""Scenes: before the grasps where these are planned in them, else after, with each grasp's clearance there."""
 
 from __future__ import annotations
 
+from typing import Any, Final
+
 import numpy as np
+from numpy.typing import NDArray
 
 from service.model.domain import Stage, TaskMessage
+from service.model.errors import MeshError, SceneError
 from service.store.attributes import Attribute
 from service.store.manifests import load_shard
+from service.store.shards import json_attribute
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
 from worker.scenes.clearance import count_rejections
+from worker.scenes.kinds import rest_poses
 from worker.stages.assets import hand_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output, batch_seed
 
+#: Columns of carried-over grasps in a shard of scenes that grasps are yet to be planned in.
+_NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
+    "grasp/base_index": np.zeros(0, np.int32),
+    "grasp/scene_index": np.zeros(0, np.int32),
+    "grasp/hand_pose": np.zeros((0, 7)),
+    "grasp/table_clearance_m": np.zeros(0),
+    "grasp/valid": np.zeros(0, np.uint8),
+}
+
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
+    """The scenes of a batch."""
+    return _before_grasps(message, context) if message.request.in_scene else _after_grasps(message, context)
+
+
+def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
+    """Lay the object into `request.scenes` scenes.
+
+    Raises:
+        SceneError: it does not fit in, or does not come to rest.
+    """
+    hand, obj = hand_of(context.store, message), object_of(context.store, message)
+    context.check()
+    context.progress(0.0, 1.0, "scenes")
+    place = message.request.place
+    # The first batch has the scenes of `graspd synth` with the same seed.
+    seed = batch_seed(message) if message.batch else message.request.seed
+    try:
+        scenes = rest_poses(place, obj, count=message.request.scenes, seed=seed)
+    except MeshError as error:
+        raise SceneError(str(error)) from None
+    said: dict[str, Attribute] = {
+        "scene": json_attribute(place.model_dump(mode="json")), "root_link": hand.root_link,
+    }  # fmt: skip
+    return Output({**scenes, **_NO_GRASPS}, said)
+
+
+def _after_grasps(message: TaskMessage, context: TaskContext) -> Output:
     """Drop the object `request.scenes` times and carry the grasps of the base shard over."""
     base = load_shard(context.store, Stage.SYNTHESIZE, message.inputs[0])
     hand, obj = hand_of(context.store, message), object_of(context.store, message)

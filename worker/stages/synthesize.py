@@ -3,34 +3,88 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
-from service.model.domain import TaskMessage
-from worker.certified import certified_grasps
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.domain import Stage, TaskMessage
+from service.model.errors import InputError, SceneError
+from service.store.attributes import Attribute
+from service.store.manifests import load_shard
+from worker.certified import Certified, certified_grasps
 from worker.files.base_attributes import base_attributes
+from worker.planners import planner
+from worker.scenes.kinds import supports_of
+from worker.simulation.surroundings import Scenes
 from worker.stages.assets import hand_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output
 from worker.stages.pieces import pieces_of
 
+#: Columns of the scene shard that stand in the base shard as well: so it can be used by itself.
+_OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability")
+
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Grasps of one batch with quality and verdict: `message.count` valid ones, as far as the job's budget goes."""
+    """Grasps of one batch with quality and verdict: `message.count` valid ones, as far as the job's budget goes.
+
+    Raises:
+        SceneError: no hand can reach into the scenes, a job's first batch finds no grasp, or its method knows none.
+    """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
+    columns = _scene_columns(message, context)
+    scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"]) if columns else None
     context.check()
-    found = certified_grasps(
-        hand,
-        obj,
-        message.request,
-        count=message.count,
-        batch=message.batch,
-        pieces=lambda prepared: pieces_of(context.store, prepared),
-        run=context.run,
-    )
+    try:
+        found = certified_grasps(
+            hand,
+            obj,
+            message.request,
+            count=message.count,
+            batch=message.batch,
+            scenes=scenes,
+            pieces=lambda prepared: pieces_of(context.store, prepared),
+            run=context.run,
+        )
+    except InputError as error:
+        # Of hand and object there are errors of their own; what is left is that no hand finds a way in.
+        if scenes is not None and type(error) is InputError:
+            raise SceneError(str(error)) from None
+        raise
+    if scenes is not None and message.batch == 0:
+        _check_hope(message, found)
     seconds = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
-    info = {**seconds, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}
+    shares = {name: round(value, 4) for name, value in found.shares.items()}
+    info = {**seconds, **shares, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}
     said = base_attributes(hand, message.request, tried=found.tried, verdict_key=found.verdict_key)
-    return Output({**found.grasps.to_columns(), **found.columns}, said, info)
+    of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes is not None else {}
+    return Output({**found.grasps.to_columns(), **found.columns, **columns}, {**said, **of_scenes}, info)
+
+
+def _scene_columns(message: TaskMessage, context: TaskContext) -> dict[str, NDArray[Any]]:
+    """Where the object stands in the scenes of the batch; nothing where it floats."""
+    request = message.request
+    if not request.in_scene:
+        return {}
+    try:
+        planner(request.method, request.options, in_scenes=True)
+    except InputError as error:
+        raise SceneError(str(error)) from None
+    shard = load_shard(context.store, Stage.SCENE, message.inputs[0])
+    return {name: np.asarray(shard[name], float) for name in _OF_SCENES}
+
+
+def _check_hope(message: TaskMessage, found: Certified) -> None:
+    """What the first batch does not find at all, the others of its job are not made to look for."""
+    request = message.request
+    if request.want == "raw" or len(found.grasps):
+        return
+    lost = ", ".join(f"{number} {name}" for name, number in found.rejected.items() if number)
+    raise SceneError(
+        f"none of {found.planned} grasps tried is {request.counted} in its scene ({request.place.kind}): {lost}; give "
+        f"a larger budget than {request.budget:g} tries for each grasp, or another pose, scene, hand or seed"
+    )
 
 
 def _json(info: dict[str, object]) -> dict[str, object]:

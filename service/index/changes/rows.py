@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from service.model.domain import Asset, State
-from service.model.planning import CHAIN, plan
+from service.model.planning import plan, stages_of
 from service.model.records import AttemptRecord, JobRecord
 from service.store.manifests import ShardManifest
 
@@ -41,13 +41,14 @@ def job_row(record: JobRecord) -> Row:
 
 def task_rows(record: JobRecord) -> Iterator[Row]:
     """The tasks of a job before anything happened to them."""
+    order = stages_of(record.request)
     for task in plan(record):
         yield {
             "id": task.id,
             "job_id": record.id,
             "stage": task.stage.value,
             "batch": task.batch,
-            "position": CHAIN.index(task.stage),
+            "position": order.index(task.stage),
             "count": task.count,
             "lane": record.lane.value,
             "inputs": list(task.inputs),
@@ -129,6 +130,7 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
         "shard_id": manifest.shard_id,
         "hand": manifest.hand,
         "object": manifest.object,
+        "scene_kind": manifest.request.place.kind,
         "created": manifest.created,
     }
     return [of_shard | {"row": row} | grasp.model_dump() for row, grasp in enumerate(manifest.grasps)]

@@ -6,10 +6,11 @@ from collections.abc import Collection, Sequence
 from itertools import groupby
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, exists, func, select, update
+from sqlalchemy import ColumnElement, Connection, bindparam, exists, func, select, update
 
-from service.index.tables import jobs, tasks
+from service.index.tables import attempts, jobs, tasks
 from service.model.domain import State
+from service.model.errors import SceneError
 from service.model.planning import TaskFacts, batch_ready, batch_states, job_state
 
 _FACTS = (
@@ -28,10 +29,15 @@ _FACTS = (
 def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
     """Derive the states of a job's tasks, of some batches or all, then the job's own.
 
+    Where the first batch found no grasp in its scenes, the job's other batches are not made: they end as if cancelled.
+
     Returns:
         the job's state.
     """
-    cancelled = bool(connection.scalar(select(jobs.c.cancelled).where(jobs.c.id == job_id)))
+    facts = connection.execute(select(jobs.c.cancelled, _hopeless(job_id)).where(jobs.c.id == job_id)).first()
+    cancelled = facts is not None and any(facts)
+    if facts is not None and facts.hopeless:
+        batches = None
     query = select(*_FACTS).where(tasks.c.job_id == job_id).order_by(tasks.c.batch, tasks.c.position)
     if batches is not None:
         query = query.where(tasks.c.batch.in_(sorted(set(batches))))
@@ -46,6 +52,18 @@ def settle(connection: Connection, job_id: str, batches: Collection[int] | None 
         )
         connection.execute(statement, changes)
     return _settle_job(connection, job_id)
+
+
+def _hopeless(job_id: str) -> ColumnElement[bool]:
+    """Whether the first batch of a job ended because of its scenes."""
+    last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
+    failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
+    return (
+        exists()
+        .select_from(tasks)
+        .where(tasks.c.job_id == job_id, tasks.c.batch == 0, *failed, last, attempts.c.kind == SceneError.__name__)
+        .label("hopeless")
+    )
 
 
 def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[dict[str, Any]]:

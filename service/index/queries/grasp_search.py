@@ -59,9 +59,12 @@ def conditions(where: GraspFilter | None) -> list[Condition]:
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
-    for name, flag in (("valid", where.valid), ("success", where.success)):
-        if flag is not None:
-            found.append(Condition("flag", grasps.c[name], is_, flag))
+    flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard", "pushes_held")}
+    found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
+    if where.scene is not None:
+        anyone = where.scene == "any"
+        compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)
+        found.append(Condition("flag", grasps.c.scene_kind, compared, kind))
     found += [Condition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
     found += [Condition(name, grasps.c[name], operator.le, bound) for name, bound in where.at_most.items()]
     return found
@@ -155,7 +158,9 @@ def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequ
     """Rows that pass the conditions of a group; of a metric's no more are counted than matter."""
     query: Select[Any]
     if group == "job":
-        query = select(func.sum(tasks.c.count)).where(tasks.c.job_id == where.job, tasks.c.position == 0)
+        query = select(func.sum(tasks.c.count)).where(
+            tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value
+        )
     elif group == "pair":
         pair = {"hand": where.hand, "object": where.object}
         tests = [shards.c[name] == value for name, value in pair.items() if value is not None]

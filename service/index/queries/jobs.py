@@ -15,7 +15,6 @@ from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
 from service.model.domain import Stage, State
 from service.model.errors import NotFoundError
-from service.model.planning import CHAIN
 
 
 @dataclass(frozen=True)
@@ -132,24 +131,24 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
         select(
             tasks.c.job_id,
             tasks.c.position,
+            tasks.c.stage,
             tasks.c.state,
             func.count().label("tasks"),
             func.sum(cast(share, Float)).label("done"),
             func.sum(func.coalesce(tasks.c.seconds, 0.0)).label("seconds"),
         )
         .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id, tasks.c.position, tasks.c.state)
+        .group_by(tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
     )
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in connection.execute(query).mappings():
-        stage = stages[row["job_id"]].setdefault(row["position"], {"tasks": 0, "done": 0.0, "seconds": 0.0})
+        stage = stages[row["job_id"]].setdefault(
+            row["position"], {"stage": row["stage"], "tasks": 0, "done": 0.0, "seconds": 0.0}
+        )
         stage[row["state"]] = row["tasks"]
         for name in ("tasks", "done", "seconds"):
             stage[name] += row[name]
-    return {
-        job: [StageProgress(stage=CHAIN[position], **stages[job][position]) for position in sorted(stages[job])]
-        for job in ids
-    }
+    return {job: [StageProgress(**stages[job][position]) for position in sorted(stages[job])] for job in ids}
 
 
 def _made(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:

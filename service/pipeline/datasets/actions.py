@@ -13,6 +13,7 @@ from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snap
 from service.model.digests import digest_json
 from service.model.domain import AssetKind, JobOptions, State
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from service.model.scene_spec import SceneDocument
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver
@@ -194,9 +195,14 @@ def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member]
     for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
         if tuple(ours) != theirs:
             words.append(f"its {what} are {_named(theirs)}")
-    mine, other = options.model_dump(), known.options.model_dump()
-    words += [f"its {name} is {other[name]!r}" for name in mine if mine[name] != other[name]]
+    # Not by their dumps: those leave out what is at its default.
+    mine, other = ({name: getattr(one, name) for name in JobOptions.model_fields} for one in (options, known.options))
+    words += [f"its {name} is {_said(other[name])}" for name in mine if mine[name] != other[name]]
     return "; ".join(words)
+
+
+def _said(value: object) -> str:
+    return "a document of its own" if isinstance(value, SceneDocument) else repr(value)
 
 
 def _named(members: Iterable[Member]) -> str:

@@ -206,6 +206,7 @@ def recipe_of(options: JobOptions) -> Hashable:
         options.want,
         options.referee,
         options.robustness,
+        options.place.kind,
     )
 
 

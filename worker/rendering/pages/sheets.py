@@ -49,6 +49,18 @@ def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
     return rows
 
 
+def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(S,) row of the grasp with the largest epsilon that was planned in each scene, of those of a mask (N,); or -1."""
+    score = np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf)
+    scene = np.asarray(base["grasp/scene_index"])
+    rows = np.full(len(base["scene/object_pose"]), -1, np.int32)
+    for s in range(len(rows)):
+        mine = np.flatnonzero((scene == s) & among)
+        if len(mine):
+            rows[s] = mine[np.argmax(score[mine])]
+    return rows
+
+
 def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
     """For each row what a caption says: label and value, from the datasets of a base shard."""
     epsilon, area = _quoted(quality, "quality/epsilon"), _quoted(quality, "quality/contact_area_cm2")

@@ -1,0 +1,133 @@
+"""The scene of a job: what may be asked for, and that a job without one is what it was before there were scenes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from service.model.clock import timestamp
+from service.model.dataset_records import Member
+from service.model.digests import digest_json, job_id, shard_id
+from service.model.domain import SCENES, JobOptions, JobRequest, Lane, Stage
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.model.version import STAGE_REVISIONS
+from service.pipeline.datasets.spec import describe
+from tests.fakes import request
+from worker.planners.registry import PLANNERS, method
+
+HAND, OBJECT = "a" * 32, "b" * 32
+#: A job as it was written before jobs had scenes.
+PLAIN: dict[str, Any] = {
+    "grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scenes": 0, "views": 0, "stereo": False,
+    "width": 320, "height": 240, "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0,
+    "referee": "certificate", "audits": 8, "robustness": 0, "options": {}, "target": "",
+}  # fmt: skip
+PLANE = {"kind": "half_space"}
+
+
+def record(wanted: JobRequest) -> JobRecord:
+    return JobRecord(
+        id=job_id(wanted, HAND, OBJECT), request=wanted, hand_digest=HAND, object_digest=OBJECT, lane=Lane.BULK,
+        created=timestamp(),
+    )  # fmt: skip
+
+
+def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None:
+    wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
+    job = record(request())
+    assert job.request.model_dump(mode="json") == wanted
+    said = {"request": wanted, "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
+    assert job.id == digest_json(said)
+    (task,) = plan(job)
+    assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
+
+
+def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
+    made = describe(
+        "d", [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)], JobOptions(), lambda one: one
+    )
+    options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
+    assert made.digest == digest_json({"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": options})
+
+
+def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
+    common = {"hand": HAND, "object": OBJECT, "names": ["gripper", "ball"], "batch": 1, "count": 32, "seed": 0}
+    said = {**common, "stage": "scene", "revision": 2, "inputs": ["x"], "scenes": 3}
+    assert digest_json(said) == shard_id(
+        Stage.SCENE, request=request(scenes=3), hand_digest=HAND, object_digest=OBJECT, batch=1, count=32, revision=2,
+        inputs=("x",),
+    )  # fmt: skip
+
+
+def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
+    job = record(request(scene="table", views=2))
+    assert job.id != record(request(scenes=SCENES, views=2)).id
+    scene, base, views = plan(job)
+    assert [task.stage for task in (scene, base, views)] == [Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER]
+    assert (scene.inputs, base.inputs, views.inputs) == ((), (scene.output,), (base.output,))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"scene": "bin"}, {"scene": {"supports": [PLANE]}}, {"scenes": 5}, {"faces": "all"}, {"seed": 1},
+     {"fidelity": "draft"}],
+)  # fmt: skip
+def test_whatever_moves_scenes_gives_them_another_address(changes: dict[str, Any]) -> None:
+    first = next(plan(record(request(scene="table"))))
+    assert next(plan(record(request(**{"scene": "table", **changes})))).output != first.output
+
+
+def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:
+    assert request(scene="table").scenes == request(scene="table", scenes="0").scenes == SCENES
+    assert request(scene="table", scenes=7).scenes == 7
+    assert request().scenes == 0
+
+
+def test_a_document_is_a_scene_and_comes_back_as_it_was() -> None:
+    wanted = request(
+        scene={"supports": [PLANE, {"kind": "box", "size": [0.1, 0.2, 0.3]}], "target": [0, 0, 1, 1, 0, 0, 0]}
+    )
+    assert (wanted.place.kind, len(wanted.place.supports), wanted.in_scene) == ("file", 2, True)
+    assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"scene": "tabel"}, "'free', 'table', 'bin' or 'shelf'"),
+        ({"scene": 5}, "'free', 'table', 'bin' or 'shelf'"),
+        ({"scene": {"supports": []}}, "at least 1"),
+        ({"scene": {"supports": [PLANE] * 33}}, "at most 32"),
+        ({"scene": {"supports": [{"kind": "half_space", "normal": [0, 0, 0]}]}}, "normal that is not zero"),
+        ({"scene": {"supports": [{"kind": "box", "size": [0.1, 0.1, 1e9]}]}}, "less than or equal to 20"),
+        ({"scene": {"supports": [{"kind": "half_space", "offset": float("nan")}]}}, "finite number"),
+        ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 1, 0, 0]}}, "unit length"),
+        ({"scene": {"supports": [PLANE], "file": "/etc/passwd"}}, "Extra inputs"),
+        ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0]}, "faces": "all"}, "lies on one face"),
+        ({"faces": "all"}, "lies on no face"),
+        ({"scene": "table", "method": "dfc"}, "plans around free objects only"),
+        ({"scene": "table", "robustness": 2}, "six pushes"),
+        ({"scene": "table", "scenes": 65}, "less than or equal to 64"),
+    ],
+)
+def test_nonsense_is_refused_in_a_line(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError) as refused:
+        request(**changes)
+    first = refused.value.errors()[0]["msg"]
+    assert words in first
+    assert "\n" not in first
+
+
+def test_the_methods_that_know_no_scene_are_those_of_the_engine() -> None:
+    known = {name for name in PLANNERS if method(name).in_scenes}
+    taken = set()
+    for name in PLANNERS:
+        try:
+            request(scene="table", method=name)
+            taken.add(name)
+        except ValidationError:
+            pass
+    assert taken == known

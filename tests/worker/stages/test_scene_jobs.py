@@ -1,0 +1,165 @@
+"""A job on a table through its three stages, as a worker runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.digests import job_id
+from service.model.domain import AssetKind, JobRequest, Lane, Stage
+from service.model.errors import TaskRefused
+from service.model.planning import message_of, plan
+from service.model.records import AttemptRecord, JobRecord
+from service.queue.port import EventKind
+from service.readers import Grasps, Pictures, open_shards
+from service.store.assets import builtin_files
+from service.store.library import publish_asset
+from service.store.manifests import load_manifest, load_shard
+from service.store.records import put_record, read_record
+from service.store.shards import Shard
+from service.store.store import Store, open_store
+from worker.files.synthesis import synthesized
+from worker.process.runner import Runner
+from worker.stages import render, scene, synthesize
+from worker.stages.context import TaskContext
+
+TABLE = {
+    "grasps": 6, "fidelity": "draft", "seed": 3, "audits": 0, "scene": "table", "scenes": 2, "views": 1, "width": 48,
+    "height": 36,
+}  # fmt: skip
+STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
+
+
+@dataclass
+class Bench:
+    """A store with the built-in Barrett hand and block, and a worker."""
+
+    store: Store
+    job: JobRecord = field(init=False)
+
+    def run(self, **request: Any) -> tuple[EventKind, str]:
+        """Kind and words of the end of a job's first batch."""
+        hand = publish_asset(self.store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
+        obj = publish_asset(self.store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
+        wanted = JobRequest(hand="barrett", object="block", **request)
+        self.job = JobRecord(
+            id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest,
+            object_digest=obj.digest, lane=Lane.BULK, created=timestamp(),
+        )  # fmt: skip
+        put_record(self.store, names.job_record(self.job.id), self.job)
+        runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
+        for task in plan(self.job):
+            message = message_of(self.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
+            event = runner.run(message, TaskContext(self.store, threads=2))
+            assert event is not None
+            if event.kind is not EventKind.FINISHED:
+                break
+        return event.kind, event.message
+
+    def made(self, stage: Stage) -> Shard:
+        return load_shard(self.store, stage, next(task for task in plan(self.job) if task.stage is stage).output)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    bench = Bench(open_store(tmp_path_factory.mktemp("store").as_uri()))
+    assert bench.run(**TABLE) == (EventKind.FINISHED, "")
+    yield bench
+
+
+def test_grasps_stand_in_the_scenes_that_were_made_first(table: Bench) -> None:
+    first, base = table.made(Stage.SCENE), table.made(Stage.SYNTHESIZE)
+    np.testing.assert_array_equal(base["scene/object_pose"], first["scene/object_pose"])
+    assert set(np.unique(base["grasp/scene_index"])) <= {0, 1}
+    assert len(first["grasp/valid"]) == 0
+    manifest = load_manifest(table.store, Stage.SYNTHESIZE, str(base.attributes["shard_id"]))
+    assert manifest.valid == 6 == (base["quality/lift_outcome"] == 1).sum()
+    assert all(one.clearance_m >= 0.002 and one.lift_hard is not None for one in manifest.grasps)  # type: ignore[operator]
+    assert 0 < manifest.info["lift_share"] <= manifest.info["clear_share"] <= 1
+
+
+def test_the_first_batch_is_what_synth_makes_with_the_same_seed(table: Bench) -> None:
+    request = table.job.request
+    alone = synthesized("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
+    base = table.made(Stage.SYNTHESIZE)
+    for name in ("grasp/hand_pose", "grasp/approach", "grasp/lift", "scene/object_pose", "quality/clearance_m"):
+        np.testing.assert_array_equal(base[name], alone.arrays[name])
+
+
+def test_pictures_show_the_scene_with_and_without_the_best_hand(table: Bench) -> None:
+    views, base = table.made(Stage.RENDER), table.made(Stage.SYNTHESIZE)
+    shown = views["camera/hand_grasp"]
+    assert shown.tolist() == [
+        max(np.flatnonzero(base["grasp/scene_index"] == s), key=lambda row: base["quality/epsilon"][row, 1])
+        for s in (0, 1)
+    ]
+    assert (views["image/rgb_hand"] != views["image/rgb"]).any(axis=(1, 2, 3)).all()
+    assert set(np.unique(views["image/segmentation"])) <= {0, 1, 2}
+
+
+def test_readers_give_the_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -> None:
+    shards = open_shards(table.store, job=table.job.id)
+    columns = ("grasp/approach", "grasp/lift", "grasp/scene_index", "quality/lift_hard", "quality/clearance_m")
+    grasps = Grasps(shards, columns)
+    assert grasps[0]["grasp/approach"].shape == (6, 7)
+    assert len(grasps.arrays()["quality/lift_hard"]) == 6
+    pictures = Pictures(shards)
+    assert sum(len(picture["grasp/hand_pose"]) for picture in pictures) == 6
+    base, views = table.made(Stage.SYNTHESIZE), table.made(Stage.RENDER)
+    row = int(pictures[0]["grasp/base_row"][0])
+    assert base["grasp/scene_index"][row] == pictures[0]["scene"] == views["camera/scene_index"][0]
+
+
+def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> None:
+    walls = [{"kind": "box", "size": [0.4, 0.02, 0.6], "pose": [0, s * 0.05, 0.3, 1, 0, 0, 0]} for s in (-1, 1)] + [
+        {"kind": "box", "size": [0.02, 0.4, 0.6], "pose": [s * 0.07, 0, 0.3, 1, 0, 0, 0]} for s in (-1, 1)
+    ]
+    shaft = {"supports": [{"kind": "half_space"}, *walls], "target": [0, 0, 0.03, 1, 0, 0, 0]}
+    bench = Bench(table.store)
+    kind, words = bench.run(**TABLE | {"scene": shaft, "grasps": 2, "budget": 1, "views": 0})
+    assert kind is EventKind.FAILED
+    assert "\n" not in words
+    task = list(plan(bench.job))[-1]
+    attempt = read_record(AttemptRecord, table.store, names.attempt(task.id, 1))
+    assert (attempt.kind, attempt.last) == ("SceneError", True), "it is not tried again"
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"scene": {"supports": [{"kind": "half_space", "offset": 0.5}], "target": [0, 0, 0, 1, 0, 0, 0]}},
+            "deep in support 0",
+        ),
+        ({"scene": "table", "method": "elsewhere"}, "unknown method"),
+    ],
+)
+def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, changes: dict[str, Any], words: str) -> None:
+    kind, said = Bench(table.store).run(**TABLE | {"views": 0, "grasps": 1} | changes)
+    assert kind is EventKind.FAILED
+    assert words in said
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        {"supports": [{"kind": "box", "size": [1e300, 1, 1]}]},
+        {"supports": [{"kind": "mesh", "file": "/etc/passwd"}]},
+        "moon",
+    ],
+)
+def test_a_forged_task_with_a_nonsense_scene_is_refused(table: Bench, nonsense: Any, tmp_path: Path) -> None:
+    task = next(plan(table.job))
+    message = message_of(table.job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
+    message["request"]["scene"] = nonsense
+    runner = Runner(STAGES, worker="w", publish=lambda event: None)  # type: ignore[arg-type]
+    with pytest.raises(TaskRefused, match="no task of graspd"):
+        runner.run(message, TaskContext(open_store(tmp_path.as_uri())))
+    assert list(tmp_path.iterdir()) == []
