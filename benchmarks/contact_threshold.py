@@ -49,7 +49,7 @@ def sweep(cell: Cell) -> dict[str, Any]:
     found = {}
     for friction in FRICTIONS:
         thresholds = [mm * 1e-3 for mm in THRESHOLDS_MM]
-        table = measure(cell.hand, cell.obj, grasps, friction=friction, thresholds_m=thresholds)
+        table = measure(cell.hand, cell.obj, grasps, friction=friction, thresholds_m=thresholds, every_volume=True)
         found[f"{friction:g}"] = {
             key: np.asarray(table[f"quality/{column}"]).mean(axis=0).tolist() for key, (_, column, _) in PANELS.items()
         }

@@ -90,7 +90,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         title="ε (Ferrari-Canny)", short="ε", swept=True, indexed=Indexed.OFFERED, digits=2, plot="whole",
     ),
     GraspMetric(
-        "wrench_volume", "1", "volume of the L1 grasp wrench space",
+        "wrench_volume", "1", "volume of the L1 grasp wrench space; nan: not measured at this threshold",
         title="Wrench space volume", short="Vol", swept=True, indexed=Indexed.SORTED, digits=1,
     ),
     GraspMetric(

@@ -22,6 +22,9 @@ CAPACITY: Final = 40_000
 _TABLE: Final = 1 << 16
 MAX_POINTS: Final = 512
 _DIMENSION: Final = 6
+#: A point that is above a plane by less than this share of the largest coordinate is on it: products of coordinates
+#: round by some 1e-15, and ε is off by no more than this.
+_ROUNDING: Final = 1e-13
 _LAST_STAMP: Final = 2**31 - 2 * MAX_POINTS
 
 
@@ -73,22 +76,43 @@ def radius_and_volume(points: Floats) -> tuple[float, float] | None:
     Returns:
         None where the arithmetic did not give a closed hull: take another way.
     """
-    joggle = np.random.default_rng(0).uniform(-1.0, 1.0, points.shape) * JOGGLE * float(np.abs(points).max())
-    points = points + joggle
-    corners = _simplex(points)
-    space = _workspace
-    _begin(space.hull, points, corners)
+    points, corners = _joggled(points)
     order = np.setdiff1d(np.arange(len(points), dtype=np.int32), corners)
     with wp.ScopedDevice("cpu"):
-        given = [
-            wp.array(points, dtype=kernels.vec6), wp.array(order, dtype=wp.int32), space.marks,
-            _TABLE - 1, space.stamps(len(order)),
-        ]  # fmt: skip
-        wp.launch(kernels.grow_hull, 1, inputs=given, outputs=[space.hull, space.result], device="cpu")
+        found = _grown(kernels.grow_hull, points, corners, wp.array(order, dtype=wp.int32))
+    return found if found is not None and np.isfinite(found).all() else None
+
+
+def radius(points: Floats) -> float | None:
+    """The same distance alone, exact as well, in about a tenth of the time; any value up to 0 if the origin is outside.
+
+    Args:
+        points: (P, 6), 8 to `MAX_POINTS` of them, not all in one hyperplane.
+
+    Returns:
+        None where the arithmetic did not give a closed hull: take another way.
+    """
+    points, corners = _joggled(points)
+    found = _grown(kernels.grow_to_nearest, points, corners, _ROUNDING * float(np.abs(points).max()))
+    return found[0] if found is not None and np.isfinite(found[0]) else None
+
+
+def _joggled(points: Floats) -> tuple[Floats, NDArray[np.int32]]:
+    """The points, moved by next to nothing, and the corners of the simplex to begin with."""
+    joggle = np.random.default_rng(0).uniform(-1.0, 1.0, points.shape) * JOGGLE * float(np.abs(points).max())
+    moved: Floats = points + joggle
+    return moved, _simplex(moved)
+
+
+def _grown(kernel: Any, points: Floats, corners: NDArray[np.int32], second: Any) -> tuple[float, float] | None:
+    """What a kernel finds of a hull that begins with a simplex; None if that is not sound."""
+    space = _workspace
+    _begin(space.hull, points, corners)
+    with wp.ScopedDevice("cpu"):
+        given = [wp.array(points, dtype=kernels.vec6), second, space.marks, _TABLE - 1, space.stamps(len(points))]
+        wp.launch(kernel, 1, inputs=given, outputs=[space.hull, space.result], device="cpu")
     least, volume, sound = space.result.numpy()
-    if not (sound and np.isfinite(least) and np.isfinite(volume)):
-        return None
-    return float(least), float(volume)
+    return (float(least), float(volume)) if sound else None
 
 
 def _simplex(points: Floats) -> NDArray[np.int32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS
+from service.store.manifests import INDEX_THRESHOLD_M
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -21,7 +23,7 @@ from worker.quality.contact import MAX_CONTACTS, choose_contacts, contact_area_c
 from worker.quality.penetration import penetration_depth
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from worker.quality.volume import SharedVolume
-from worker.quality.wrench_space import Norm, measure_space, wrenches
+from worker.quality.wrench_space import Norm, epsilon_of_space, measure_space, wrenches
 from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
@@ -41,6 +43,7 @@ def measure(
     friction: float = DEFAULT_FRICTION,
     thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
     norm: Norm = "l1",
+    every_volume: bool = False,
     run: Run = ALONE,
 ) -> dict[str, NDArray[np.generic]]:
     """Quality columns of a base shard for N grasps, at the posture of contact.
@@ -52,6 +55,8 @@ def measure(
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
         norm: l1 (GraspIt!'s) or linf wrench space.
+        every_volume: the volume of the wrench space at all thresholds; else at the one that the index tells, and nan at
+            the others: a volume takes ten times as long as an epsilon.
         run: told of grasps done; asked between chunks whether to stop.
 
     Returns:
@@ -66,7 +71,7 @@ def measure(
         raise InputError(
             f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
         )
-    pair = _Pair(hand, obj, friction, thresholds, norm)
+    pair = _Pair(hand, obj, friction, thresholds, norm, every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     done, lock = 0, threading.Lock()
 
@@ -90,8 +95,12 @@ def measure(
 class _Pair:
     """What the chunks of one table share."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, friction: float, thresholds: Floats, norm: Norm) -> None:
+    def __init__(
+        self, hand: HandModel, obj: ObjectModel, friction: float, thresholds: Floats, norm: Norm, every_volume: bool
+    ) -> None:
         self.obj, self.friction, self.thresholds, self.norm = obj, friction, thresholds, norm
+        told = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
+        self.with_volume = {t for t in range(len(thresholds)) if every_volume or t == told}
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
         self.volume = SharedVolume(hand, obj)
 
@@ -107,24 +116,25 @@ class _Pair:
     def spaces(self, found: Distances) -> tuple[Floats, Floats]:
         """(B, T) epsilon and volume of the wrench space of B grasps."""
         shape = (len(found.distance), len(self.thresholds))
-        epsilon, volume = np.zeros(shape), np.zeros(shape)
+        epsilon, volume = np.zeros(shape), np.full(shape, np.nan)
         facing = self.probe.facing(found)
         for b in range(shape[0]):
-            place, normal = found.closest[b], found.normal[b]
-            last: NDArray[np.intp] = np.zeros(0, np.intp)
-            for t, threshold in enumerate(self.thresholds):
-                near = facing[b] & (np.abs(found.distance[b]) < threshold)
-                chosen = choose_contacts(near, place, normal, scale=self.obj.radius, limit=MAX_CONTACTS)
-                if t and np.array_equal(chosen, last):
-                    epsilon[b, t], volume[b, t] = epsilon[b, t - 1], volume[b, t - 1]
-                elif len(chosen):
-                    edges = wrenches(
-                        place[chosen], -normal[chosen], friction=self.friction,
-                        centre=self.obj.centre_of_mass, radius=self.obj.radius,
-                    )  # fmt: skip
-                    epsilon[b, t], volume[b, t] = measure_space(edges, norm=self.norm)
-                last = chosen
+            place, normal, near = found.closest[b], found.normal[b], np.abs(found.distance[b])
+            for t in range(shape[1]):
+                chosen = choose_contacts(
+                    facing[b] & (near < self.thresholds[t]), place, normal, scale=self.obj.radius, limit=MAX_CONTACTS
+                )
+                epsilon[b, t], volume[b, t] = self._space(place[chosen], normal[chosen], t in self.with_volume)
         return epsilon, volume
+
+    def _space(self, place: Floats, normal: Floats, with_volume: bool) -> tuple[float, float]:
+        """Epsilon and volume, nan if it is not wanted, of contacts at (C, 3) with outward normals (C, 3)."""
+        if not len(place):
+            return 0.0, 0.0
+        edges = wrenches(place, -normal, friction=self.friction, centre=self.obj.centre_of_mass, radius=self.obj.radius)
+        if with_volume:
+            return measure_space(edges, norm=self.norm)
+        return epsilon_of_space(edges, norm=self.norm), math.nan
 
 
 @dataclass(frozen=True)

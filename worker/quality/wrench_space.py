@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from service.model.errors import InputError
-from worker.quality.hull import MAX_POINTS, radius_and_volume
+from worker.quality.hull import MAX_POINTS, radius, radius_and_volume
 
 Floats = NDArray[np.float64]
 Norm = Literal["l1", "linf"]
@@ -89,9 +89,8 @@ def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, f
     Raises:
         InputError: linf with more than `MAX_LINF_CONTACTS` contacts.
     """
-    dimension = edge_wrenches.shape[-1]
-    points = edge_wrenches.reshape(-1, dimension) if norm == "l1" else _minkowski(edge_wrenches)
-    if dimension == 6 and MANY <= len(points) <= MAX_POINTS and not _flat(points):
+    points = _points(edge_wrenches, norm)
+    if _is_ours(points):
         found = radius_and_volume(points)
         if found is not None:
             return max(0.0, found[0]), found[1]
@@ -99,6 +98,22 @@ def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, f
     if hull is None:
         return 0.0, 0.0
     return max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume)
+
+
+def epsilon_of_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> float:
+    """Epsilon alone, as in `measure_space` and as exact, in a tenth of the time where there are many contacts."""
+    points = _points(edge_wrenches, norm)
+    found = radius(points) if _is_ours(points) else None
+    return max(0.0, found) if found is not None else measure_space(edge_wrenches, norm=norm)[0]
+
+
+def _points(edge_wrenches: Floats, norm: Norm) -> Floats:
+    return edge_wrenches.reshape(-1, edge_wrenches.shape[-1]) if norm == "l1" else _minkowski(edge_wrenches)
+
+
+def _is_ours(points: Floats) -> bool:
+    """Whether our own hull takes these points, and is the faster one."""
+    return points.shape[1] == 6 and MANY <= len(points) <= MAX_POINTS and not _flat(points)
 
 
 def _hull(points: Floats) -> ConvexHull | None:

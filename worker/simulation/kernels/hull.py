@@ -116,6 +116,50 @@ def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, m
     return pending
 
 
+@wp.func
+def insert(
+    hull: Hull,
+    p: int,
+    point: wp.array(dtype=vec6),
+    mark: wp.array(dtype=wp.int64),
+    mask: wp.int64,
+    stamp: int,
+    top: int,
+    spares: int,
+):
+    """Put point p into the hull; facets ever used, spare ones among them, and 1 if that failed."""
+    capacity = hull.state.shape[0]
+    failed = wp.int32(0)
+    count = look(hull, top, point[p])
+    born = wp.int32(0)
+    pending = wp.int32(0)
+    for i in range(count):
+        f = hull.seen[i]
+        for k in range(6):
+            if failed == 0 and hull.state[hull.neighbour[f, k]] == LIVE:
+                e = top
+                if spares > 0:
+                    spares = spares - 1
+                    e = hull.spare[spares]
+                elif top + 1 >= capacity:
+                    failed = 1
+                else:
+                    top = top + 1
+                span(hull, e, f, k, p, point)
+                pending = pending + link(hull, e, k, mark, stamp, mask)
+                hull.fresh[born] = e
+                born = born + 1
+    if pending != 0:
+        failed = 1
+    for i in range(count):
+        hull.state[hull.seen[i]] = DEAD
+        hull.spare[spares] = hull.seen[i]
+        spares = spares + 1
+    for i in range(born):
+        hull.state[hull.fresh[i]] = LIVE
+    return top, spares, failed
+
+
 @wp.kernel
 def grow_hull(
     # In:
@@ -133,40 +177,12 @@ def grow_hull(
     `result_out`: least distance of a facet from the origin, negative where the origin is outside; volume; 1 if sound.
     """
     hull = hull_inout
-    capacity = hull.state.shape[0]
     top = wp.int32(7)
     spares = wp.int32(0)
     failed = wp.int32(0)
     for turn in range(order_in.shape[0]):
         if failed == 0:
-            p = order_in[turn]
-            count = look(hull, top, point_in[p])
-            born = wp.int32(0)
-            pending = wp.int32(0)
-            for i in range(count):
-                f = hull.seen[i]
-                for k in range(6):
-                    if failed == 0 and hull.state[hull.neighbour[f, k]] == LIVE:
-                        e = top
-                        if spares > 0:
-                            spares = spares - 1
-                            e = hull.spare[spares]
-                        elif top + 1 >= capacity:
-                            failed = 1
-                        else:
-                            top = top + 1
-                        span(hull, e, f, k, p, point_in)
-                        pending = pending + link(hull, e, k, mark_in, stamp_in + turn, mask_in)
-                        hull.fresh[born] = e
-                        born = born + 1
-            if pending != 0:
-                failed = 1
-            for i in range(count):
-                hull.state[hull.seen[i]] = DEAD
-                hull.spare[spares] = hull.seen[i]
-                spares = spares + 1
-            for i in range(born):
-                hull.state[hull.fresh[i]] = LIVE
+            top, spares, failed = insert(hull, order_in[turn], point_in, mark_in, mask_in, stamp_in + turn, top, spares)
     least = wp.float64(1.0e30)
     volume = wp.float64(0.0)
     for f in range(top):
@@ -175,4 +191,56 @@ def grow_hull(
             volume = volume + hull.offset[f] * hull.area[f]
     result_out[0] = least
     result_out[1] = volume / wp.float64(6.0)
+    result_out[2] = wp.float64(1 - failed)
+
+
+@wp.kernel
+def grow_to_nearest(
+    # In:
+    point_in: wp.array(dtype=vec6),
+    rounding_in: wp.float64,
+    mark_in: wp.array(dtype=wp.int64),
+    mask_in: wp.int64,
+    stamp_in: int,
+    # Out:
+    hull_inout: Hull,
+    result_out: wp.array(dtype=wp.float64),
+):
+    """Grow a hull that has 7 facets where it is nearest to the origin, until its nearest facet is one of the whole hull.
+
+    A facet with no point above it is a facet of the hull of all points; no facet of the part that is built is nearer, and
+    the whole contains the part. So its distance is that of the whole hull, of which little has to be built (Zheng, "An
+    efficient algorithm for a grasp quality measure", IEEE T-RO 2013).
+
+    `result_out`: least distance of a facet from the origin, at most 0 where the origin is outside; nan; 1 if sound.
+    """
+    hull = hull_inout
+    top = wp.int32(7)
+    spares = wp.int32(0)
+    failed = wp.int32(0)
+    done = wp.int32(0)
+    least = wp.float64(0.0)
+    for turn in range(point_in.shape[0]):
+        if failed == 0 and done == 0:
+            nearest = wp.int32(-1)
+            least = wp.float64(1.0e30)
+            for f in range(top):
+                if hull.state[f] == LIVE and hull.offset[f] < least:
+                    least = hull.offset[f]
+                    nearest = f
+            far = wp.int32(-1)
+            height = rounding_in
+            for i in range(point_in.shape[0]):
+                above = wp.dot(hull.normal[nearest], point_in[i]) - least
+                if above > height:
+                    height = above
+                    far = i
+            if far < 0:
+                done = 1
+            else:
+                top, spares, failed = insert(hull, far, point_in, mark_in, mask_in, stamp_in + turn, top, spares)
+    if done == 0:
+        failed = 1
+    result_out[0] = least
+    result_out[1] = wp.float64(wp.nan)
     result_out[2] = wp.float64(1 - failed)
