@@ -34,8 +34,15 @@ def quat_rotate(q: Floats, v: Floats) -> Floats:
     """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
     q, v = np.asarray(q, float), np.asarray(v, float)
     u = q[..., 1:]
-    t = 2.0 * np.cross(u, v)
-    return v + q[..., :1] * t + np.cross(u, t)
+    t = 2.0 * cross(u, v)
+    return v + q[..., :1] * t + cross(u, t)
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Vector product (..., 3), the very numbers of `numpy.cross`, which is several times slower on small arrays."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def quat_from_axis_angle(axis: Floats, angle: Floats) -> Floats:

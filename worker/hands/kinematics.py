@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 from service.model.transforms import compose, quat_from_axis_angle
 from worker.hands.model import Floats, HandModel, JointType
@@ -23,14 +26,22 @@ def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> F
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     poses = np.empty((len(hand_pose), hand.bodies, 7))
     poses[:, 0] = hand_pose
-    joint_of_body = {int(body): j for j, body in enumerate(hand.joint_body)}
-    for body in range(1, hand.bodies):
-        value = joints[:, joint_of_body[body]]
-        motion = np.zeros((len(joints), 7))
-        motion[:, 3] = 1.0
-        if hand.joint_type[body] == JointType.REVOLUTE:
-            motion[:, 3:] = quat_from_axis_angle(hand.axis[body], value)
-        else:
-            motion[:, :3] = value[:, None] * hand.axis[body]
-        poses[:, body] = compose(compose(poses[:, hand.parent[body]], hand.origin[body]), motion)
+    joint_of_body = np.full(hand.bodies, -1)
+    joint_of_body[hand.joint_body] = np.arange(len(hand.joint_body))
+    for level in _levels(hand.parent.tobytes()):
+        value, axis = joints[:, joint_of_body[level]], hand.axis[level]
+        turns = (hand.joint_type[level] == JointType.REVOLUTE)[:, None]
+        rotation = np.where(turns, quat_from_axis_angle(axis, value), [1.0, 0, 0, 0])
+        motion = np.concatenate([np.where(turns, 0.0, value[..., None] * axis), rotation], axis=-1)
+        poses[:, level] = compose(compose(poses[:, hand.parent[level]], hand.origin[level]), motion)
     return poses
+
+
+@lru_cache(maxsize=64)
+def _levels(parents: bytes) -> tuple[NDArray[np.intp], ...]:
+    """Bodies in the order of their distance from the root, those of one distance together; the root left out."""
+    parent = np.frombuffer(parents, np.int32)
+    depth = np.zeros(len(parent), int)
+    for body in range(1, len(parent)):
+        depth[body] = depth[parent[body]] + 1
+    return tuple(np.flatnonzero(depth == level) for level in range(1, depth.max() + 1))

@@ -57,6 +57,8 @@ FRICTION: Final = 0.3
 MAX_PRESSING: Final = 16
 
 _POINTS: Final = 600
+#: Steps of its way that a finger is looked at together: most are clear after one or two.
+_LOOK_STEPS: Final = 3
 _CHUNK: Final = 32
 
 
@@ -191,22 +193,35 @@ def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
 
 
 def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
-    """(B, K, fingers) least distance of each finger's points to the object; inf where a finger has none."""
+    """(B, K, fingers) least distance of each finger's points to the object; inf where a finger has none.
+
+    A hand whose fingers have all been `CLEARANCE_M` away is not looked at farther on its way: -inf there.
+    """
     count, steps, _ = paths.shape
-    finger = finger_of_body(probe.hand)
-    joints = probe.hand.expand(paths).reshape(count * steps, -1)
-    distance = _distances(probe, np.repeat(hand_pose, steps, axis=0), joints)
-    out = np.full((count * steps, max(1, len(probe.hand.fingertips))), np.inf)
-    for f in range(out.shape[1]):
-        mine = finger[probe.points.body] == f
-        if mine.any():
-            out[:, f] = distance[:, mine].min(axis=1)
-    return out.reshape(count, steps, -1)
+    finger = finger_of_body(probe.hand)[probe.points.body]
+    points = np.flatnonzero(finger >= 0)
+    out = np.full((count, steps, max(1, len(probe.hand.fingertips))), -np.inf)
+    going = np.arange(count)
+    for first in range(0, steps, _LOOK_STEPS):
+        look = paths[going, first : first + _LOOK_STEPS]
+        joints = probe.hand.expand(look).reshape(-1, len(probe.hand.joint_names))
+        distance = _distances(probe, np.repeat(hand_pose[going], look.shape[1], axis=0), joints, points)
+        found = np.full((len(distance), out.shape[2]), np.inf)
+        for f in range(out.shape[2]):
+            mine = finger[points] == f
+            if mine.any():
+                found[:, f] = distance[:, mine].min(axis=1)
+        out[going, first : first + _LOOK_STEPS] = found.reshape(len(going), look.shape[1], -1)
+        going = going[(out[going].max(axis=1) < CLEARANCE_M).any(axis=1)]
+        if not len(going):
+            break
+    return out
 
 
-def _distances(probe: Probe, hand_pose: Floats, joints: Floats) -> Floats:
-    points = probe.posed_points(body_poses(probe.hand, hand_pose, joints))
-    return probe.signed_distance(points.reshape(-1, 3))[0].reshape(points.shape[:2])
+def _distances(probe: Probe, hand_pose: Floats, joints: Floats, points: NDArray[np.intp] | None = None) -> Floats:
+    """(B, P) signed distances of the hand's points, or of some of them, at B postures."""
+    posed = probe.posed_points(body_poses(probe.hand, hand_pose, joints), points)
+    return probe.signed_distance(posed.reshape(-1, 3))[0].reshape(posed.shape[:2])
 
 
 def _first_clear(clearance: Floats, wanted: float) -> NDArray[np.intp]:

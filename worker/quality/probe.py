@@ -31,6 +31,8 @@ OBJECT_POINTS: Final = 3000
 SEED: Final = 7919
 #: Distances beyond this are reported as this [m].
 REACH_M: Final = 0.012
+#: Cells along the longest side of the grid that tells which points are beyond reach.
+COARSE_CELLS: Final = 32
 #: Hand and object normals of a contact are opposite to within 60 degrees.
 FACING_COS: Final = -0.5
 
@@ -88,6 +90,16 @@ class Probe:
                 indices=wp.array(obj.faces.ravel(), dtype=wp.int32),
                 support_winding_number=not obj.watertight,
             )
+            self._coarse = wp.zeros((0, 0, 0), dtype=wp.float32)
+        size = np.subtract(self._high, self._low)
+        self._spacing = float(size.max()) / COARSE_CELLS
+        nodes = np.stack(
+            np.meshgrid(*(np.arange(int(length / self._spacing) + 2) for length in size), indexing="ij"), axis=-1
+        )
+        points = np.asarray(self._low) + self._spacing * nodes + obj.centre_of_mass
+        coarse = self._query(points.reshape(-1, 3))[0].reshape(nodes.shape[:3])
+        with wp.ScopedDevice("cpu"):
+            self._coarse = wp.array(coarse, dtype=wp.float32)
 
     @cached_property
     def sample_spacing(self) -> float:
@@ -98,6 +110,10 @@ class Probe:
 
     def signed_distance(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Signed distance (P,), closest point (P, 3), outward normal (P, 3) of points (P, 3) in the object frame."""
+        distance, closest, normal = self._query(points)
+        return np.minimum(distance, REACH_M), closest, normal
+
+    def _query(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         count = len(points)
         with wp.ScopedDevice("cpu"):
             given = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
@@ -113,23 +129,23 @@ class Probe:
                     self._corner_normals,
                     self._low,
                     self._high,
+                    self._coarse,
+                    self._spacing,
                     REACH_M,
                     given,
                 ],
                 outputs=[distance, closest, normal],
                 device="cpu",
             )
-        reached = np.minimum(distance.numpy().astype(float), REACH_M)
-        return reached, closest.numpy().astype(float) + self.obj.centre_of_mass, normal.numpy().astype(float)
+        place = closest.numpy().astype(float) + self.obj.centre_of_mass
+        return distance.numpy().astype(float), place, normal.numpy().astype(float)
 
-    def posed_points(self, bodies: Floats) -> Floats:
-        """(B, N, 3) hand points in the object frame for body poses (B, L, 7)."""
-        return self._turned(bodies, self.points.position) + bodies[:, self.points.body, :3]
-
-    def _turned(self, bodies: Floats, vectors: Floats) -> Floats:
-        rotation = quat_to_matrix(bodies[..., 3:])
-        turned: Floats = np.einsum("bnij,nj->bni", rotation[:, self.points.body], vectors)
-        return turned
+    def posed_points(self, bodies: Floats, rows: NDArray[np.intp] | None = None) -> Floats:
+        """(B, N, 3) hand points, or those of `rows`, in the object frame for body poses (B, L, 7)."""
+        body, position = self.points.body, self.points.position
+        if rows is not None:
+            body, position = body[rows], position[rows]
+        return _turned(bodies, body, position) + bodies[:, body, :3]
 
     def measure(self, posture: Posture) -> Distances:
         """All distances of B postures."""
@@ -141,7 +157,7 @@ class Probe:
         return Distances(
             bodies=bodies,
             hand_points=points,
-            hand_normals=self._turned(bodies, self.points.normal),
+            hand_normals=_turned(bodies, self.points.body, self.points.normal),
             distance=distance.reshape(shape),
             closest=closest.reshape(*shape, 3),
             normal=normal.reshape(*shape, 3),
@@ -191,6 +207,13 @@ class Probe:
             position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
             rotation: Any = wp.array(to_xyzw(frames[..., 3:]), dtype=wp.quat)
         return [self._pieces, position, rotation]
+
+
+def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
+    """(B, N, 3) vectors (N, 3) of the bodies (N,), turned as the bodies are."""
+    rotation = quat_to_matrix(bodies[..., 3:])
+    turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], vectors)
+    return turned
 
 
 def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from worker.quality import hull
-from worker.quality.hull import MAX_POINTS, radius_and_volume
+from worker.quality.hull import MAX_POINTS, radius, radius_and_volume
 from worker.quality.wrench_space import measure_space, wrenches
 
 #: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
@@ -93,3 +93,29 @@ def test_more_points_than_the_workspace_holds_go_to_qhull() -> None:
     points /= 1 + np.linalg.norm(points, axis=1, keepdims=True) ** 4
     theirs = ConvexHull(points)
     assert measure_space(points[:, None])[1] == pytest.approx(theirs.volume, rel=JOGGLED)
+
+
+@pytest.mark.parametrize(("count", "friction"), [(4, 0.5), (8, 1.0), (20, 0.2), (20, 1.0)])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_radius_alone_is_that_of_the_whole_hull(count: int, friction: float, seed: int) -> None:
+    points = contacts(count, friction, seed)
+    whole = radius_and_volume(points)
+    assert whole is not None
+    # Where the origin is outside only that is known: how far the nearest facet is from it then says nothing of ε.
+    found = radius(points)
+    assert found is not None
+    assert max(0.0, found) == pytest.approx(max(0.0, whole[0]), abs=1e-12)  # the same planes, made in another order
+
+
+def test_the_radius_alone_of_a_cube_with_points_inside() -> None:
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T
+    inner = np.random.default_rng(0).uniform(-0.9, 0.9, (60, 6))
+    assert radius(np.vstack([inner, corners])) == pytest.approx(1.0, rel=JOGGLED)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_radius_alone_of_a_cloud_beside_the_origin_is_not_positive(seed: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(120, 6)) + 5.0
+    found = radius(points)
+    assert found is not None
+    assert found <= 0

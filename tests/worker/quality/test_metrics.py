@@ -18,7 +18,7 @@ from worker.grasps import Posture
 from worker.hands.surface import sample_surface
 from worker.quality.contact import choose_contacts, contact_distance_consistency_mm, finger_of_body
 from worker.quality.diversity import explained_variance
-from worker.quality.probe import HAND_POINTS, Probe
+from worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from worker.quality.table import MEASURES, measure
 from worker.quality.volume import SharedVolume, VoxelVolume
 from worker.run import Run
@@ -196,3 +196,21 @@ def test_a_function_that_is_added_to_the_measures_is_measured_of_every_grasp(mon
 
 def test_every_measure_has_its_row_in_the_table_of_metrics() -> None:
     assert set(MEASURES) <= {metric.name for metric in GRASP_METRICS}
+
+
+def test_the_volume_is_measured_where_the_index_tells_it_and_everywhere_if_asked() -> None:
+    grasps = grasp_set(closed_on_box(0.0))
+    told, every = measure(plate_hand(), BOX, grasps), measure(plate_hand(), BOX, grasps, every_volume=True)
+    assert np.isfinite(told["quality/wrench_volume"][0]).tolist() == [False, True, False]
+    assert np.isfinite(every["quality/wrench_volume"]).all()
+    # One is the hull's nearest facet, the other that of a part of the hull: the same plane, rounded otherwise.
+    np.testing.assert_allclose(told["quality/epsilon"], every["quality/epsilon"], atol=1e-9)
+
+
+def test_points_beyond_reach_are_told_apart_without_being_looked_up() -> None:
+    ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.03))
+    probe = Probe(two_finger_hand(), ball)
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (4000, 3))
+    gap = np.linalg.norm(points, axis=1) - 0.03
+    # The facets of the ball lie 0.04 mm below its sphere.
+    np.testing.assert_allclose(probe.signed_distance(points)[0], np.minimum(gap, REACH_M), atol=1e-4)

@@ -14,6 +14,9 @@ wp.set_module_options({"enable_backward": False})
 #: Gap over which the normal turns from the surface's own to the direction of the closest point [m].
 BLEND = wp.constant(2.0e-4)
 
+#: Distances between positions of some metres are off by less than this [m].
+ROUNDING = wp.constant(1.0e-6)
+
 
 @wp.kernel
 def mesh_distance(
@@ -23,6 +26,8 @@ def mesh_distance(
     corner_normal_in: wp.array(dtype=wp.vec3),
     low_in: wp.vec3,
     high_in: wp.vec3,
+    coarse_in: wp.array3d(dtype=wp.float32),
+    spacing_in: wp.float32,
     # In:
     reach_in: wp.float32,
     point_in: wp.array(dtype=wp.vec3),
@@ -35,6 +40,8 @@ def mesh_distance(
 
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
     The sign is ray parity, or the winding number where `winding` is 1 (open meshes): both are right near creases.
+    `coarse` has the distance at nodes `spacing` apart, the first one at `low`; empty: not known. A point is at most as
+    much nearer to the surface as it is away from a node: what is beyond reach by that is looked up no further.
     """
     i = wp.tid()
     p = point_in[i]
@@ -50,6 +57,14 @@ def mesh_distance(
         and p[1] < high_in[1]
         and p[2] < high_in[2]
     )
+    if inside and coarse_in.shape[0] > 0:
+        at = (p - low_in) / spacing_in
+        x = wp.min(int(at[0] + 0.5), coarse_in.shape[0] - 1)
+        y = wp.min(int(at[1] + 0.5), coarse_in.shape[1] - 1)
+        z = wp.min(int(at[2] + 0.5), coarse_in.shape[2] - 1)
+        node = low_in + spacing_in * wp.vec3(float(x), float(y), float(z))
+        if coarse_in[x, y, z] - wp.length(p - node) > reach_in + ROUNDING:
+            return
     if inside:
         if winding_in == 1:
             query = wp.mesh_query_point_sign_winding_number(mesh_in, p, wp.length(high_in - low_in))

@@ -206,11 +206,11 @@ def grow_to_nearest(
     hull_inout: Hull,
     result_out: wp.array(dtype=wp.float64),
 ):
-    """Grow a hull that has 7 facets where it is nearest to the origin, until its nearest facet is one of the whole hull.
+    """Grow a hull that has 7 facets where it is nearest to the origin, until its nearest facet is the whole hull's.
 
-    A facet with no point above it is a facet of the hull of all points; no facet of the part that is built is nearer, and
-    the whole contains the part. So its distance is that of the whole hull, of which little has to be built (Zheng, "An
-    efficient algorithm for a grasp quality measure", IEEE T-RO 2013).
+    A facet with no point above it is a facet of the hull of all points; no facet of the part that is built is nearer,
+    and the whole contains the part. So its distance is that of the whole hull, of which little has to be built (Zheng,
+    "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013).
 
     `result_out`: least distance of a facet from the origin, at most 0 where the origin is outside; nan; 1 if sound.
     """
