@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import cross, quat_rotate
 from worker.hands.model import Floats, HandModel, JointType
 
 
@@ -27,21 +27,20 @@ def generalized_forces(
 
     Args:
         hand: the hand.
-        bodies: (L, 7) body poses.
-        body: (C,) the body that each point belongs to.
-        points: (C, 3) points in the frame of the poses [m].
-        forces: (C, E, 3) E forces at each point [N].
+        bodies: (..., L, 7) body poses.
+        body: (..., C) the body that each point belongs to.
+        points: (..., C, 3) points in the frame of the poses [m].
+        forces: (..., C, E, 3) E forces at each point [N].
 
     Returns:
-        (C, E, D) [N m, or N for prismatic dofs].
+        (..., C, E, D) [N m, or N for prismatic dofs].
     """
-    axis = quat_rotate(bodies[:, 3:], hand.axis)
-    lever = np.asarray(points, float)[:, None] - bodies[None, :, :3]
+    axis = quat_rotate(bodies[..., 3:], hand.axis)[..., None, :, :]
+    lever = np.asarray(points, float)[..., :, None, :] - bodies[..., None, :, :3]
     # axis . (lever x force) = force . (axis x lever)
-    turning = np.cross(axis[None], lever)
-    motion = np.where((hand.joint_type == JointType.REVOLUTE)[None, :, None], turning, axis[None])
+    motion = np.where((hand.joint_type == JointType.REVOLUTE)[:, None], cross(axis, lever), axis)
     motion = np.where(ancestors(hand)[body][..., None], motion, 0.0)
-    joint = np.einsum("cej,clj->cel", np.asarray(forces, float), motion)
+    joint = np.asarray(forces, float) @ np.swapaxes(motion, -1, -2)
     drive = np.zeros((hand.bodies, hand.dofs))
     moving = np.arange(1, hand.bodies)
     drive[moving, hand.dof[moving]] = hand.multiplier[moving]

@@ -18,7 +18,7 @@ from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.probe import Distances, Probe, probe_of
-from worker.quality.squeeze import Contacts, Hold, hold
+from worker.quality.squeeze import Contacts, Hold, balanced
 from worker.simulation.obstacles import feature_distances
 from worker.simulation.surroundings import Placed
 
@@ -118,22 +118,21 @@ def hold_forces(
     holds: list[Hold] = []
     for start in range(0, len(grasp), _CHUNK):
         found = probe.measure(_rows(grasp, start))
-        for b in range(len(found.bodies)):
-            contacts = _pressing(probe, found, b)
-            holds.append(
-                hold(
-                    hand, found.bodies[b], contacts, total_normal_force=total_normal_force, friction=friction,
-                    centre=obj.centre_of_mass, radius=obj.radius,
-                )
-            )  # fmt: skip
+        holds += balanced(
+            hand, found.bodies, _pressing(probe, found), total_normal_force=total_normal_force, friction=friction,
+            centre=obj.centre_of_mass, radius=obj.radius,
+        )  # fmt: skip
     return holds
 
 
-def _pressing(probe: Probe, found: Distances, b: int) -> Contacts:
-    near = probe.facing(found)[b] & (found.distance[b] < PRESSING_M)
-    place, normal = found.closest[b], found.normal[b]
-    chosen = choose_contacts(near, place, normal, scale=probe.obj.radius, limit=MAX_PRESSING)
-    return Contacts(probe.points.body[chosen], place[chosen], -normal[chosen])
+def _pressing(probe: Probe, found: Distances) -> list[Contacts]:
+    """The contacts of each grasp that press."""
+    near = probe.facing(found) & (found.distance < PRESSING_M)
+    contacts = []
+    for mask, place, normal in zip(near, found.closest, found.normal, strict=True):
+        chosen = choose_contacts(mask, place, normal, scale=probe.obj.radius, limit=MAX_PRESSING)
+        contacts.append(Contacts(probe.points.body[chosen], place[chosen], -normal[chosen]))
+    return contacts
 
 
 def _pregrasp(probe: Probe, grasp: Posture, placed: Placed | None) -> Posture:

@@ -6,15 +6,16 @@ leaves no net wrench and whose normal components sum to a given force.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from worker.hands.jacobian import generalized_forces
 from worker.hands.model import HandModel
+from worker.quality.balance import nonnegative_weights
 from worker.quality.wrench_space import wrenches
 
 Floats = NDArray[np.float64]
@@ -51,51 +52,71 @@ class Hold:
     """Net wrench over the sum of normal forces, torques over the object's radius; 0: perfectly balanced."""
 
 
-def hold(
+def balanced(
     hand: HandModel,
     bodies: Floats,
-    contacts: Contacts,
+    contacts: Sequence[Contacts],
     *,
     total_normal_force: float,
     friction: float,
     centre: Floats,
     radius: float,
-) -> Hold:
-    """Balanced contact forces of one grasp within the hand's torque limits.
+) -> list[Hold]:
+    """Balanced contact forces of B grasps within the hand's torque limits.
 
     Where the torques exceed a limit all forces shrink together, so the balance stays.
 
     Args:
         hand: the hand.
-        bodies: (L, 7) body poses at the grasp.
-        contacts: the contacts.
+        bodies: (B, L, 7) body poses at each grasp.
+        contacts: the contacts of each.
         total_normal_force: wanted sum of normal forces [N].
         friction: Coulomb coefficient of the pyramids.
         centre: (3,) torque origin [m].
         radius: torque scale [m].
     """
-    if not len(contacts.body):
-        return Hold(np.zeros((0, 3)), np.zeros(hand.dofs), 1.0)
-    edge = wrenches(contacts.point, contacts.normal, friction=friction, centre=centre, radius=radius)
-    torque = generalized_forces(hand, bodies, contacts.body, contacts.point, edge[..., :3])
-    share = _shares(edge.reshape(-1, 6), torque.reshape(-1, hand.dofs) / hand.effort)
-    residual = float(np.linalg.norm(share @ edge.reshape(-1, 6)))
-    share = share.reshape(edge.shape[:2]) * total_normal_force
-    wanted = np.einsum("ce,ced->d", share, torque)
-    scale = min(1.0, 1.0 / max(1e-12, float((np.abs(wanted) / hand.effort).max())))
-    return Hold(scale * np.einsum("ce,cej->cj", share, edge[..., :3]), scale * wanted, residual)
+    count = np.array([len(some.body) for some in contacts], int)
+    most = int(count.max(initial=0))
+    if not most:
+        return [Hold(np.zeros((0, 3)), np.zeros(hand.dofs), 1.0) for _ in contacts]
+    body, point, normal = _padded(contacts, most)
+    edge = wrenches(point, normal, friction=friction, centre=centre, radius=radius)
+    torque = generalized_forces(hand, bodies, body, point, edge[..., :3])
+    share = _shares(edge, torque / hand.effort, count)
+    residual = np.linalg.norm(np.einsum("bce,bcew->bw", share, edge), axis=1)
+    share *= total_normal_force
+    wanted = np.einsum("bce,bced->bd", share, torque)
+    scale = np.minimum(1.0, 1.0 / np.maximum(1e-12, (np.abs(wanted) / hand.effort).max(axis=1)))
+    force = scale[:, None, None] * np.einsum("bce,bcej->bcj", share, edge[..., :3])
+    return [
+        Hold(force[b, : count[b]], scale[b] * wanted[b], float(residual[b]) if count[b] else 1.0)
+        for b in range(len(count))
+    ]
 
 
-def _shares(edge: Floats, torque: Floats) -> Floats:
-    """(K,) non-negative weights of K edge wrenches (K, 6), of sum 1 and without net wrench as nearly as can be.
+def _padded(contacts: Sequence[Contacts], most: int) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Body (B, C), point and normal (B, C, 3) of all contacts; those that a grasp lacks have normal z."""
+    body = np.zeros((len(contacts), most), np.intp)
+    point, normal = np.zeros((len(contacts), most, 3)), np.tile([0.0, 0, 1], (len(contacts), most, 1))
+    for b, some in enumerate(contacts):
+        body[b, : len(some.body)], point[b, : len(some.body)] = some.body, some.point
+        normal[b, : len(some.body)] = some.normal
+    return body, point, normal
 
-    `torque` (K, D) are the dofs' torques over their limits, up to a common factor.
+
+def _shares(edge: Floats, torque: Floats, count: NDArray[np.intp]) -> Floats:
+    """(B, C, E) non-negative weights of the edge wrenches (B, C, E, 6) of `count` (B,) contacts, of sum 1 and without net
+    wrench as nearly as can be.
+
+    `torque` (B, C, E, D) are the dofs' torques over their limits, up to a common factor.
     """
-    count = len(edge)
-    effort = torque / max(1e-12, float(np.abs(torque).max()))
-    system = np.vstack([edge.T, SUM * np.ones((1, count)), TORQUE * effort.T, SPREAD * np.eye(count)])
-    target = np.zeros(len(system))
+    used = np.arange(edge.shape[1]) < count[:, None]
+    largest = np.abs(np.where(used[..., None, None], torque, 0.0)).max(axis=(1, 2, 3))
+    effort = torque / np.maximum(1e-12, largest)[:, None, None, None]
+    columns = np.concatenate([edge, np.full((*edge.shape[:3], 1), SUM), TORQUE * effort], axis=-1)
+    target = np.zeros(columns.shape[-1])
     target[6] = SUM
-    share = nnls(system, target)[0]
-    weights: Floats = share / max(float(share.sum()), 1e-12)
-    return weights
+    flat = columns.reshape(len(edge), -1, columns.shape[-1])
+    share = nonnegative_weights(flat, target, SPREAD, count * edge.shape[2])
+    weights: Floats = share / np.maximum(share.sum(axis=1), 1e-12)[:, None]
+    return weights.reshape(edge.shape[:3])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from service.model.errors import InputError
+from service.model.transforms import cross
 from worker.quality.hull import MAX_POINTS, radius, radius_and_volume
 
 Floats = NDArray[np.float64]
@@ -33,25 +34,25 @@ MANY: Final = 24
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
-    """Two unit tangents (N, 3) each, t1 x t2 = n; along the coordinate axes where the normal is."""
+    """Two unit tangents (..., 3) each, t1 x t2 = n; along the coordinate axes where the normal is."""
     n = np.asarray(normals, float)
     axis = np.eye(3)[np.argmin(np.abs(n), axis=-1)]
-    t1 = np.cross(n, axis)
+    t1 = cross(n, axis)
     t1 /= np.linalg.norm(t1, axis=-1, keepdims=True)
-    return t1, np.cross(n, t1)
+    return t1, cross(n, t1)
 
 
 def cone_edges(
     normals: Floats, friction: float, *, edges: int = EDGES, unit: Literal["normal", "force"] = "normal"
 ) -> Floats:
-    """(N, E, 3) edge forces of the friction pyramids about inward unit normals (N, 3).
+    """(..., E, 3) edge forces of the friction pyramids about inward unit normals (..., 3).
 
     `unit` says what has length 1: the normal component (GraspIt!) or the force itself (FRoGGeR).
     """
     t1, t2 = tangents(normals)
     angle = 2 * np.pi * np.arange(edges) / edges
-    around = np.cos(angle)[:, None] * t1[:, None] + np.sin(angle)[:, None] * t2[:, None]
-    force: Floats = np.asarray(normals, float)[:, None] + friction * around
+    around = np.cos(angle)[:, None] * t1[..., None, :] + np.sin(angle)[:, None] * t2[..., None, :]
+    force: Floats = np.asarray(normals, float)[..., None, :] + friction * around
     return force / np.sqrt(1 + friction**2) if unit == "force" else force
 
 
@@ -64,18 +65,18 @@ def wrenches(
     radius: float,
     edges: int = EDGES,
 ) -> Floats:
-    """(N, E, 6) edge wrenches: force, then torque about `centre` over `radius`.
+    """(..., E, 6) edge wrenches: force, then torque about `centre` over `radius`.
 
     Args:
-        points: (N, 3) contact points [m].
-        normals: (N, 3) unit normals into the object.
+        points: (..., 3) contact points [m].
+        normals: (..., 3) unit normals into the object.
         friction: Coulomb coefficient.
         centre: (3,) torque origin, the centre of mass [m].
         radius: torque scale, the object's largest radius [m].
         edges: edges of the pyramid.
     """
     force = cone_edges(normals, friction, edges=edges)
-    torque = np.cross((np.asarray(points, float) - centre)[:, None] / radius, force)
+    torque = cross((np.asarray(points, float) - centre)[..., None, :] / radius, force)
     return np.concatenate([force, torque], axis=-1)
 
 

@@ -19,7 +19,7 @@ from worker.planners.fast_graspd import pairs
 from worker.planners.fast_graspd.planner import optimise_batch
 from worker.planners.port import Wanted
 from worker.run import Run
-from worker.studies.timing import kernel_shares
+from worker.studies.timing import host_ms, kernel_shares
 
 Load = Callable[[float], ObjectModel]
 Say = Callable[[str], None]
@@ -42,7 +42,8 @@ def bench(
         say: told of each run as it ends.
 
     Returns:
-        `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds, `kernels`.
+        `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
+        `host_ms_per_grasp`, `kernels`.
     """
     first = fidelities[0]
     start = _start_times(hand, load(first.face_error_m), first, device)
@@ -64,6 +65,7 @@ def bench(
         "object": load(first.face_error_m).name,
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
         "start": start,
+        "host_ms_per_grasp": round(host_ms(hand, load(first.face_error_m), first, min(32, max(batches)), device), 3),
         "kernels": kernel_shares(pair, first, min(32, max(batches))),
         "runs": runs,
     }

@@ -1,17 +1,25 @@
-"""Where the time of an iteration goes, launch by launch."""
+"""Where the time goes: of an iteration, launch by launch; of a batch, in kernels and on the host."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
+from warp._src import context
 
 from service.model.domain import Fidelity
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair
+from worker.planners.fast_graspd.planner import plan
 from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.starts import sample_starts
+from worker.planners.port import Wanted
+from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.model import Model
 from worker.simulation.record import record_iteration
@@ -89,3 +97,44 @@ def _timed(
             found.setdefault(name, []).append(time.perf_counter() - began)
     launches.run(len(schedule) - before - sampled)
     return {name: float(np.median(values)) for name, values in found.items()}, data.state(len(state.pivot))
+
+
+def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, device: str) -> float:
+    """Processor time of one thread outside the kernels for a raw grasp [ms]: starts, merits, projection, the postures
+    around the grasp. On a GPU the kernels take none of it, so it bounds the grasps per second from above.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        fidelity: the knobs.
+        count: grasps of the batch; another one before it warms caches up.
+        device: Warp device.
+    """
+    run = Run(device, threads=1)
+    plan(hand, obj, Wanted(min(count, 4), fidelity, seed=1), run)
+    with _kernel_seconds() as kernels:
+        began = time.thread_time()
+        plan(hand, obj, Wanted(count, fidelity, seed=0), run)
+        total = time.thread_time() - began
+    return 1e3 * (total - sum(kernels)) / count
+
+
+@contextmanager
+def _kernel_seconds() -> Iterator[list[float]]:
+    """Processor seconds of each kernel that this thread runs on the CPU."""
+    spent: list[float] = []
+    original = context.invoke
+
+    def invoke(*arguments: Any) -> Any:
+        began = time.thread_time()
+        try:
+            return original(*arguments)
+        finally:
+            spent.append(time.thread_time() - began)
+
+    # Warp tells the time of kernels on CUDA only.
+    context.invoke = invoke
+    try:
+        yield spent
+    finally:
+        context.invoke = original

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
+from service.model.transforms import cross, quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.data import Data
@@ -49,35 +49,62 @@ def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.
 def _frame(z: Floats) -> Floats:
     """Rotation matrix with third column z (3,) and an arbitrary but fixed first."""
     helper = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = np.cross(helper, z)
+    x = cross(helper, z)
     x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
+    return np.stack([x, cross(z, x), z], axis=1)
 
 
-def draw(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> _Draw:
+@dataclass(frozen=True)
+class _Pair:
+    """What all draws of a hand around an object share."""
+
+    hand: HandModel
+    centre: Floats
+    """(3,) centre of mass of the object [m]."""
+    corners: Floats
+    """(F, 3, 3) corners of its faces [m]."""
+    across: Floats
+    """(F, 3) normals of twice the faces' area [m^2]."""
+    area: Floats
+    """(F,) [m^2], doubled."""
+    share: Floats
+    """(F,) the area of the faces up to each, over the whole."""
+    palm: Floats
+    """(3, 3) rotation to the frame of the palm's approach."""
+
+    @classmethod
+    def of(cls, hand: HandModel, obj: ObjectModel) -> _Pair:
+        corners = obj.vertices[obj.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(across, axis=1)
+        share = np.cumsum(area / area.sum())
+        return cls(
+            hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T
+        )
+
+
+def draw(pair: _Pair, rng: np.random.Generator) -> _Draw:
     """One candidate start at its nearest distance; `approach` (3,) is the direction in which the palm looks."""
-    triangles = obj.vertices[obj.faces]
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    face = int(rng.choice(len(area), p=area / area.sum()))
+    hand = pair.hand
+    face = int(pair.share.searchsorted(rng.random(), side="right"))
     u, v = rng.random(2)
     if u + v > 1:
         u, v = 1 - u, 1 - v
-    corner = triangles[face]
+    corner = pair.corners[face]
     point = corner[0] + u * (corner[1] - corner[0]) + v * (corner[2] - corner[0])
-    normal = cross[face] / area[face]
+    normal = pair.across[face] / pair.area[face]
     tilt_axis = _frame(normal)[:, :2] @ rng.normal(size=2)
     angle = float(np.linalg.norm(tilt_axis)) * TILT
     if angle > 1e-9:
         axis = tilt_axis / np.linalg.norm(tilt_axis)
-        normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
+        normal = normal * np.cos(angle) + cross(axis, normal) * np.sin(angle)
     approach = -normal
-    align = _frame(approach) @ _frame(hand.palm.approach).T
+    align = _frame(approach) @ pair.palm
     roll = quat_from_axis_angle(approach, np.array(rng.uniform(0, 2 * np.pi)))
     rotation = quat_multiply(roll, quat_from_matrix(align))
     span = hand.upper - hand.lower
     q = np.clip(hand.preshape + POSTURE_NOISE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
-    pivot = point - obj.centre_of_mass - approach * rng.uniform(*GAP)
+    pivot = point - pair.centre - approach * rng.uniform(*GAP)
     return _Draw(HandState(pivot[None], rotation[None], q[None]), approach)
 
 
@@ -126,11 +153,12 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     """
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(indices) * each * len(RETREATS))
+    pair = _Pair.of(hand, obj)
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     best: list[tuple[float, HandState] | None] = [None] * len(generators)
     open_ = list(range(len(generators)))
     for _ in range(DRAWS):
-        draws = [draw(hand, obj, generators[i]) for i in open_]
+        draws = [draw(pair, generators[i]) for i in open_]
         states = _retreated(draws)
         depth = probe.depths(states).reshape(len(draws), len(RETREATS))
         for row, i in enumerate(open_):
