@@ -105,8 +105,8 @@ def _padded(contacts: Sequence[Contacts], most: int) -> tuple[NDArray[np.intp], 
 
 
 def _shares(edge: Floats, torque: Floats, count: NDArray[np.intp]) -> Floats:
-    """(B, C, E) non-negative weights of the edge wrenches (B, C, E, 6) of `count` (B,) contacts, of sum 1 and without net
-    wrench as nearly as can be.
+    """(B, C, E) non-negative weights of the edge wrenches (B, C, E, 6) of `count` (B,) contacts: of sum 1, and without
+    net wrench as nearly as can be.
 
     `torque` (B, C, E, D) are the dofs' torques over their limits, up to a common factor.
     """

@@ -78,9 +78,7 @@ class _Pair:
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(across, axis=1)
         share = np.cumsum(area / area.sum())
-        return cls(
-            hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T
-        )
+        return cls(hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T)
 
 
 def draw(pair: _Pair, rng: np.random.Generator) -> _Draw:

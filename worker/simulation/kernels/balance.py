@@ -2,8 +2,8 @@
 
 Each system is min |M x - t|^2 + s^2 |x|^2 over x >= 0, with R rows and K columns, R much less than K. Its minimum has
 s^2 x = max(0, M^T r) with the residual r = t - M x, so r is where the convex, piecewise quadratic
-phi(r) = s^2 |r|^2 / 2 + |max(0, M^T r)|^2 / 2 - s^2 t r is least: R unknowns instead of K. Newton's method on it ends after
-finitely many steps, at the exact minimum, as soon as the set of columns with M^T r > 0 stays the same.
+phi(r) = s^2 |r|^2 / 2 + |max(0, M^T r)|^2 / 2 - s^2 t r is least: R unknowns instead of K. Newton's method on it ends
+after finitely many steps, at the exact minimum, as soon as the set of columns with M^T r > 0 stays the same.
 """
 
 import warp as wp
