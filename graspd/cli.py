@@ -47,6 +47,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("render", "worker.commands.render", "Without a server", "Pictures of scenes with their labels."),
     ("chart", "worker.commands.chart", "Studies", "Speed against accuracy of methods and fidelities."),
     ("bench", "worker.commands.bench", "Studies", "Grasps per second, and where the time goes."),
+    ("view", "worker.commands.view", "Without a server", "Grasps of a file in 3D in the browser, one at a time."),
     ("pictures", "worker.commands.render", "Without a server", "The best grasps of a file on one sheet."),
     ("export", "worker.commands.exchange", "Without a server", "Grasps and pictures in the formats of others."),
     ("import", "worker.commands.exchange", "Without a server", "Grasps of others, judged and measured like ours."),

@@ -49,6 +49,13 @@ def chart(
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
     remark: Annotated[str, typer.Option(help="A sentence on the conditions, for the report.")] = "",
+    scene: Annotated[
+        str,
+        typer.Option(help="Other than free: planned in table, bin, shelf or a file, against free ones put there."),
+    ] = "free",
+    work: Annotated[
+        Path | None, typer.Option(help="With --scene: folder that keeps each result; a stopped run goes on there.")
+    ] = None,
     publish: Annotated[
         bool, typer.Option("--publish", help="Also into the store, for the dashboard and `fidelity: auto`.")
     ] = False,
@@ -64,17 +71,23 @@ def chart(
     from worker.studies.chart.sweeps import turns
 
     turns(knobs=knob or ())  # a wrong name is told before an hour of work
-    work = Run(Device(device).resolve(), threads)
+    if scene != "free" and (sweep or publish):
+        raise InputError("--sweep and --publish are of free objects' charts; leave out --scene")
+    on = Run(Device(device).resolve(), threads)
     batches = [_number(part) for part in _parts(batch)]
     if quick:
         hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
         batches, peer_batch, repeats = [4], 2, 1
     chosen = settings_of(
         _parts(methods), known_fidelities(_parts(fidelities)), batches=batches, peer_batch=peer_batch,
-        options=option or [], quick=quick, run=work,
+        options=option or [], quick=quick, run=on,
     )  # fmt: skip
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
+
+    if scene != "free":
+        _in_scenes(models, things, chosen, scene, work=work, said=said, out=out, json=json)
+        return
 
     def keep(so_far: dict[str, Any]) -> None:
         if out is not None:
@@ -83,13 +96,36 @@ def chart(
     result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | said
     if sweep:
         result["sweeps"] = turn(
-            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=work,
+            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on,
             knobs=knob or (), say=_say,
         )  # fmt: skip
     if out is not None:
         write(result, out)
     if publish:
         _publish(result, data_dir)
+    if json:
+        emit(result)
+    else:
+        typer.echo(markdown(result))
+
+
+def _in_scenes(
+    hands: Sequence[Any], things: Sequence[Any], settings: Sequence[Any], scene: str, *, work: Path | None,
+    said: dict[str, str], out: Path | None, json: bool,
+) -> None:  # fmt: skip
+    from service.model.scene_spec import parse_scene
+    from worker.studies.chart.scene_report import markdown, write
+    from worker.studies.chart.scenes import scene_chart
+
+    spec = parse_scene(scene)
+    # Every stable face of an object, where it is dropped.
+    spec = spec if spec.target is not None else parse_scene(scene, faces="all")
+
+    def keep(so_far: dict[str, Any]) -> None:
+        if out is not None:
+            write(so_far | said, out)
+
+    result = scene_chart(hands, things, settings, spec, work=work, say=_say, keep=keep) | said
     if json:
         emit(result)
     else:

@@ -19,7 +19,10 @@ from service.model.version import PACKAGE_VERSION
 
 app = typer.Typer()
 
-STUDIES: Final = ("time_step", "stiffness", "contact_count", "gradient", "shapes", "starts", "rates", "length")
+STUDIES: Final = (
+    "time_step", "stiffness", "contact_count", "gradient", "shapes", "starts", "rates", "length",
+    "scene_height", "scene_wall", "scene_neighbours", "scene_size",
+)  # fmt: skip
 
 
 @app.command(epilog="graspd stability --only gradient --only starts --out stability --publish")
@@ -33,7 +36,8 @@ def stability(
     threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
     source: Annotated[
-        Path | None, typer.Option("--from", help="A stability.json: draw and publish its maps, measure nothing.")
+        list[Path] | None,
+        typer.Option("--from", help="A stability.json: draw and publish its maps, measure nothing; several times."),
     ] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Also into the store, for the dashboard.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; GRASPD_DATA_DIR.")] = None,
@@ -44,8 +48,8 @@ def stability(
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
         raise InputError(f"there is no study {unknown[0]!r}; choose of {', '.join(STUDIES)}")
-    if source is not None:
-        found = _read(source)
+    if source:
+        found = _joined([_read(path) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
         found = _measured(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
@@ -81,6 +85,13 @@ def _read(path: Path) -> Stability:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError:
         raise InputError(f"{path} is no stability.json; `graspd stability --out FOLDER` writes one") from None
+
+
+def _joined(parts: list[Stability]) -> Stability:
+    """Several runs as one: the later one's map where both have it."""
+    maps = {one.name: one for part in parts for one in part.maps}
+    commands = "; ".join(dict.fromkeys(part.command for part in parts))
+    return replace(parts[-1], command=commands, maps=list(maps.values()))
 
 
 def _publish(found: Stability, data_dir: Path | None) -> str:

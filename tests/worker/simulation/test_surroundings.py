@@ -80,14 +80,18 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
 
 
-def mujoco_distances(hand, postures: Posture, plane: Obstacle) -> np.ndarray:
+def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
     from worker.scenes.neighbours import _add_piece
 
     spec = mujoco.MjSpec()
-    geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
-    normal, offset = plane.planes[0, :3], plane.planes[0, 3]
-    geom.pos = offset * normal
-    mujoco.mju_quatZ2Vec(geom.quat, normal)
+    if len(obstacle.corners):
+        spec.add_mesh(name="obstacle", uservert=obstacle.corners.ravel())
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="obstacle")
+    else:
+        geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
+        normal, offset = obstacle.planes[0, :3], obstacle.planes[0, 3]
+        geom.pos = offset * normal
+        mujoco.mju_quatZ2Vec(geom.quat, normal)
     for k, one in enumerate(hand.pieces):
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", one)
     model = spec.compile()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,13 +46,37 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
         figure.savefig(file, dpi=150)
 
 
+def draw_scenes(rows: Sequence[Row], files: Sequence[Path]) -> None:
+    """Share of tries that are lifted over lifted grasps per second, at full and at half friction."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    styles = _styles(rows)
+    for axes, (title, key) in zip(
+        panels, (("Lifted", "lift"), ("Lifted at half the friction", "lift_hard")), strict=True
+    ):
+        _panel(axes, rows, styles, x="valid_per_second", y=key, label=_one_of_several)
+        _front(axes, rows, key, True)
+        axes.set_xlabel("lifted grasps per CPU second")
+        axes.set_title(title, loc="left", fontsize=11)
+        axes.set_ylim(-0.07, 1.04)
+    panels[0].set_ylabel("share of all tries")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    for file in files:
+        figure.savefig(file, dpi=150)
+
+
 def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
     """Colour and marker of each method; its fidelities share them."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
 
-def _panel(axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], *, x: str, y: str) -> None:
+def _panel(
+    axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], *, x: str, y: str,
+    label: Callable[[Row, Sequence[Row]], str] | None = None,
+) -> None:  # fmt: skip
     shown: set[str] = set()
     labels = []
     for row in rows:
@@ -71,9 +95,9 @@ def _panel(axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]]
             label=None if row["method"] in shown else row["method"], zorder=3,
         )  # fmt: skip
         shown.add(row["method"])
-        text = _label(row, rows)
-        labels.append((at, row[y], f"{text}, 0 of {row['grasps']}" if none else text, colour))
-    _logarithmic(axes, [at * (0.5 if ", 0 of" in text else 1.0) for at, _, text, _ in labels])
+        text = (label or _label)(row, rows)
+        labels.append((at, row[y], ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none))), colour))
+    _logarithmic(axes, [at * (0.5 if "0 of" in text else 1.0) for at, _, text, _ in labels])
     top = max([row[f"{y}_high"] for row in rows] or [1.0])
     axes.set_ylim(-0.09 * top, 1.08 * top)
     axes.grid(alpha=0.25)
@@ -112,6 +136,11 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
         return str(row["method"])
     several = len({r["batch"] for r in own}) > 1
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
+
+
+def _one_of_several(row: Row, rows: Sequence[Row]) -> str:
+    """The fidelity where a method has several; the legend names the others."""
+    return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
 def _front(axes: Any, rows: Sequence[Row], key: str, more: bool) -> None:

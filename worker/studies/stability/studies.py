@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 from service.model.stability import StabilityMap
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.run import Run
-from worker.studies.stability import descents, gradients, integrators, shapes
+from worker.studies.stability import descents, gradients, integrators, scenes, shapes
 
 Say = Callable[[str], None]
+
+#: Hands beside the one that is named, for what depends on a hand's size and build.
+OTHER_HANDS: Final = ("barrett",)
 
 
 def run(
@@ -22,6 +26,9 @@ def run(
     def few(values: Sequence[float]) -> Sequence[float]:
         return values[1::2] if quick else values
 
+    hands = [model] if quick else [model, *(hand_from_path(name) for name in OTHER_HANDS if name != model.name)]
+    gaps = (5, 80) if quick else scenes.GAPS_MM
+    place: dict[str, Any] = {"count": 2 if quick else 12, "run": work, "say": say}
     lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
     studies: dict[str, Callable[[], StabilityMap]] = {
         "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
@@ -43,6 +50,18 @@ def run(
             model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
         ),
         "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
+        "scene_height": lambda: scenes.height_map(
+            hands, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM, **place
+        ),
+        "scene_wall": lambda: scenes.wall_map(
+            hands, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS), **place
+        ),
+        "scene_neighbours": lambda: scenes.neighbour_map(
+            hands, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS), **place
+        ),
+        "scene_size": lambda: scenes.size_map(
+            hands, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS, **place
+        ),
     }  # fmt: skip
     found = []
     for name in names:

@@ -1,0 +1,102 @@
+"""Grasps planned in scenes against filtered ones: what is run, what is counted, and that a stopped run goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from worker.commands.chart import app
+from worker.studies.chart.scene_report import markdown
+from worker.studies.chart.scenes import FILTERED, IN_SCENE, figures, summed
+
+ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    folder = tmp_path_factory.mktemp("chart")
+    arguments = [*ARGUMENTS, "--objects", "block", "--work", str(folder / "work"), "--out", str(folder), "--json"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout.strip().splitlines()[-1]), folder
+
+
+def test_who_plans_in_scenes_does_both_and_others_are_filtered(made: tuple[dict[str, Any], Path]) -> None:
+    assert [(run["method"], run["way"]) for run in made[0]["runs"]] == [
+        ("fast_graspd", IN_SCENE),
+        ("fast_graspd", FILTERED),
+        ("autograsp", FILTERED),
+    ]
+
+
+def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[str, Any], Path]) -> None:
+    for run in made[0]["runs"]:
+        assert 0 <= run["lift_hard_count"] <= run["lift_count"] <= run["clear_count"] <= run["grasps"]
+        assert run["valid_per_second"] == pytest.approx(run["lift_count"] / run["seconds"], rel=1e-4)
+        assert run["lift_low"] <= run["lift"] <= run["lift_high"]
+
+
+def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
+    found, folder = made
+    assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
+    with (folder / "chart.csv").open() as stream:
+        assert [row["method"] for row in csv.DictReader(stream)] == [run["method"] for run in found["runs"]]
+    assert (folder / "chart.png").stat().st_size > 10_000 and (folder / "chart.svg").is_file()
+    assert f"| {IN_SCENE} | fast_graspd | draft |" in (folder / "chart.md").read_text()
+
+
+def test_a_run_that_was_stopped_plans_only_what_is_missing(
+    made: tuple[dict[str, Any], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, folder = made
+    kept = sorted((folder / "work").glob("*.json"))
+    assert len(kept) == 3
+    kept[0].unlink()
+    planned = []
+
+    def tried(setting: Any, way: str, hand: Any, place: Any) -> dict[str, Any]:
+        planned.append((setting.method, way))
+        return {**runs[setting.method, way]}
+
+    runs = {(run["method"], run["way"]): run for run in found["runs"]}
+    monkeypatch.setattr("worker.studies.chart.scenes._tried", tried)
+    arguments = [*ARGUMENTS, "--objects", "block", "--work", str(folder / "work"), "--json"]
+    again = json.loads(CliRunner().invoke(app, arguments).stdout.strip().splitlines()[-1])
+    assert len(planned) == 1
+    assert again["runs"] == found["runs"]
+
+
+def test_a_free_chart_s_options_are_refused_with_a_scene(tmp_path: Path) -> None:
+    for option in ("--publish", "--sweep"):
+        done = CliRunner().invoke(app, [*ARGUMENTS, "--objects", "block", option])
+        assert done.exit_code == 2 and "leave out --scene" in done.output
+
+
+def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:
+    counts = {"grasps": grasps, "seconds": seconds, "clear_count": lifted, "lift_count": lifted, "lift_hard_count": 0}
+    said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
+    return {**said, **figures([counts]), "scenes": 1}
+
+
+def test_a_gain_is_the_median_of_the_pairs_in_which_filtering_found_any() -> None:
+    runs = [run_of(IN_SCENE, pair, 8, 2.0) for pair in "abc"]
+    runs += [run_of(FILTERED, pair, lifted, 1.0) for pair, lifted in (("a", 1), ("b", 2), ("c", 0))]
+    inside, outside = summed(runs)
+    assert inside["gain"] == pytest.approx((4 / 1 + 4 / 2) / 2)
+    assert (inside["pairs_with_one"], outside["pairs_with_one"]) == (3, 2)
+    assert inside["lift"] == 0.8 and outside["valid_per_second"] == pytest.approx(1.0)
+
+
+def test_a_pair_that_is_refused_counts_as_tries_without_a_lift() -> None:
+    refused = run_of(IN_SCENE, "a", 0, 0.0) | {"note": "nothing can reach it"}
+    (row,) = summed([refused, run_of(IN_SCENE, "b", 5, 1.0)])
+    assert row["lift"] == 0.25 and row["grasps_per_second"] == pytest.approx(10.0)
+    assert row["valid_per_second"] == pytest.approx(5.0)
+    chart = {"runs": [refused], "summary": [row], "device": "d", "created": "c", "versions": {"graspd": "0"}}
+    said = markdown(chart | {"scene": {"kind": "table", "faces": "all"}})
+    assert "## Refused" in said and "nothing can reach it" in said

@@ -1,0 +1,184 @@
+"""`graspd view`: it serves a page, its slider moves hand and object, grasps follow one another, it ends cleanly."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from service.model.scene_spec import SceneSpec
+from service.model.transforms import quat_from_axis_angle
+from service.store.shards import Shard, json_attribute, write_shard
+from tests.worker.models import object_from_mesh, two_finger_hand
+from worker.hands.kinematics import body_poses
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.rendering.hands import drawn_bodies
+
+viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
+
+HAND = two_finger_hand()
+GRASPS = 3
+LIFT_M = 0.1
+
+
+def arrays(joints: int) -> dict[str, np.ndarray]:
+    """Three grasps in a bin, of which the second is valid: the hand comes down along z and rises again."""
+    turned = quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))
+    pose = np.tile(np.concatenate([[0, 0, 0.06], turned]), (GRASPS, 1))
+    pose[:, 0] = 0.01 * np.arange(GRASPS)
+    coming = np.repeat(pose[:, None], 3, axis=1)
+    coming[..., 2] += [0.1, 0.05, 0]
+    lift = pose + np.array([0, 0, LIFT_M, 0, 0, 0, 0])
+    made: dict[str, np.ndarray] = {}
+    for k, name in enumerate(("pregrasp", "grasp", "squeeze")):
+        made |= {f"{name}/hand_pose": pose, f"{name}/joint_positions": np.full((GRASPS, joints), 0.1 * k)}
+    made |= {"grasp/approach": coming, "grasp/approach_joint_positions": np.full((GRASPS, joints), -0.1)}
+    made |= {"grasp/lift": lift, "grasp/scene_index": np.array([0, 0, 1])}
+    made["scene/object_pose"] = np.array([[0.05, 0, 0.03, 1, 0, 0, 0], [-0.05, 0, 0.03, 1, 0, 0, 0]])
+    made["scene/rest_probability"] = np.ones(2)
+    per_grasp = np.linspace(0.1, 0.3, GRASPS)
+    swept = ("contact_area_cm2", "epsilon", "wrench_volume")
+    plain = ("intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss")
+    made |= {f"quality/{name}": np.repeat(per_grasp[:, None], 2, axis=1) for name in swept}
+    made |= {f"quality/{name}": per_grasp for name in plain}
+    made |= {"quality/thresholds_m": np.array([0.002, 0.005]), "quality/contact_links": np.full(GRASPS, 4)}
+    return made | {"quality/valid": np.array([0, 1, 0], np.uint8), "quality/success": np.array([0, 1, 0], np.int8)}
+
+
+SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator:
+    from worker.viewing.viewer import Shown, Viewer
+
+    block = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
+    said = {"hand": "two fingers", "object": "block", "scene": SCENE}
+    made = Viewer(Shown(Shard("base", said, arrays(2)), HAND, block), port=0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(autouse=True)
+def first(request) -> None:
+    """Each test begins at the grasp of the first file's first filter."""
+    if "viewer" in request.fixturenames:
+        made = request.getfixturevalue("viewer")
+        made.choose("all")
+
+
+def test_the_page_is_answered_on_the_loopback(viewer):
+    assert viewer.url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(viewer.url, timeout=10) as answer:
+        assert b"<html" in answer.read().lower()
+
+
+@pytest.mark.parametrize(("place", "height", "joint"), [(0, 0.16, -0.1), (1, 0.06, 0), (2, 0.06, 0.1), (4, 0.16, 0.2)])
+def test_the_slider_moves_the_bodies_of_the_hand_where_its_kinematics_say(viewer, place, height, joint):
+    viewer.slider.value = place
+    viewer.show()
+    root = np.concatenate([[0, 0, height], arrays(2)["grasp/hand_pose"][0, 3:]])
+    (bodies,) = body_poses(HAND, root[None], np.full((1, 2), float(joint)))
+    for node, body in zip(viewer.models.bodies, drawn_bodies(HAND), strict=True):
+        # The nodes keep single precision.
+        np.testing.assert_allclose(node.position, bodies[body, :3], atol=1e-6)
+        assert abs(node.wxyz @ bodies[body, 3:]) == pytest.approx(1, abs=1e-6)
+
+
+def test_the_object_is_carried_up_with_the_hand_and_not_before(viewer):
+    for place, height in ((0, 0.0), (3, 0.0), (3.5, LIFT_M / 2), (4, LIFT_M)):
+        viewer.slider.value = place
+        viewer.show()
+        np.testing.assert_allclose(viewer.models.thing.position, [0, 0, height], atol=1e-9)
+
+
+def test_the_next_grasp_stands_in_its_own_scene_and_after_the_last_comes_the_first(viewer):
+    assert viewer.row == 0
+    viewer.step(2)
+    assert viewer.row == 2
+    np.testing.assert_allclose(viewer.models.rest.position, [-0.05, 0, 0.03])
+    viewer.step(1)
+    assert viewer.row == 0
+    np.testing.assert_allclose(viewer.models.rest.position, [0.05, 0, 0.03])
+
+
+def test_only_valid_grasps_are_shown_where_that_is_chosen(viewer):
+    assert viewer.filters == ("valid only", "all")
+    viewer.choose("valid only")
+    assert viewer.row == 1
+    viewer.step(1)
+    assert viewer.row == 1
+
+
+def test_dots_are_where_the_hand_is_near_the_object(viewer):
+    viewer.slider.value = 0
+    viewer.show()
+    assert len(viewer.models.contacts.points) == 0
+    viewer.slider.value = 2
+    viewer.show()
+    low, high = np.array([0.025, 0.02, 0.03]) * -1 - 0.006, np.array([0.025, 0.02, 0.03]) + 0.006
+    points = np.asarray(viewer.models.contacts.points)
+    assert len(points) and ((points > low) & (points < high)).all()
+
+
+def test_a_grasp_in_a_bin_has_five_supports_around_it_and_they_can_be_hidden(viewer):
+    nodes = [viewer.server.scene.get_handle_by_name(f"/scene/support{k}") for k in range(6)]
+    assert sum(node is not None for node in nodes) == 5
+    viewer.models.show_scene(False)
+    assert not any(node.visible for node in nodes if node is not None)
+
+
+def test_without_viser_one_line_says_how_to_install_it(tmp_path, monkeypatch):
+    from worker.commands.view import app
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    result = CliRunner().invoke(app, [str(tmp_path / "grasps.h5")])
+    assert result.exit_code == 2
+    assert "pip install 'graspd[view]'" in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+@pytest.mark.timeout(180)
+def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
+    hand, block = hand_from_path("barrett"), object_from_path("block")
+    said = {
+        "hand": "barrett", "hand_digest": hand.digest, "object": "block", "object_digest": block.digest,
+        "method": "none", "fidelity": json_attribute({"face_error_m": 3e-4}), "seed": 0, "batch": 0,
+        "joint_names": list(hand.joint_names), "scene": SCENE,
+    }  # fmt: skip
+    file = tmp_path / "grasps.h5"
+    file.write_bytes(write_shard("base", arrays(len(hand.joint_names)), said))
+    command = [sys.executable, "-m", "graspd", "view", str(file), "--port", "0"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"SSH_CONNECTION": ""}
+    ) as process:
+        assert process.stdout is not None
+        address, forwarding = process.stdout.readline(), process.stdout.readline()
+        found = re.search(r"http://127\.0\.0\.1:(\d+)$", address.strip())
+        assert found, address
+        assert f"ssh -L {found[1]}:127.0.0.1:{found[1]}" in forwarding
+        with urllib.request.urlopen(found[0], timeout=10) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+
+
+def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
+    from worker.commands.view import app
+
+    file = tmp_path / "grasps.h5"
+    file.write_text("nothing")
+    result = CliRunner().invoke(app, [str(file)])
+    assert result.exit_code == 2
+    assert "grasps.h5 is not a readable HDF5 file" in result.output

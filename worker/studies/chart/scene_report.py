@@ -1,0 +1,99 @@
+"""A chart of scenes as JSON, CSV, Markdown and pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from worker.studies.chart.figure import draw_scenes
+from worker.studies.chart.scenes import FILTERED, IN_SCENE
+
+Row = Mapping[str, Any]
+
+COLUMNS: Final = (
+    "way", "method", "fidelity", "hand", "object", "scenes", "grasps", "seconds", "clear_count", "lift_count",
+    "lift_hard_count", "clear", "lift", "lift_low", "lift_high", "lift_hard", "grasps_per_second", "valid_per_second",
+    "valid_per_second_low", "valid_per_second_high", "note",
+)  # fmt: skip
+
+
+def write(chart: Row, folder: Path) -> list[Path]:
+    """chart.json, chart.csv, chart.md, chart.png and chart.svg in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / name for name in ("chart.json", "chart.csv", "chart.md", "chart.png", "chart.svg")]
+    files[0].write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
+    with files[1].open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(chart["runs"])
+    draw_scenes([named(row) for row in chart["summary"]], files[3:])
+    files[2].write_text(markdown(chart) + "\n")
+    return files
+
+
+def named(row: Row) -> dict[str, Any]:
+    """The row with its way in the method's name, as the picture has them apart."""
+    return {**row, "method": f"{row['method']}, {row['way']}"}
+
+
+def markdown(chart: Row) -> str:
+    """What was run, all pairs together, each pair."""
+    parts = [_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"])]
+    parts += ["## Each hand and object", _runs(chart["runs"])]
+    if refused := [run for run in chart["runs"] if run["note"]]:
+        lines = [
+            f"- {run['method']} {run['fidelity']}, {run['hand']}, {run['object']}: {run['note']}" for run in refused
+        ]
+        parts += ["## Refused", "\n".join(lines)]
+    return "\n\n".join(parts)
+
+
+def _head(chart: Row) -> str:
+    hands, objects = (", ".join(dict.fromkeys(run[name] for run in chart["runs"])) for name in ("hand", "object"))
+    command = f"    {chart['command']}\n\n" if chart.get("command") else ""
+    remark = f" {chart['remark']}" if chart.get("remark") else ""
+    return (
+        f"# In the scene, or filtered\n\n{command}{chart['device']}, graspd {chart['versions']['graspd']}, "
+        f"{chart['created']}. Scene: {chart['scene']['kind']}, faces {chart['scene']['faces']}. Hands: {hands}. "
+        f"Objects: {objects}.{remark}\n\n"
+        f"- *{IN_SCENE}*: planned for the scene\n"
+        f"- *{FILTERED}*: planned around a free object and put into the same scenes, grasp i into scene i in turn: all "
+        "that peers can do\n"
+        "- *clear*: free of what stands there, coming, closing and lifting\n"
+        "- *lifted*: clear, and lifted by MuJoCo (level *lift*); share of all tries\n"
+        "- speed: lifted grasps over CPU seconds of planner and postures, all cores together, without the referee\n"
+        "- bars: 95 % (Wilson); hollow: none was lifted, the most that there can be"
+    )
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    lines = [
+        "| way | method | fidelity | tries | clear | lifted | half friction | lifted per CPU second | pairs with one | "
+        "× over filtered |",
+        "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    for row in rows:
+        gain = "–" if row["gain"] is None else f"{row['gain']:.3g}"
+        lines.append(
+            f"| {row['way']} | {row['method']} | {row['fidelity']} | {row['grasps']} | {row['clear']:.2f} | "
+            f"{row['lift']:.2f} | {row['lift_hard']:.2f} | {row['valid_per_second']:.3g} | "
+            f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
+        )
+    note = "× over filtered: median of the pairs in which the same fidelity, filtered, had any at all."
+    return "\n".join(lines) + f"\n\n{note}"
+
+
+def _runs(runs: Sequence[Row]) -> str:
+    lines = [
+        "| hand | object | way | method | fidelity | tries | clear | lifted | half friction | lifted per CPU second |",
+        "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: |",
+    ]
+    lines += [
+        f"| {run['hand']} | {run['object']} | {run['way']} | {run['method']} | {run['fidelity']} | {run['grasps']} | "
+        f"{run['clear']:.2f} | {run['lift']:.2f} | {run['lift_hard']:.2f} | {run['valid_per_second']:.3g} |"
+        for run in runs
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,235 @@
+"""Grasps planned in a scene against grasps planned around a free object, put into the same scene and filtered.
+
+A setting of a method that plans in scenes is run both ways, others only the second. Grasp i is tried in scene i of the
+object's stable faces in turn, whichever way it was planned, and judged alike: clear on its way, lifted, lifted at half
+the friction. Speed is lifted grasps over seconds of all cores together, planner and postures without way and referee:
+it does not follow what else the machine does.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from service.model.clock import timestamp
+from service.model.digests import digest_json
+from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
+from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.planners import Wanted, method, synthesize
+from worker.quality.intervals import wilson
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.lifting import judge_lifts
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.scenes.way import plan_way
+from worker.simulation.surroundings import Placed, Scenes
+from worker.studies.bench import device_name
+from worker.studies.chart.chart import TRUE_ERROR_M, Thing
+from worker.studies.chart.statistics import pareto, plain
+from worker.studies.chart.trials import SEED, WARM_SEED, Setting
+
+Row = dict[str, Any]
+Say = Callable[[str], None]
+
+IN_SCENE: Final = "in the scene"
+FILTERED: Final = "free, filtered"
+#: Shares of all tries, by their column.
+SHARES: Final = ("clear", "lift", "lift_hard")
+
+
+@dataclass(frozen=True)
+class Place:
+    """An object in its scenes."""
+
+    thing: Thing
+    true: ObjectModel
+    """As the judge sees it: the same for all settings."""
+    pieces: ConvexPieces
+    scenes: Scenes
+
+
+def scene_chart(
+    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], spec: SceneSpec, *,
+    work: Path | None = None, say: Say = lambda line: None, keep: Callable[[Row], None] = lambda result: None,
+) -> Row:  # fmt: skip
+    """Run everything.
+
+    Args:
+        hands: the hands.
+        things: the objects.
+        settings: what to compare; a setting's `batch` is the number of its grasps on each pair.
+        spec: the scene.
+        work: folder that keeps what each setting found on each pair; a run that was stopped goes on there.
+        say: told of each cell as it ends.
+        keep: given the result so far after each pair.
+
+    Returns:
+        `runs[]` of one setting on one pair each, `summary[]` over the pairs, `device`, `created`.
+    """
+    runs: list[Row] = []
+    for thing in things:
+        place = _place(thing, spec)
+        for hand in hands:
+            for setting, way in _ways(settings):
+                runs.append(_kept(setting, way, hand, place, spec, work))
+                say(_line(runs[-1]))
+            keep(_result(runs, settings, spec))
+    return _result(runs, settings, spec)
+
+
+def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
+    """Each setting with the ways in which it plans."""
+    found = []
+    for setting in settings:
+        able = method(setting.method).in_scenes
+        found += [(setting, way) for way in (IN_SCENE, FILTERED) if able or way == FILTERED]
+    return found
+
+
+def _place(thing: Thing, spec: SceneSpec) -> Place:
+    true = thing.load(TRUE_ERROR_M)
+    poses = rest_poses(spec, true, count=4, seed=SEED)["scene/object_pose"]
+    return Place(thing, true, decompose(true), Scenes(supports_of(spec), poses))
+
+
+def _kept(setting: Setting, way: str, hand: HandModel, place: Place, spec: SceneSpec, work: Path | None) -> Row:
+    """What the setting finds on the pair, from its file where it was found before."""
+    said = {
+        "way": way, "method": setting.method, "fidelity": setting.fidelity, "hand": hand.name,
+        "object": place.thing.name, "batch": setting.batch, "options": dict(setting.options),
+    }  # fmt: skip
+    if work is None:
+        return said | _tried(setting, way, hand, place)
+    terms = [said, setting.knobs.model_dump(mode="json"), spec.model_dump(mode="json"), hand.digest, place.true.digest]
+    # What is found follows from the code of planners too: another revision begins anew.
+    file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize']])}.json"
+    if not file.is_file():
+        work.mkdir(parents=True, exist_ok=True)
+        partial = file.with_suffix(".tmp")
+        partial.write_text(json.dumps(said | _tried(setting, way, hand, place), indent=1, allow_nan=False) + "\n")
+        partial.replace(file)
+    found: Row = json.loads(file.read_text())
+    return found
+
+
+def _tried(setting: Setting, way: str, hand: HandModel, place: Place) -> Row:
+    """Counts, shares and speed of one setting on one pair."""
+    obj = place.thing.load(setting.knobs.face_error_m)
+    placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
+    used, note = 0.0, ""
+    counts = dict.fromkeys(SHARES, 0)
+    try:
+        _planned(setting, hand, obj, _first(placed), way, warm=True)
+        began = time.process_time()
+        grasps = _planned(setting, hand, obj, placed, way)
+        used = time.process_time() - began
+        counts = _judged(hand, place, grasps, placed)
+    except InputError as error:
+        # A scene that leaves no way in, or a pair that the method refuses.
+        note = str(error)
+    row: Row = {"grasps": setting.batch, "seconds": used, **{f"{name}_count": n for name, n in counts.items()}}
+    return {**row, **figures([row]), "scenes": len(place.scenes.object_pose), "note": note}
+
+
+def _first(placed: Placed) -> Placed:
+    return placed.take(slice(0, 1))
+
+
+def _planned(
+    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, way: str, *, warm: bool = False
+) -> GraspSet:
+    options = {**setting.options, **(setting.warm if warm else {})}
+    wanted = Wanted(
+        len(placed.index), setting.knobs, WARM_SEED if warm else SEED, placed=placed if way == IN_SCENE else None
+    )
+    return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
+
+
+def _judged(hand: HandModel, place: Place, grasps: GraspSet, placed: Placed) -> dict[str, int]:
+    """How many are clear on their way, lifted besides, and lifted at half the friction besides."""
+    way = plan_way(hand, place.true, grasps, placed)
+    grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+    rows, counts = np.flatnonzero(way.clear), {"clear": int(way.clear.sum())}
+    for name, hard in (("lift", False), ("lift_hard", True)):
+        if len(rows):
+            verdicts = judge_lifts(
+                hand, place.true, grasps.take(rows), placed.take(rows), hard=hard, pieces=place.pieces
+            )  # fmt: skip
+            rows = rows[verdicts.success == 1]
+        counts[name] = len(rows)
+    return counts
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
+    """Shares of all tries with their 95 % (Wilson), and lifted grasps per second, over some cells.
+
+    Where several cells are summed, each grasp counts alike. A cell that was refused took no time that is known.
+    """
+    grasps, seconds = sum(row["grasps"] for row in rows), sum(row["seconds"] for row in rows)
+    found: Row = {"grasps": grasps, "seconds": seconds}
+    planned = sum(row["grasps"] for row in rows if row["seconds"])
+    for name in SHARES:
+        count = sum(row[f"{name}_count"] for row in rows)
+        low, high = wilson(count, grasps)
+        found |= {f"{name}_count": count, name: count / grasps, f"{name}_low": low, f"{name}_high": high}
+    found["grasps_per_second"] = planned / seconds if seconds else 0.0
+    for end in ("", "_low", "_high"):
+        found[f"valid_per_second{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
+    return {key: plain(value) for key, value in found.items()}
+
+
+def summed(runs: Sequence[Row]) -> list[Row]:
+    """A row for each way, method and fidelity over all pairs; `gain` over the same fidelity filtered, the median of the
+    pairs in which that found any; `front` names the shares in which nobody faster is better."""
+    groups: dict[tuple[str, str, str, int], list[Row]] = {}
+    for run in runs:
+        groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)
+    rows = []
+    for (way, name, fidelity, batch), own in groups.items():
+        row: Row = {"way": way, "method": name, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
+        row |= figures(own)
+        row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
+        row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None
+        rows.append(row)
+    able = [row for row in rows if row["valid_per_second"]]
+    for row in rows:
+        row["front"] = []
+    for key in ("lift", "lift_hard"):
+        for index in pareto([(row["valid_per_second"], row[key]) for row in able]):
+            able[index]["front"].append(key)
+    return rows
+
+
+def _gain(own: Sequence[Row], filtered: Sequence[Row]) -> float | None:
+    there = {(run["hand"], run["object"]): run["valid_per_second"] for run in filtered}
+    ratios = [run["valid_per_second"] / there[pair] for run in own if there.get(pair := (run["hand"], run["object"]))]
+    return plain(float(np.median(ratios))) if ratios else None
+
+
+def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec) -> Row:
+    return {
+        "created": timestamp(),
+        "device": device_name(settings[0].run.device),
+        "versions": {"graspd": PACKAGE_VERSION},
+        "scene": spec.model_dump(mode="json"),
+        "referee": {"protocol": "lift", "level": "lift"},
+        "runs": list(runs),
+        "summary": summed(runs),
+    }
+
+
+def _line(run: Row) -> str:
+    return (
+        f"{run['way']:14s} {run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
+        f"{run['valid_per_second']:8.3f} lifted/s  clear {run['clear']:.2f}  lift {run['lift']:.2f}  "
+        f"half friction {run['lift_hard']:.2f} {run['note']}"
+    )

@@ -1,0 +1,256 @@
+"""The viewer: viser's server with the grasps of one file, a slider for the way, and buttons from grasp to grasp."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import threading
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.scene_kinds import supports_in
+from service.model.scene_spec import SceneSpec
+from service.model.transforms import IDENTITY_POSE, quat_rotate
+from service.readers.ways import point_at, scene_spec_of, stop_places, way_of
+from service.store.shards import Shard
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.rendering.standing import seen_share
+from worker.scenes.neighbours import Neighbours
+from worker.viewing.models import Models, Supports
+
+#: Seconds from one named posture to the next while the way is played, and from picture to picture.
+STOP_S: Final = 1.2
+FRAME_S: Final = 0.04
+#: Contact threshold at which epsilon is quoted [m].
+_QUOTED_M: Final = 0.005
+#: How far the first view is from the object, and how far its sides are apart [m], [rad].
+_EYE_M: Final = 0.7
+_STEP: Final = np.pi / 8
+
+
+def missing() -> str:
+    """What to do before a viewer can be used; empty: nothing."""
+    try:
+        import viser  # noqa: F401
+    except ImportError:
+        return "graspd view needs viser, which is not part of this install; run pip install 'graspd[view]'"
+    return ""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a viewer shows: a base shard with its hand, its object and what stands beside it."""
+
+    shard: Shard
+    hand: HandModel
+    obj: ObjectModel
+    neighbours: Neighbours | None = None
+
+
+class Viewer:
+    """Serves one file until it is closed. `url` is where; `place` and `row` say what is shown."""
+
+    def __init__(self, shown: Shown, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        """Start to serve on a port (0: any free one; else the first free one from there on).
+
+        Raises:
+            InputError: viser is not installed, the file holds no grasps, or the address cannot be used.
+        """
+        if said := missing():
+            raise InputError(said)
+        self._shown, self._arrays = shown, shown.shard.arrays
+        self._choices = _choices(shown.shard)
+        self._rows = next(iter(self._choices.values()))
+        self._at, self._lock, self._ended = 0, threading.RLock(), threading.Event()
+        self._playing: threading.Thread | None = None
+        spec = scene_spec_of(shown.shard) or SceneSpec()
+        self._supports: Supports = supports_in(spec)
+        self.server = _served(host, port)
+        self.models = Models(self.server.scene, shown.hand, shown.obj)
+        self._way = way_of(shown.shard, self.row)
+        self._controls()
+        self._load()
+        self._aim()
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    @property
+    def row(self) -> int:
+        """Row of the grasp that is shown."""
+        return int(self._rows[self._at])
+
+    def close(self) -> None:
+        """Stop to serve."""
+        self._ended.set()
+        if self._playing is not None:
+            self._playing.join()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def step(self, by: int) -> None:
+        """Go on by so many grasps, round the end."""
+        with self._lock:
+            self._at = (self._at + by) % len(self._rows)
+            self._load()
+
+    def choose(self, name: str) -> None:
+        """Show only grasps of a kind: a word of `Viewer.filters`."""
+        with self._lock:
+            self._rows, self._at = self._choices[name], 0
+            self._load()
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Kinds of grasps that the file has."""
+        return tuple(self._choices)
+
+    def show(self) -> None:
+        """Draw the posture at which the slider stands."""
+        with self._lock:
+            place = float(self.slider.value)
+            distance = self.models.pose(point_at(self._way, place), contacts=bool(self._contacts.value))
+            self.models.show_scene(bool(self._scene.value))
+            touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())
+            self._said.content = f"**{_doing(self._way, place)}**: {touching} points of the hand within 1 mm, " + (
+                f"deepest {-least:.2f} mm inside"
+                if least < 0
+                else f"nearest {least:.1f} mm away"
+                if least < 10
+                else "free"
+            )
+            self.server.flush()
+
+    def play(self) -> None:
+        """Run the slider over the way, once, in a thread of its own."""
+        with self._lock:
+            if self._playing is not None and self._playing.is_alive():
+                return
+            self._playing = threading.Thread(target=self._run, daemon=True)
+            self._playing.start()
+
+    def _run(self) -> None:
+        last = float(stop_places(self._way)[-1])
+        for place in np.linspace(0, last, max(2, round(last * STOP_S / FRAME_S))):
+            self.slider.value = float(place)
+            if self._ended.wait(FRAME_S):
+                return
+
+    def _controls(self) -> None:
+        gui = self.server.gui
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        self._title = gui.add_markdown("")
+        turn = gui.add_button_group("grasp", ("previous", "next"))
+        choice = gui.add_dropdown("show", self.filters, initial_value=self.filters[0])
+        places = stop_places(self._way)
+        marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
+        start = next(place for place, name in marks if name == "grasp")
+        self.slider = gui.add_slider("way", 0.0, float(places[-1]), 0.01, start, marks=marks)
+        play = gui.add_button("play")
+        self._said = gui.add_markdown("")
+        self._contacts = gui.add_checkbox("contacts", True)
+        self._scene = gui.add_checkbox("scene", True, visible=bool(self._supports))
+        self._figures = gui.add_markdown("")
+        turn.on_click(lambda event: self.step(1 if event.target.value == "next" else -1))
+        choice.on_update(lambda event: self.choose(str(event.target.value)))
+        play.on_click(lambda _: self.play())
+        for control in (self.slider, self._contacts, self._scene):
+            control.on_update(lambda _: self.show())
+
+    def _load(self) -> None:
+        """The scene, the way and the figures of the present grasp."""
+        shard, row = self._shown.shard, self.row
+        self._way = way_of(shard, row)
+        number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
+        pose = np.asarray(self._arrays["scene/object_pose"][number], float) if self._supports else IDENTITY_POSE
+        self.models.surround(self._supports, pose, self._shown.neighbours, number)
+        said = shard.attributes
+        self._title.content = (
+            f"**{said.get('hand')} × {said.get('object')}**, grasp {self._at + 1} of {len(self._rows)} (row {row})"
+        )
+        self._figures.content = _figures(shard, row)
+        self.show()
+
+    def _aim(self) -> None:
+        """Look at the object from a side that no support hides, across the palm's way if that goes."""
+        pose = np.concatenate([self.models.rest.position, self.models.rest.wxyz])
+        points = quat_rotate(pose[3:], self._shown.obj.hull_vertices) + pose[:3]
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        palm = quat_rotate(pose[3:], quat_rotate(self._way[-1].hand_pose[3:], self._shown.hand.palm.approach))
+        first = float(np.arctan2(palm[1], palm[0]) + 0.5 * np.pi)
+        eyes = [
+            middle + _EYE_M * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+            for e in (0.45, 0.8)
+            for a in (first + _STEP * ((k + 1) // 2) * (-1) ** k for k in range(16))
+        ]
+        eye = next((eye for eye in eyes if seen_share(self._supports, eye, points) > 0.8), eyes[0])
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, camera.up, camera.fov = eye, middle, (0.0, 0.0, 1.0), 0.75
+
+
+def _served(host: str, port: int) -> Any:
+    import viser
+
+    if port == 0:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            try:
+                probe.bind((host, 0))
+            except OSError as error:
+                raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
+            port = int(probe.getsockname()[1])
+    try:
+        # It greets on standard output, where the address is told in our own words.
+        with contextlib.redirect_stdout(io.StringIO()):
+            return viser.ViserServer(host=host, port=port, label="graspd view", verbose=False)
+    except OSError as error:
+        raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
+
+
+def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
+    """Rows of each kind of grasps that the file has: valid, lifted at half the friction, sound, all."""
+    found: dict[str, NDArray[np.intp]] = {}
+    for name in ("valid", "lift_hard", "sound"):
+        column = shard.arrays.get(f"quality/{name}")
+        if column is not None and (rows := np.flatnonzero(np.asarray(column) > 0)).size:
+            found["lifts at half friction" if name == "lift_hard" else f"{name} only"] = rows
+    count = len(shard["grasp/hand_pose"])
+    if not count:
+        raise InputError("the file holds no grasps")
+    return found | {"all": np.arange(count)}
+
+
+def _figures(shard: Shard, row: int) -> str:
+    arrays = shard.arrays
+    column = int(np.argmin(np.abs(np.asarray(arrays["quality/thresholds_m"], float) - _QUOTED_M)))
+    rows = [("ε at 5 mm", f"{float(arrays['quality/epsilon'][row, column]):.3f}")]
+    rows.append(("penetration", f"{float(arrays['quality/penetration_depth_mm'][row]):.2f} mm"))
+    verdicts = {
+        "success": "lift" if "quality/lift_outcome" in arrays else "verdict",
+        "lift_hard": "lift at half friction",
+        "pushes": "six pushes",
+    }
+    for name, words in verdicts.items():
+        if (known := arrays.get(f"quality/{name}")) is not None and known[row] >= 0:
+            rows.append((words, "holds" if known[row] else "fails"))
+    if (clearance := arrays.get("quality/clearance_m")) is not None:
+        rows.append(("nearest to the scene", f"{1e3 * float(clearance[row]):.1f} mm"))
+    return "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def _doing(way: Any, place: float) -> str:
+    places = stop_places(way)
+    names = [(float(at), point.name) for at, point in zip(places, way, strict=True) if point.name]
+    near = next((name for at, name in names if abs(at - place) < 0.02), "")
+    if near:
+        return near
+    after = next(k for k, (at, _) in enumerate(names) if at > place)
+    return f"{names[after - 1][1]} to {names[after][1]}"
