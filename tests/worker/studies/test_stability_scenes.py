@@ -65,6 +65,13 @@ def test_an_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandMode
         assert_valid_ones_are_clear(hand, found, spec)
 
 
+def test_one_wall_nearby_costs_grasps_but_is_no_reason_to_refuse(hand: HandModel) -> None:
+    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["one"], 20))
+    found = scenes.planned(hand, sides, spec, "draft", 6)
+    assert found.shares["clear_share"] > 0.5
+    assert_valid_ones_are_clear(hand, found, spec)
+
+
 def test_a_box_among_boxes_is_lifted_out_or_not_valid(hand: HandModel) -> None:
     sides, spec = scenes._standing(scenes.TARGET_MM, scenes._neighbours(scenes.NEIGHBOURS["four"], 120))
     found = scenes.planned(hand, sides, spec, "draft", 6)
