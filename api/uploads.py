@@ -13,9 +13,10 @@ from service.model.domain import AssetKind
 from service.model.errors import InputError, LimitError
 from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from service.store.descriptions import json_object
+from service.store.hand_main import SUFFIXES, hand_name, main_of
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
-    AssetKind.HAND: (".urdf", ".xml"),
+    AssetKind.HAND: SUFFIXES,
     AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off"),
 }
 _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
@@ -55,26 +56,28 @@ def files_of_upload(
         ).without_common_folder()
     else:
         files = {check_path(leaf): file.read()}
-    if "asset.json" not in files:
-        files["asset.json"] = json.dumps({"file": _main_file(kind, leaf, files)}).encode()
-    said = asset_json(files)
-    if options:
-        described = json_object(said, "asset.json") | json_object(options, "options")
+    stated = "asset.json" in files
+    said = json_object(asset_json(files), "asset.json") if stated else {}
+    described = said | (json_object(options, "options") if options else {})
+    if kind is AssetKind.HAND and isinstance(wanted := described.get("file", ""), str):
+        described["file"] = main_of(files, wanted, where=leaf)
+    elif not stated:
+        described.setdefault("file", _main_file(kind, leaf, files))
+    if described != said:
         files["asset.json"] = json.dumps(described).encode()
     return files
 
 
 def name_of_upload(filename: str) -> str:
     """A name a user may give, made of a file's name: `My mug (2).stl` is `My-mug-2`."""
-    stem = PurePosixPath(filename.replace("\\", "/")).stem
+    leaf = PurePosixPath(filename.replace("\\", "/")).name
+    stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
     return _NAME.sub("-", stem).strip("-._")[:64] or "unnamed"
 
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:
     suffixes = MAIN_SUFFIXES[kind]
     found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in suffixes]
-    if kind is AssetKind.HAND and any(name.lower().endswith(".urdf") for name in found):
-        found = [name for name in found if name.lower().endswith(".urdf")]
     known = ", ".join(suffixes)
     if not found:
         raise InputError(f"{upload} holds no {kind.value} file; one of {known} is needed, or a ZIP of its folder")

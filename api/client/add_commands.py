@@ -17,8 +17,10 @@ from service.model.errors import InputError
 from service.store.asset_options import (
     AllowOpenOption,
     ApproachOption,
+    ClosingOption,
     DensityOption,
     DropOption,
+    FingertipsOption,
     FixOption,
     KeepLargestOption,
     LicenceOption,
@@ -29,6 +31,8 @@ from service.store.asset_options import (
     ScaleSweepOption,
     SourceOption,
     UnitsOption,
+    UrdfOption,
+    XacroOption,
     hand_options,
     object_options,
     provenance,
@@ -42,14 +46,16 @@ WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a
 
 @reporting_errors
 def add_hand(
-    file: Annotated[
-        Path, typer.Argument(help="A URDF, whose meshes are found beside it; its folder; or a ZIP of that.")
-    ],
+    file: Annotated[Path, typer.Argument(help="A URDF, xacro or MJCF, with its meshes; its folder; or a ZIP of that.")],
     name: NameOption = None,
+    urdf: UrdfOption = None,
+    xacro: XacroOption = None,
     palm: PalmOption = None,
     approach: ApproachOption = None,
     root: RootOption = None,
     pre_shape: PreShapeOption = None,
+    closing: ClosingOption = None,
+    fingertips: FingertipsOption = None,
     fix: FixOption = None,
     drop: DropOption = None,
     licence: LicenceOption = None,
@@ -59,10 +65,13 @@ def add_hand(
     json: JsonFlag = False,
 ) -> None:
     """Upload a hand, wait for its check, and say what was guessed."""
-    options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    options = hand_options(
+        urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
+        fingertips=fingertips, fix=fix, drop=drop,
+    )  # fmt: skip
     options |= provenance(licence, source)
-    with upload_of(file) as upload:
-        _add(AssetKind.HAND, upload, name, options, wait=wait, url=url, json=json)
+    with upload_of(file) as (upload, main):
+        _add(AssetKind.HAND, upload, name, ({"file": main} if main else {}) | options, wait=wait, url=url, json=json)
 
 
 @reporting_errors

@@ -26,6 +26,17 @@ FixOption = Annotated[
 DropOption = Annotated[
     list[str] | None, typer.Option("--drop", help="Leave out a link and all that hangs on it; several times.")
 ]
+UrdfOption = Annotated[
+    str | None, typer.Option("--urdf", help="Which URDF, xacro or MJCF of the folder or ZIP is the hand: NAME.")
+]
+XacroOption = Annotated[
+    list[str] | None, typer.Option("--xacro", help="Arguments of a xacro file: NAME=VALUE; several times.")
+]
+ClosingOption = Annotated[
+    list[str] | None,
+    typer.Option("--closing", help="How joints close the hand, -1, 0 (spreads) or 1: JOINT=-1,...; several times."),
+]
+FingertipsOption = Annotated[str | None, typer.Option("--fingertips", help="Links at the ends of the fingers: A,B,C.")]
 UnitsOption = Annotated[
     Literal["m", "mm", "cm", "in"] | None, typer.Option("--units", help="Unit of the file; default: metres.")
 ]
@@ -55,10 +66,14 @@ def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
 
 def hand_options(
     *,
+    urdf: str | None = None,
+    xacro: list[str] | None = None,
     palm: str | None = None,
     approach: str | None = None,
     root: str | None = None,
     pre_shape: list[str] | None = None,
+    closing: list[str] | None = None,
+    fingertips: str | None = None,
     fix: list[str] | None = None,
     drop: list[str] | None = None,
 ) -> dict[str, Any]:
@@ -67,20 +82,19 @@ def hand_options(
     Raises:
         InputError: a text is no vector or no JOINT=VALUE.
     """
-    options: dict[str, Any] = {}
-    if palm:
-        options["palm"] = {"link": palm}
-    if approach:
-        options["approach"] = _vector(approach)
-    if root:
-        options["root"] = root
-    if pre_shape:
-        options["preshape"] = _assignments("--pre-shape", pre_shape)
-    if fix:
-        options["fix"] = _assignments("--fix", fix)
-    if drop:
-        options["drop"] = drop
-    return options
+    options: dict[str, Any] = {
+        "file": urdf,
+        "xacro": dict(map(_argument, xacro or [])),
+        "palm": {"link": palm} if palm else None,
+        "approach": _vector(approach) if approach else None,
+        "root": root,
+        "preshape": _assignments("--pre-shape", pre_shape) if pre_shape else None,
+        "closing": _directions(closing) if closing else None,
+        "fingertips": [link.strip() for link in fingertips.split(",") if link.strip()] if fingertips else None,
+        "fix": _assignments("--fix", fix) if fix else None,
+        "drop": drop,
+    }
+    return {key: value for key, value in options.items() if value}
 
 
 def object_options(
@@ -132,3 +146,18 @@ def _assignments(option: str, texts: list[str]) -> dict[str, float]:
         except ValueError:
             raise InputError(f"{option} {text!r} must be JOINT=VALUE with a number") from None
     return values
+
+
+def _argument(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise InputError(f"--xacro {text!r} must be NAME=VALUE")
+    return name, value
+
+
+def _directions(texts: list[str]) -> dict[str, int]:
+    values = _assignments("--closing", texts)
+    for name, value in values.items():
+        if value not in (-1, 0, 1):
+            raise InputError(f"--closing {name}={value:g} must be -1, 0 or 1")
+    return {name: int(value) for name, value in values.items()}

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import IO, Final, Self
+from typing import IO, Final, Self, TypeVar
 
 from service.model.digests import StreamedFiles, digest_bytes, digest_files
 from service.model.domain import Asset, AssetKind
@@ -31,6 +31,7 @@ MAX_NAMES: Final = 128 << 10
 #: A small archive may unpack to much more: robot meshes compress about four to one, so this refuses only bombs.
 UNPACK_FACTOR: Final = 8
 _PIECE_BYTES: Final = 1 << 16
+_T = TypeVar("_T")
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
@@ -72,6 +73,14 @@ def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     return files
 
 
+def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
+    """A folder zipped whole has its own name before every file: take it off."""
+    tops = {name.partition("/")[0] for name in files}
+    if len(tops) == 1 and all("/" in name for name in files):
+        return {name.partition("/")[2]: entry for name, entry in files.items()}
+    return files
+
+
 class ZipFiles(StreamedFiles):
     """Files of a ZIP that lies in a file, unpacked piece by piece when they are asked for; others may be added.
 
@@ -96,11 +105,9 @@ class ZipFiles(StreamedFiles):
             self._known[name] = (size, digest)
 
     def without_common_folder(self) -> Self:
-        """A folder zipped whole has its own name before every file: take it off."""
-        tops = {name.partition("/")[0] for name in self._found}
-        if len(tops) == 1 and all("/" in name for name in self._found):
-            self._found = {name.partition("/")[2]: entry for name, entry in self._found.items()}
-            self._known = {name.partition("/")[2]: facts for name, facts in self._known.items()}
+        """See the function of this name."""
+        self._found = without_common_folder(self._found)
+        self._known = without_common_folder(self._known)
         return self
 
     def digest(self, name: str) -> str:

@@ -12,11 +12,15 @@ from service.model.domain import AssetKind
 from service.model.errors import GraspdError, InputError
 from service.store.asset_options import (
     ApproachOption,
+    ClosingOption,
     DropOption,
+    FingertipsOption,
     FixOption,
     PalmOption,
     PreShapeOption,
     RootOption,
+    UrdfOption,
+    XacroOption,
     hand_options,
 )
 from service.store.asset_summary import say_check
@@ -29,11 +33,17 @@ app = typer.Typer(add_completion=False)
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
 @reporting_errors
 def check(
-    file: Annotated[str, typer.Argument(help="A URDF, its folder, a ZIP of that, or the name of a built-in hand.")],
+    file: Annotated[
+        str, typer.Argument(help="A URDF, xacro or MJCF, its folder, a ZIP of that, or the name of a built-in hand.")
+    ],
+    urdf: UrdfOption = None,
+    xacro: XacroOption = None,
     palm: PalmOption = None,
     approach: ApproachOption = None,
     root: RootOption = None,
     pre_shape: PreShapeOption = None,
+    closing: ClosingOption = None,
+    fingertips: FingertipsOption = None,
     fix: FixOption = None,
     drop: DropOption = None,
     picture: Annotated[
@@ -42,7 +52,10 @@ def check(
     json: JsonFlag = False,
 ) -> None:
     """Say whether a hand can be used, and what was guessed about it. Needs no server."""
-    options = hand_options(palm=palm, approach=approach, root=root, pre_shape=pre_shape, fix=fix, drop=drop)
+    options = hand_options(
+        urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
+        fingertips=fingertips, fix=fix, drop=drop,
+    )  # fmt: skip
     report = report_hand(file, options)
     if picture and report["verdict"] != "refuse":
         from worker.rendering.pages.portraits import hand_portrait, write_png

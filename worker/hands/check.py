@@ -30,7 +30,7 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     try:
         settings = parse_options(files, options)
         main = main_file(files, settings)
-        robot = read_robot(files, main)
+        robot = read_robot(files, main, settings.xacro)
         hand = assemble(robot, settings, files, main, name=name, digest="0" * 32)
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
     except InputError as error:

@@ -1,4 +1,4 @@
-"""A hand from its files: URDF, meshes, and what is said of it in `asset.json` or `hand.json`."""
+"""A hand from its files: its description, meshes, and what is said of it in `asset.json` or `hand.json`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from service.model.digests import digest_files, digest_variant
 from service.model.domain import AssetKind
-from service.model.errors import HandError, NotFoundError
+from service.model.errors import HandError, InputError, NotFoundError
 from service.model.transforms import compose
 from service.settings import Settings
-from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
+from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack, without_common_folder
 from service.store.hand_files import files_of_hand
+from service.store.hand_main import hand_name, main_of
 from worker.hands.collisions import resting_neighbours
 from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
@@ -47,7 +48,7 @@ def load_hand(
     """
     settings = parse_options(files, options)
     main = main_file(files, settings)
-    robot = read_robot(files, main)
+    robot = read_robot(files, main, settings.xacro)
     return assemble(robot, settings, files, main, name=name, digest=digest)
 
 
@@ -78,7 +79,7 @@ def assemble(
         lower=tree.lower,
         upper=tree.upper,
         effort=_effort(robot, tree, options),
-        stiffness=_stiffness(tree, options),
+        stiffness=_stiffness(robot, tree, options),
         preshape=np.clip(np.zeros(dofs), tree.lower, tree.upper),
         closing=np.zeros(dofs),
         joint_names=tree.joint_names,
@@ -97,16 +98,11 @@ def assemble(
 
 
 def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
-    """Name of the URDF: as the description says, else the only one; an XML file counts where there is no URDF."""
-    if options.file:
-        if options.file not in files:
-            raise HandError(f"asset.json names the file {options.file!r}, which is not there")
-        return options.file
-    found = sorted(name for name in files if name.lower().endswith(".urdf"))
-    found = found or sorted(name for name in files if name.lower().endswith(".xml"))
-    if len(found) != 1:
-        raise HandError(f'{len(found)} URDF files among the hand\'s files; name one in asset.json under "file"')
-    return found[0]
+    """Name of the file that describes the hand: as the options say, else the only one."""
+    try:
+        return main_of(files, options.file)
+    except InputError as error:
+        raise HandError(str(error)) from None
 
 
 def _pieces(robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str) -> tuple[ConvexPiece, ...]:
@@ -150,9 +146,13 @@ def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
     return np.array(values)
 
 
-def _stiffness(tree: Tree, options: HandOptions) -> Floats:
+def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
+    """(D,) stated, else that of the robot's servos, else assumed."""
     stated = options.stiffness
-    values = [stated.get(d, DEFAULT_STIFFNESS) if isinstance(stated, dict) else stated for d in tree.dof_names]
+    values = []
+    for dof in tree.dof_names:
+        gain = stated if isinstance(stated, float) else (stated or {}).get(dof)
+        values.append(gain if gain is not None else robot.joints[dof].stiffness or DEFAULT_STIFFNESS)
     if min(values) <= 0:
         raise HandError("a stiffness in asset.json is not positive")
     return np.array(values)
@@ -195,9 +195,11 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         known = ", ".join(builtin_names(AssetKind.HAND))
         raise NotFoundError(f"{path} is neither a file nor a built-in hand ({known})")
     if path.suffix.lower() == ".zip":
-        return path.stem, unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes), {}
-    files = {name: file.read_bytes() for name, file in files_of_hand(path).items()}
-    return path.resolve().stem, files, {} if path.is_dir() else {"file": path.name}
+        packed = unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes)
+        return path.stem, without_common_folder(packed), {}
+    found, main = files_of_hand(path)
+    files = {name: file.read_bytes() for name, file in found.items()}
+    return hand_name(path.resolve().name), files, {"file": main} if main else {}
 
 
 __all__ = ["files_from_path", "hand_from_path", "load_hand"]

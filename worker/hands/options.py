@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import PurePosixPath
 from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -51,6 +52,7 @@ class HandOptions(_Options):
     licence: str = ""
     source: str = ""
     facts: dict[str, Any] = Field(default_factory=dict)
+    xacro: dict[str, str] = Field(default_factory=dict, description="values of the arguments of a xacro file")
     root: str | None = Field(None, description="link that becomes the root; what is not below it is dropped")
     drop: tuple[str, ...] = Field((), description="links to leave out, with all that hangs on them")
     fix: dict[str, Finite] = Field(default_factory=dict, description="joints frozen at a value [rad or m]")
@@ -60,7 +62,7 @@ class HandOptions(_Options):
     preshape: dict[str, Finite] = Field(default_factory=dict, description="joint values in which the hand approaches")
     closing: dict[str, int] = Field(default_factory=dict, description="-1, 0, +1: how a joint closes the hand")
     fingertips: tuple[str, ...] = ()
-    stiffness: Finite | dict[str, Finite] = DEFAULT_STIFFNESS
+    stiffness: Finite | dict[str, Finite] | None = None
     effort: Finite | dict[str, Finite] | None = None
 
 
@@ -101,7 +103,7 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
     try:
         notes = json.loads(files["hand.json"])
         noted = notes.get("urdf", urdf)
-        if noted is not None and (noted not in files or noted != (urdf or noted)):
+        if noted is not None and not _is_among(noted, files, urdf):
             return {}
         if "palm_link" in notes:
             options["palm"] = {"link": notes["palm_link"], "approach": notes.get("palm_normal_in_palm_link")}
@@ -115,3 +117,9 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
     except (ValueError, TypeError, AttributeError, RecursionError):
         raise HandError("hand.json is not a readable description of a hand; correct or remove it") from None
     return options
+
+
+def _is_among(noted: str, files: Mapping[str, bytes], urdf: object) -> bool:
+    """Whether notes are on the URDF that is meant; beside it they call it by its name alone."""
+    named = [name for name in files if PurePosixPath(name).name == PurePosixPath(noted).name]
+    return bool(named) and PurePosixPath(str(urdf or noted)).name == PurePosixPath(noted).name

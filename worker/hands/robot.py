@@ -21,6 +21,8 @@ MAX_LINKS: Final = 256
 MAX_SHAPES: Final = 1024
 #: No part of a robot hand lies farther than this from its parent [m]; larger numbers are a unit mistake.
 MAX_LENGTH_M: Final = 10.0
+#: Limit of a prismatic joint that has none, to either side [m]: such a joint may stand in a scene, not in a hand.
+UNLIMITED_M: Final = 10.0
 MOVING: Final = ("revolute", "continuous", "prismatic")
 
 

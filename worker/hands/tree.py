@@ -11,7 +11,7 @@ from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angle
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
-from worker.hands.robot import Joint, Mimic, Robot, chain_to
+from worker.hands.robot import UNLIMITED_M, Joint, Mimic, Robot, chain_to
 
 
 @dataclass(frozen=True)
@@ -175,6 +175,8 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot) -> tuple[floa
         if drive.dof != dof:
             continue
         joint = robot.joints[name]
+        if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
+            raise HandError(f"joint {name!r} slides without a range; give it one, or fix it: --fix {name}=0")
         ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
         lower, upper = max(lower, ends[0]), min(upper, ends[1])
     if lower > upper:

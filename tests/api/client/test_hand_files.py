@@ -29,7 +29,7 @@ def hand(tmp_path: Path) -> Path:
 
 
 def sent(path: Path) -> set[str]:
-    with upload_of(path) as upload:
+    with upload_of(path) as (upload, _):
         return set(unpack(upload.read_bytes(), limit_bytes=10_000))
 
 
@@ -44,7 +44,7 @@ def test_a_folder_brings_urdf_and_all_meshes_inside(hand: Path) -> None:
 
 def test_the_upload_is_named_after_the_hand(hand: Path) -> None:
     for path in (hand, hand / "claw.urdf"):
-        with upload_of(path) as upload:
+        with upload_of(path) as (upload, _):
             assert upload.name == "claw.zip"
         assert not upload.exists()
 
@@ -52,7 +52,7 @@ def test_the_upload_is_named_after_the_hand(hand: Path) -> None:
 def test_other_files_are_sent_as_they_are(hand: Path, tmp_path: Path) -> None:
     (tmp_path / "plain.urdf").write_text("<robot/>")
     for path in (tmp_path / "plain.urdf", tmp_path / "hand.zip", tmp_path / "missing.urdf"):
-        with upload_of(path) as upload:
+        with upload_of(path) as (upload, _):
             assert upload == path
 
 

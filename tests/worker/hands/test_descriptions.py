@@ -44,8 +44,9 @@ def facts(report: dict[str, Any]) -> tuple[str, list[float], list[str], list[flo
 
 def added(path: Path) -> dict[str, Any]:
     """The report of the files that the service gets from `hands add`."""
-    with upload_of(path) as upload:
-        files = files_of_upload(AssetKind.HAND, upload.name, upload.read_bytes(), limit_bytes=10**7)
+    with upload_of(path) as (upload, main):
+        said = json.dumps({"file": main}) if main else ""
+        files = files_of_upload(AssetKind.HAND, upload.name, upload.read_bytes(), limit_bytes=10**7, options=said)
     return check_hand(files, "leap")
 
 

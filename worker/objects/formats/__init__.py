@@ -1,4 +1,4 @@
-"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB. The input may be hostile: no header's word is trusted."""
+"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE. The input may be hostile: no header's word is trusted."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from service.model.errors import GraspdError, MeshError
-from worker.objects.formats import glb, obj, off, ply, stl
+from worker.objects.formats import dae, glb, obj, off, ply, stl
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
 
 __all__ = ["MAX_FACES", "READERS", "Soup", "read_mesh"]
@@ -20,6 +20,7 @@ READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
     ".ply": ply.read,
     ".off": off.read,
     ".glb": glb.read,
+    ".dae": dae.read,
 }
 
 

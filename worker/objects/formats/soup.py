@@ -28,9 +28,10 @@ class Soup:
         """Each colour with the indices of its faces; None for those without."""
         if self.colours is None:
             return [(None, np.arange(len(self.faces)))]
-        known, index = np.unique(np.round(self.colours, 3), axis=0, return_inverse=True, equal_nan=True)
+        # NaN is not equal to itself; no colour is below 0.
+        known, index = np.unique(np.nan_to_num(np.round(self.colours, 3), nan=-1.0), axis=0, return_inverse=True)
         return [
-            (None if np.isnan(rgb).any() else (float(rgb[0]), float(rgb[1]), float(rgb[2])), np.flatnonzero(index == i))
+            (None if rgb[0] < 0 else (float(rgb[0]), float(rgb[1]), float(rgb[2])), np.flatnonzero(index == i))
             for i, rgb in enumerate(known)
         ]
 

@@ -1,0 +1,219 @@
+"""Hands from MJCF: where their bodies are is what MuJoCo says, and nothing outside their folder is read."""
+
+from __future__ import annotations
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from service.model.errors import HandError
+from service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix
+from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
+from worker.commands.hands import report_hand
+from worker.hands.check import check_hand
+from worker.hands.kinematics import body_poses
+from worker.hands.load import files_from_path, hand_from_path, load_hand
+from worker.hands.model import HandModel
+
+#: Both sides compute in float64; what is left is rounding over a chain of a dozen rotations [m, and entries of R].
+FK_TOLERANCE = 1e-6
+POSTURES = 200
+
+
+def tip() -> bytes:
+    return bytes(trimesh.creation.box((8.0, 8.0, 16.0)).export(file_type="stl"))
+
+
+def files(text: str = CLAW, **others: bytes) -> dict[str, bytes]:
+    return {"claw.xml": text.encode(), "meshes/tip.stl": tip(), **others}
+
+
+def load(text: str = CLAW, **options: object) -> HandModel:
+    return load_hand(files(text), name="claw", digest="0" * 32, options=options)
+
+
+def oracle(path: Path) -> mujoco.MjModel:
+    """The model as MuJoCo reads it from the disk, without what needs files that tests do not have."""
+    if path.name != "claw.xml":
+        return mujoco.MjModel.from_xml_path(str(path))
+    return mujoco.MjModel.from_xml_string(re.sub("<texture[^>]*>", "", CLAW), {"meshes/tip.stl": tip()})
+
+
+def agree(hand: HandModel, model: mujoco.MjModel, links: list[str]) -> None:
+    """Poses of bodies relative to the hand's root, in random postures within the limits."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(5)
+    joints = [(model.joint(name).qposadr[0], name) for name in hand.joint_names]
+    assert len(joints) == len(hand.joint_names)
+    for _ in range(POSTURES):
+        q = hand.expand(rng.uniform(hand.lower, hand.upper))
+        values = dict(zip(hand.joint_names, q, strict=True))
+        for address, name in joints:
+            data.qpos[address] = values[name]
+        mujoco.mj_kinematics(model, data)
+        poses = body_poses(hand, IDENTITY_POSE, q)[0]
+        at = {name: np.concatenate([data.body(name).xpos, data.body(name).xquat]) for name in (*links, hand.root_link)}
+        for link in links:
+            expected = pose_to_matrix(compose(invert(at[hand.root_link]), at[link]))
+            found = pose_to_matrix(poses[hand.body_names.index(link)])
+            np.testing.assert_allclose(found, expected, atol=FK_TOLERANCE, err_msg=link)
+
+
+def test_bodies_are_where_mujoco_puts_them() -> None:
+    # The body of `left` stands at an anchor of its own, so its frame is not that of the joint that carries it.
+    agree(load(), oracle(Path("claw.xml")), ["left_end", "right", "right_end"])
+    agree(load(root="mount"), oracle(Path("claw.xml")), ["palm", "left_end", "right", "right_end"])
+
+
+@pytest.mark.parametrize(
+    ("package", "path"),
+    [
+        ("robopianist", "models/hands/third_party/shadow_hand/right_hand.xml"),
+        ("robosuite_models", "assets/grippers/schunk_svh_right_hand.xml"),
+        ("robosuite_models", "assets/grippers/g1_three_finger_right_gripper.xml"),
+        ("gymnasium_robotics", "envs/assets/hand/reach.xml"),
+    ],
+)
+def test_bodies_of_hands_of_strangers_are_where_mujoco_puts_them(package: str, path: str) -> None:
+    file = package_file(package, path)
+    # Meshes that lie beside the model's folder are in the upload only with the folder that holds both.
+    beside = ".." in file.read_text()
+    hand = hand_from_path(*((file.parents[1], {"file": f"{file.parent.name}/{file.name}"}) if beside else (file,)))
+    agree(hand, oracle(file), [name for name in hand.body_names[1:] if ":" not in name.removeprefix("robot0:")])
+
+
+def package_file(package: str, path: str) -> Path:
+    """A file of an installed package that is not imported."""
+    spec = find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip(f"{package} is not installed")
+    return Path(spec.submodule_search_locations[0]) / path
+
+
+def test_the_arm_above_is_left_out_and_kept_for_export() -> None:
+    hand = load()
+    assert hand.root_link == "palm"
+    assert [joint.name for joint in hand.arm] == ["wrist"]
+    assert "wrist" not in hand.joint_names
+
+
+def test_what_is_no_hand_is_left_out() -> None:
+    hand = load(root="mount")
+    assert not {"ball", "world"} & set(hand.body_names)
+
+
+def test_an_equality_and_a_tendon_couple_joints() -> None:
+    hand = load()
+    assert set(hand.dof_names) == {"left_spread", "left_bend", "right_slide"}
+    values = dict(zip(hand.dof_names, (0.2, 0.6, 0.01), strict=False))
+    q = dict(zip(hand.joint_names, hand.expand(np.array([values[dof] for dof in hand.dof_names])), strict=True))
+    assert q["left_curl"] == pytest.approx(0.5 * values["left_bend"])
+    # q1 - q1_0 = 0.1 - 0.5 (q2 - q2_0), both at rest at 0.
+    assert q["right_curl"] == pytest.approx(0.1 - 0.5 * values["left_spread"])
+
+
+def test_servos_give_force_limits_and_gains() -> None:
+    hand = load()
+    at = {name: number for number, name in enumerate(hand.dof_names)}
+    # The tendon's length is bend + 0.5 curl, and curl is half of bend: 1.25 a radian of bend.
+    assert hand.effort[at["left_bend"]] == pytest.approx(2 * 1.25)
+    assert hand.stiffness[at["left_bend"]] == pytest.approx(4 * 1.25**2)
+    assert hand.effort[at["right_slide"]] == pytest.approx(15 * 2)
+    assert hand.stiffness[at["right_slide"]] == pytest.approx(300 * 2**2)
+    assert hand.effort[at["left_spread"]] == pytest.approx(0.3)
+
+
+def test_shapes_that_touch_are_told_from_those_that_are_seen() -> None:
+    hand = load()
+    palm = [piece for piece in hand.pieces if piece.link == "palm"]
+    assert [piece.size for piece in palm] == [(0.08, 0.06, 0.02)]
+    (seen,) = [mesh for mesh in hand.visuals.meshes if mesh.body == 0]
+    assert np.ptp(seen.vertices[:, 0]) == pytest.approx(0.1) and seen.colour == pytest.approx((0.2, 0.4, 0.6))
+
+
+def test_a_mesh_is_where_mujoco_puts_it() -> None:
+    (piece,) = [p for p in load().pieces if p.link == "left_end" and p.kind == "hull"]
+    # 8 x 8 x 16 mm about 30 mm above the body; MuJoCo keeps mesh vertices in single precision.
+    np.testing.assert_allclose(piece.vertices.min(axis=0), [-0.004, -0.004, 0.022], atol=1e-6)
+    np.testing.assert_allclose(piece.vertices.max(axis=0), [0.004, 0.004, 0.038], atol=1e-6)
+
+
+def test_a_closed_loop_becomes_a_coupling_with_its_error_told() -> None:
+    report = report_of(FOUR_BAR)
+    assert report["verdict"] == "accept" and set(report["facts"]["dofs"]) == {"drive", "thumb"}
+    assert "top, back follow drive within" in report["message"]
+    hand = load_hand({"h.xml": FOUR_BAR.encode()}, name="h", digest="0" * 32)
+    joints = dict(zip(hand.joint_names, hand.expand(np.array([0.5, 0.0])), strict=True))
+    # A parallelogram: the rocker turns as the crank does, the coupler stays upright.
+    assert joints["back"] == pytest.approx(0.5, abs=1e-6) and joints["top"] == pytest.approx(-0.5, abs=1e-6)
+
+
+def report_of(text: str, **others: bytes) -> dict[str, Any]:
+    return check_hand({"h.xml": text.encode(), "meshes/tip.stl": tip(), **others}, "h")
+
+
+def with_inside(text: str) -> str:
+    return CLAW.replace('<light pos="0 0 1"/>', text)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        (with_inside('<include file="/etc/passwd"/>'), "outside the hand's folder"),
+        (with_inside('<include file="../../etc/passwd"/>'), "outside the hand's folder"),
+        (with_inside('<include file="missing.xml"/>'), "missing.xml"),
+        (with_inside('<include file="h.xml"/>'), "includes itself"),
+        (CLAW.replace('file="tip.stl"', 'file="/etc/passwd"'), "outside the hand's folder"),
+        (CLAW.replace('file="tip.stl"', 'file="../../tip.stl"'), "outside the hand's folder"),
+        (CLAW.replace('file="tip.stl"', 'file="other.stl"'), "other.stl"),
+        (CLAW.replace('file="tip.stl"', 'file="tip.exe"'), "tip.exe"),
+        (with_inside('<attach model="other" prefix="x"/>'), "<attach>"),
+        (with_inside('<replicate count="1000000000"><body/></replicate>'), "<replicate>"),
+        (with_inside('<composite type="cable" count="100000 1 1"/>'), "<composite>"),
+        ('<!DOCTYPE m [<!ENTITY a "aaa">]><mujoco>&a;</mujoco>', "entities"),
+        ("<mujoco><worldbody><body></mujoco>", "well-formed"),
+        ("<mujoco><worldbody><body><geom/></body></worldbody></mujoco>", "MuJoCo does not take it"),
+        ('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>', "no moving joint"),
+        (CLAW.replace('name="left_curl" axis', 'type="ball" name="left_curl" axis2'), "MuJoCo does not take it"),
+        (CLAW.replace('<joint name="right_curl" axis="0 1 0" range="0 50"/>', '<joint type="ball"/>'), "right_curl"),
+        (CLAW.replace(' range="0 0.025"', ""), "slides without a range"),
+    ],
+)
+def test_a_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named: str) -> None:
+    report = report_of(text)
+    assert report["verdict"] == "refuse" and named in report["message"]
+    assert "\n" not in report["message"] and len(report["message"]) < 400
+
+
+def test_an_include_in_the_folder_is_put_in() -> None:
+    part = b'<mujocoinclude><body name="extra"><geom type="sphere" size="0.01"/></body></mujocoinclude>'
+    text = with_inside('<include file="parts/extra.xml"/>')
+    assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
+
+
+def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # MuJoCo would find these on the disk: the reader must not let it look.
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "secret.stl").write_bytes(tip())
+    (tmp_path / "secret.xml").write_text("<mujocoinclude/>")
+    for text in (CLAW.replace("tip.stl", "secret.stl"), with_inside('<include file="secret.xml"/>')):
+        with pytest.raises(HandError, match="secret"):
+            load(text)
+
+
+def test_a_model_brings_what_it_includes_and_names(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "tip.stl").write_bytes(tip())
+    (tmp_path / "meshes" / "other.stl").write_bytes(tip())
+    (tmp_path / "extra.xml").write_text("<mujocoinclude/>")
+    (tmp_path / "claw.xml").write_text(with_inside('<include file="extra.xml"/>'))
+    name, found, stated = files_from_path(tmp_path / "claw.xml")
+    assert set(found) == {"claw.xml", "extra.xml", "meshes/tip.stl"}
+    assert (name, stated) == ("claw", {"file": "claw.xml"})
+    assert report_hand(str(tmp_path))["verdict"] == "accept"

@@ -1,0 +1,232 @@
+"""Read a hand from MJCF, by MuJoCo itself: its defaults, classes, angles and inertias are what MuJoCo makes of them.
+
+Bodies become links and their joints a chain of joints, one link between each two. What a hand does not need, and every
+file outside the upload, never reaches MuJoCo: see `worker.hands.mjcf_source`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from service.model.errors import HandError
+from service.model.transforms import IDENTITY_POSE, Floats, compose, invert, quat_from_axis_angle
+from worker.hands.mjcf_couplings import couplings
+from worker.hands.mjcf_servos import Servo, servos
+from worker.hands.mjcf_source import self_contained
+from worker.hands.primitives import hull
+from worker.hands.robot import UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
+
+_FREE, _HINGE, _SLIDE = (
+    int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+)
+#: The colour of a geom that states none: then its material's counts.
+_NAMED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
+#: Groups from this on are not drawn by MuJoCo's viewer.
+_HIDDEN_GROUP: Final = 3
+#: A joint's anchor closer than this to its body's origin is at it [m].
+_AT_ORIGIN_M: Final = 1e-12
+
+
+def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
+    """Checked contents of an MJCF model.
+
+    Raises:
+        HandError: MuJoCo does not take it, or it is no hand; the message names what is wrong.
+        LimitError: larger than a hand is.
+    """
+    text, assets = self_contained(files, main)
+    model = _compile(text, assets, main)
+    reader = _Reader(model, main)
+    roots = reader.roots()
+    if len(roots) == 1 and not reader.joints_of(roots[0]):
+        reader.body(roots[0], "", IDENTITY_POSE)
+    else:
+        reader.links.append(Link("world", (), None))
+        for body in roots:
+            reader.body(body, "world", _pose(model.body_pos[body], model.body_quat[body]))
+    return build_robot(reader.name, reader.links, reader.joints, reader.notes, main, "MJCF")
+
+
+def _compile(text: str, assets: dict[str, bytes], main: str) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_string(text, assets)
+    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
+        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
+        raise HandError(f"{main}: MuJoCo does not take it ({line}); correct the model") from None
+
+
+@dataclass
+class _Reader:
+    """Links and joints of a compiled model, body by body."""
+
+    model: Any
+    main: str
+    links: list[Link] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.name = ""
+        self._mimics: dict[int, Mimic | float] = {}
+        self._servos: dict[int, Servo] = {}
+        self._bare = not self.model.ngeom or not any(
+            self.model.geom_contype[g] or self.model.geom_conaffinity[g] for g in range(self.model.ngeom)
+        )
+        self._mimics, notes = couplings(self.model, self.joint_name)
+        self._servos = servos(self.model, self._mimics)
+        self.notes += notes
+
+    def roots(self) -> list[int]:
+        """Bodies on the world below which something moves: the others are furniture or objects."""
+        model = self.model
+        moving = {
+            self._top(int(model.jnt_bodyid[j])) for j in range(model.njnt) if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
+        }
+        found = sorted(moving)
+        if not found:
+            raise HandError(f"{self.main}: no moving joint; a hand needs at least one hinge or slide joint")
+        return found
+
+    def _top(self, body: int) -> int:
+        while self.model.body_parentid[body]:
+            body = int(self.model.body_parentid[body])
+        return body
+
+    def joints_of(self, body: int) -> list[int]:
+        """Joints of a body but for the free one of a hand that floats."""
+        first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
+        return [j for j in range(first, first + count) if int(self.model.jnt_type[j]) != _FREE]
+
+    def body_name(self, body: int) -> str:
+        return str(self.model.body(body).name) or f"body_{body}"
+
+    def joint_name(self, joint: int) -> str:
+        return str(self.model.joint(joint).name) or f"{self.body_name(int(self.model.jnt_bodyid[joint]))}_joint_{joint}"
+
+    def body(self, body: int, parent: str, pose: Floats) -> None:
+        """Add a body that hangs on link `parent` at a (7,) pose, and all bodies below it.
+
+        MuJoCo moves a body by its joints one after another, each about its own anchor in the body's frame.
+        """
+        stack = [(body, parent, pose)]
+        while stack:
+            body, parent, pose = stack.pop()
+            name = self.body_name(body)
+            at, frame = parent, pose
+            own = self.joints_of(body)
+            for number, joint in enumerate(own):
+                anchor = np.asarray(self.model.jnt_pos[joint], float)
+                there = np.concatenate([anchor, [1.0, 0, 0, 0]])
+                last = number + 1 == len(own) and np.linalg.norm(anchor) < _AT_ORIGIN_M
+                link = name if last else f"{name}:{self.joint_name(joint)}"
+                self.joints.append(self._joint(joint, at, link, compose(frame, there)))
+                if not last:
+                    self.links.append(Link(link, (), None))
+                at, frame = link, invert(there)
+            if parent and at != name:
+                self.joints.append(_fixed(f"{name}:fixed", at, name, frame))
+            self.links.append(self._link(body, name))
+            children = [c for c in range(self.model.nbody - 1, body, -1) if self.model.body_parentid[c] == body]
+            stack += [(c, name, _pose(self.model.body_pos[c], self.model.body_quat[c])) for c in children]
+
+    def _joint(self, joint: int, parent: str, child: str, origin: Floats) -> Joint:
+        model, name = self.model, self.joint_name(joint)
+        what = f"{self.main}: joint {name!r}"
+        kind = int(model.jnt_type[joint])
+        if kind not in (_HINGE, _SLIDE):
+            raise HandError(f"{what} is a ball joint; write it as three hinge joints")
+        slides = kind == _SLIDE
+        axis = np.asarray(model.jnt_axis[joint], float)
+        # A joint value counts from `ref`, at which the body stands as it is written.
+        reference = -float(model.qpos0[model.jnt_qposadr[joint]])
+        origin = compose(origin, _motion(axis, reference, slides))
+        follows = self._mimics.get(joint)
+        if isinstance(follows, float):
+            return _fixed(name, parent, child, compose(origin, _motion(axis, follows, slides)))
+        limited = bool(model.jnt_limited[joint])
+        most = UNLIMITED_M if slides else math.pi
+        lower, upper = map(float, model.jnt_range[joint]) if limited else (-most, most)
+        if not -4 * math.pi <= lower <= upper <= 4 * math.pi:
+            raise HandError(f"{what}: range {lower:g} .. {upper:g} is reversed or too large")
+        servo = self._servos.get(joint, Servo())
+        kind_name = "prismatic" if slides else "revolute" if limited else "continuous"
+        return Joint(
+            name, kind_name, parent, child, origin, axis, lower, upper, servo.effort, follows,
+            stiffness=servo.stiffness,
+        )  # fmt: skip
+
+    def _link(self, body: int, name: str) -> Link:
+        model = self.model
+        first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+        geoms = range(first, first + count) if count else range(0)
+        touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        # Some models leave contacts to pairs: then whatever is in the groups of collision shapes counts.
+        touching = touching or [g for g in geoms if self._bare and model.geom_group[g] >= _HIDDEN_GROUP]
+        shown = [g for g in geoms if g not in touching and model.geom_group[g] < _HIDDEN_GROUP]
+        shown = shown or [g for g in touching if model.geom_group[g] < _HIDDEN_GROUP]
+        mass = float(model.body_mass[body])
+        return Link(
+            name,
+            tuple(shape for g in touching for shape in self._shape(g)),
+            mass if mass > 1e-8 else None,
+            tuple(replace(s, colour=colour) for g in shown if (colour := self._colour(g)) for s in self._shape(g)),
+        )
+
+    def _shape(self, geom: int) -> Iterator[Shape]:
+        model = self.model
+        pose, size = _pose(model.geom_pos[geom], model.geom_quat[geom]), [float(s) for s in model.geom_size[geom]]
+        kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+        if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+            yield Shape("sphere", (size[0],), pose)
+        elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            yield Shape("capsule", (size[0], 2 * size[1]), pose)
+        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            yield Shape("cylinder", (size[0], 2 * size[1]), pose)
+        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
+            yield Shape("box", (2 * size[0], 2 * size[1], 2 * size[2]), pose)
+        elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+            yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=_ellipsoid(np.array(size)))
+        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[geom])
+            vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+            vertices = np.asarray(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
+            faces = np.asarray(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int32)
+            yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=(vertices, faces))
+
+    def _colour(self, geom: int) -> tuple[float, float, float] | None:
+        rgba, material = self.model.geom_rgba[geom], int(self.model.geom_matid[geom])
+        if material >= 0 and np.allclose(rgba, _NAMED_COLOUR):
+            rgba = self.model.mat_rgba[material]
+        return (float(rgba[0]), float(rgba[1]), float(rgba[2])) if rgba[3] > 0 else None
+
+
+def _pose(position: Any, quaternion: Any) -> Floats:
+    return np.concatenate([np.asarray(position, float), np.asarray(quaternion, float)])
+
+
+def _motion(axis: Floats, value: float, slides: bool) -> Floats:
+    motion = IDENTITY_POSE.copy()
+    if slides:
+        motion[:3] = axis * value
+    else:
+        motion[3:] = quat_from_axis_angle(axis, np.asarray(value))
+    return motion
+
+
+def _fixed(name: str, parent: str, child: str, origin: Floats) -> Joint:
+    return Joint(name, "fixed", parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
+
+
+def _ellipsoid(half: Floats) -> tuple[Floats, Any]:
+    """A hull of 162 points on the surface."""
+    count = 162
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z**2)
+    return hull(np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1) * half)

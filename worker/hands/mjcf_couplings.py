@@ -1,0 +1,102 @@
+"""Which joints of an MJCF model follow others: by joint equalities, fixed tendons, and closed loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from worker.hands.mjcf_loops import follow_loops
+from worker.hands.mjcf_servos import driven, joints_on_tendon
+from worker.hands.robot import Mimic
+
+_RANGE_POINTS: Final = 41
+
+
+def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic | float], list[str]]:
+    """What each dependent joint follows, or the value at which an equality holds it; and notes for the user.
+
+    Args:
+        model: the compiled model.
+        name: name of a joint.
+    """
+    found: dict[int, Mimic | float] = {}
+    notes: list[str] = []
+    for equality in range(model.neq):
+        if not model.eq_active0[equality]:
+            continue
+        first, second = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        kind = int(model.eq_type[equality])
+        if kind == int(mujoco.mjtEq.mjEQ_TENDON):
+            ends = [joints_on_tendon(model, tendon) if tendon >= 0 else [] for tendon in (first, second)]
+            if len(ends[0]) != 1 or len(ends[1]) != 1:
+                notes.append("an equality of tendons with several joints was left out")
+                continue
+            _note(notes, _couple_tendons(model, equality, ends[0][0], ends[1][0], found, name))
+        elif kind == int(mujoco.mjtEq.mjEQ_JOINT):
+            _note(notes, _couple(model, first, second, np.asarray(model.eq_data[equality, :5]), found, name))
+    notes += _couple_by_tendons(model, found, name)
+    notes += follow_loops(model, found, name)
+    return found, notes
+
+
+def _note(notes: list[str], text: str) -> None:
+    if text:
+        notes.append(text)
+
+
+def _couple(
+    model: Any, first: int, second: int, polynomial: Any, found: dict[int, Mimic | float], name: Callable[[int], str]
+) -> str:
+    """first - first0 = p(second - second0), p of degree 4; bent ones are replaced by the line that fits best."""
+    rest = [float(model.qpos0[model.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (first, second)]
+    if second < 0:
+        found[first] = rest[0] + float(polynomial[0])
+        return ""
+    if first in found or first == second:
+        return f"a second equality of {name(first)!r} was left out"
+    constant, slope, note = float(polynomial[0]), float(polynomial[1]), ""
+    if np.abs(polynomial[2:]).max() > 1e-9:
+        lower, upper = _range(model, second)
+        at = np.linspace(lower, upper, _RANGE_POINTS) - rest[1]
+        values = np.polynomial.polynomial.polyval(at, polynomial)
+        slope, constant = map(float, np.polyfit(at, values, 1))
+        error = float(np.abs(values - constant - slope * at).max())
+        note = f"{name(first)!r} follows {name(second)!r} by a line within {error:.2g}"
+    found[first] = Mimic(name(second), slope, rest[0] + constant - slope * rest[1])
+    return note
+
+
+def _couple_tendons(
+    model: Any, equality: int, one: tuple[int, float], other: tuple[int, float], found: dict[int, Mimic | float],
+    name: Callable[[int], str],
+) -> str:  # fmt: skip
+    """The same for tendons of one joint each: c1 (q1 - q1_0) = p(c2 (q2 - q2_0))."""
+    scaled = np.asarray(model.eq_data[equality, :5]) * other[1] ** np.arange(5) / one[1]
+    return _couple(model, one[0], other[0], scaled, found, name)
+
+
+def _couple_by_tendons(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> list[str]:
+    """Joints that share one actuated tendon bend in the ratio of its pull on them, unless something else moves them."""
+    alone = {
+        pulled[0][0] for actuator in range(model.nu) if len(pulled := driven(model, actuator)) == 1
+    }  # joints with an actuator of their own
+    notes = []
+    for actuator in range(model.nu):
+        free = [(j, c) for j, c in driven(model, actuator) if j not in found and j not in alone and abs(c) > 1e-9]
+        if len(free) < 2:
+            continue
+        (driver, pull), *others = free
+        for joint, coefficient in others:
+            found[joint] = Mimic(name(driver), coefficient / pull, 0.0)
+        notes.append(f"{', '.join(name(joint) for joint, _ in others)} taken to follow {name(driver)} on their tendon")
+    return notes
+
+
+def _range(model: Any, joint: int) -> tuple[float, float]:
+    if not model.jnt_limited[joint]:
+        return -np.pi, np.pi
+    lower, upper = model.jnt_range[joint]
+    return float(lower), float(upper)

@@ -1,0 +1,98 @@
+"""Force limits and position gains of the joints of an MJCF model, from its actuators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from worker.hands.robot import Mimic
+
+
+@dataclass(frozen=True)
+class Servo:
+    """What drives a joint; 0: not stated."""
+
+    effort: float = 0.0
+    """[N m or N]"""
+    stiffness: float = 0.0
+    """[N m/rad or N/m]"""
+
+
+def servos(model: Any, mimics: Mapping[int, Mimic | float]) -> dict[int, Servo]:
+    """Servo of each joint that an actuator drives.
+
+    An actuator of gear g on a length l pulls with g F dl/dq at joint q, and a position servo of gain k holds it with
+    k (g dl/dq)^2: on a joint dl/dq is 1; on a fixed tendon it is the joint's coefficient, and the joints that follow
+    this one add theirs, times how fast they follow.
+    """
+    found: dict[int, Servo] = {}
+    joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
+    for actuator in range(model.nu):
+        gear = float(model.actuator_gear[actuator, 0])
+        rates: dict[int, float] = {}
+        for joint, coefficient in driven(model, actuator):
+            driver, rate = _driver(joint, mimics, joint_of)
+            if driver is not None:
+                rates[driver] = rates.get(driver, 0.0) + coefficient * rate
+        for joint, rate in rates.items():
+            arm = abs(gear * rate)
+            force, gain = _force(model, actuator), _gain(model, actuator)
+            before = found.get(joint, Servo())
+            found[joint] = Servo(before.effort + arm * force, before.stiffness + arm**2 * gain)
+    for joint, servo in list(found.items()):
+        if model.jnt_actfrclimited[joint]:
+            most = float(np.abs(model.jnt_actfrcrange[joint]).max())
+            found[joint] = Servo(min(servo.effort, most) or most, servo.stiffness)
+    return found
+
+
+def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
+    """Joints that an actuator moves, with the rate at which its length changes with each."""
+    kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+        return [(target, 1.0)]
+    return joints_on_tendon(model, target) if kind == int(mujoco.mjtTrn.mjTRN_TENDON) else []
+
+
+def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
+    """Joints of a fixed tendon with their coefficients."""
+    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+    return [
+        (int(model.wrap_objid[w]), float(model.wrap_prm[w]))
+        for w in range(first, first + count)
+        if model.wrap_type[w] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+    ]
+
+
+def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:
+    """The joint that a joint follows in the end, and how fast."""
+    rate = 1.0
+    for _ in range(len(mimics) + 1):
+        follows = mimics.get(joint)
+        if follows is None:
+            return joint, rate
+        if isinstance(follows, float) or follows.joint not in joint_of:
+            return None, 0.0
+        rate *= follows.multiplier
+        joint = joint_of[follows.joint]
+    return None, 0.0
+
+
+def _force(model: Any, actuator: int) -> float:
+    """Largest force; 0 where none follows from the model."""
+    if model.actuator_forcelimited[actuator]:
+        return float(np.abs(model.actuator_forcerange[actuator]).max())
+    if model.actuator_ctrllimited[actuator] and model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_NONE):
+        return abs(float(model.actuator_gainprm[actuator, 0])) * float(np.abs(model.actuator_ctrlrange[actuator]).max())
+    return 0.0
+
+
+def _gain(model: Any, actuator: int) -> float:
+    """Gain of a position servo; 0 for other actuators."""
+    if model.actuator_biastype[actuator] != int(mujoco.mjtBias.mjBIAS_AFFINE):
+        return 0.0
+    return max(0.0, -float(model.actuator_biasprm[actuator, 1]))

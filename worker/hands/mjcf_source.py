@@ -1,0 +1,174 @@
+"""MJCF made safe for MuJoCo's own reader: one text that names no file, and the meshes it needs beside it.
+
+MuJoCo reads what a model names from the disk, wherever that is. So includes are put in here, meshes are looked up among
+the hand's files and renamed, and every part that a hand does not need is left out: only what is listed here reaches it.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+from typing import Final
+
+from defusedxml import ElementTree as SafeTree
+from defusedxml.common import DefusedXmlException
+
+from service.model.errors import HandError, LimitError
+
+MAX_BYTES: Final = 8 * 2**20
+_MAX_INCLUDES: Final = 64
+_MAX_ELEMENTS: Final = 50_000
+Element = ElementTree.Element
+#: Sections of a model that say something of a hand.
+_SECTIONS: Final = ("compiler", "default", "asset", "worldbody", "contact", "tendon", "equality", "actuator")
+#: Elements that would load files or plugins, or multiply what is written; none of them is needed for a hand.
+_REFUSED: Final = ("attach", "composite", "flexcomp", "model", "replicate")
+_LEFT_OUT: Final = frozenset(
+    {"texture", "layer", "hfield", "skin", "plugin", "camera", "light", "spatial", "weld", "flex", "flexvert", "pair"}
+)
+_ACTUATORS: Final = ("general", "motor", "position", "velocity", "intvelocity")
+#: Attributes that name files, or what was left out.
+_DROPPED: Final = frozenset(
+    {"file", "content_type", "texture", "hfield", "meshdir", "texturedir", "assetdir", "strippath", "plugin"}
+)
+_MESHES: Final = (".stl", ".obj", ".msh")
+
+
+def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes]]:
+    """The model as one text, and the mesh files it names.
+
+    Raises:
+        HandError: not XML, not MJCF, an include or a mesh is not there or lies outside the upload, or an element that
+            would load another model; the message names it.
+        LimitError: larger than the limits of this module.
+    """
+    root = _parse(files[main], main)
+    if root.tag != "mujoco":
+        raise HandError(f"{main}: the XML root is <{root.tag[:40]}>, an MJCF model begins with <mujoco>")
+    _put_in_includes(root, files, main, main, [0, 0])
+    folder = _mesh_folder(root)
+    assets: dict[str, bytes] = {}
+    for section in list(root):
+        if section.tag not in _SECTIONS:
+            root.remove(section)
+    for element in list(root.iter()):
+        if element.tag in _REFUSED:
+            raise HandError(f"{main}: <{element.tag}> is not read; write its parts out, or give the hand's own file")
+        if element.tag == "mesh" and (file := element.get("file")):
+            _take_mesh(element, file, files, main, folder, assets)
+            continue
+        for name in _DROPPED & element.attrib.keys():
+            del element.attrib[name]
+    _prune(root)
+    _prune_actuators(root)
+    compiler = root.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(root, "compiler")
+    # Frames without mass are common in hands and stop MuJoCo's reader.
+    compiler.set("boundmass", compiler.get("boundmass", "1e-9"))
+    compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
+    return ElementTree.tostring(root, encoding="unicode"), assets
+
+
+def _parse(data: bytes, name: str) -> Element:
+    if len(data) > MAX_BYTES:
+        raise LimitError(f"{name}: {len(data)} bytes of XML; at most {MAX_BYTES} are taken")
+    try:
+        root: Element = SafeTree.fromstring(data)
+    except DefusedXmlException:
+        raise HandError(f"{name}: XML entities are refused; write the text out") from None
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise HandError(f"{name}: not well-formed XML ({error}); export the model again") from None
+    return root
+
+
+def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here: str, counts: list[int]) -> None:
+    """Replace each include by what stands in its file; `counts` are the includes and elements so far."""
+    counts[1] += sum(1 for _ in root.iter())
+    if counts[1] > _MAX_ELEMENTS:
+        raise LimitError(f"{main}: more than {_MAX_ELEMENTS} elements")
+    for parent in list(root.iter()):
+        for at, child in reversed(list(enumerate(parent))):
+            if child.tag != "include":
+                continue
+            counts[0] += 1
+            if counts[0] > _MAX_INCLUDES:
+                raise HandError(f"{main}: more than {_MAX_INCLUDES} includes, or a file that includes itself")
+            wanted = child.get("file", "")
+            name = _find(wanted, files, [posixpath.dirname(main), posixpath.dirname(here)], main, "includes")
+            part = _parse(files[name], name)
+            _put_in_includes(part, files, main, name, counts)
+            parent[at : at + 1] = list(part)
+
+
+def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str, does: str) -> str:
+    """Name of a file that a model names, sought from several folders."""
+    path = wanted.replace("\\", "/")
+    inside = False
+    for folder in dict.fromkeys(folders):
+        name = posixpath.normpath(posixpath.join(folder, path))
+        if path.startswith("/") or name.startswith(("..", "/")) or ":" in path:
+            continue
+        inside = True
+        if name in files:
+            return name
+    if not inside:
+        raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside the hand's folder; put it inside")
+    below = [name for name in files if name.endswith("/" + posixpath.normpath(path).removeprefix("../"))]
+    if len(below) == 1:
+        return below[0]
+    raise HandError(f"{main}: {does} {wanted[:80]!r}, which is not there; add the file")
+
+
+def _mesh_folder(root: Element) -> tuple[str, bool]:
+    """Where meshes lie, as the compiler elements say, and whether folders in their names are to be left out."""
+    folder, strip = "", False
+    for compiler in root.findall("compiler"):
+        folder = compiler.get("meshdir", compiler.get("assetdir", folder))
+        strip = compiler.get("strippath", str(strip)).lower() == "true"
+    return folder, strip
+
+
+def _take_mesh(
+    element: Element, file: str, files: Mapping[str, bytes], main: str, where: tuple[str, bool],
+    assets: dict[str, bytes],
+) -> None:  # fmt: skip
+    folder, strip = where
+    wanted = PurePosixPath(file.replace("\\", "/")).name if strip else file
+    base = posixpath.dirname(main)
+    name = _find(posixpath.join(folder, wanted), files, [base, ""], main, "names the mesh")
+    suffix = PurePosixPath(name).suffix.lower()
+    if suffix not in _MESHES:
+        raise HandError(f"{main}: the mesh {name!r} is none of {', '.join(_MESHES)}, which MJCF takes; convert it")
+    # MuJoCo calls a mesh by its file where the model does not name it.
+    element.set("name", element.get("name", PurePosixPath(file.replace("\\", "/")).stem))
+    given = f"{len(assets)}{suffix}"
+    assets[given] = files[name]
+    element.set("file", given)
+    element.attrib.pop("content_type", None)
+
+
+def _prune(element: Element) -> None:
+    for child in list(element):
+        kind = child.get("type", "")
+        if child.tag in _LEFT_OUT or (child.tag == "geom" and kind in ("hfield", "sdf")):
+            element.remove(child)
+        else:
+            _prune(child)
+
+
+def _prune_actuators(root: Element) -> None:
+    """Leave actuators of joints and of tendons that are still there."""
+    tendons = {tendon.get("name") for section in root.findall("tendon") for tendon in section.findall("fixed")}
+    for section in root.findall("actuator"):
+        for actuator in list(section):
+            drives = "joint" in actuator.attrib or "jointinparent" in actuator.attrib
+            if actuator.tag not in _ACTUATORS or not (drives or actuator.get("tendon") in tendons):
+                section.remove(actuator)
+    for section in root.findall("equality"):
+        for constraint in list(section):
+            ends = {constraint.get("tendon1"), constraint.get("tendon2")} - {None}
+            if constraint.tag not in ("joint", "tendon", "connect") or ends - tendons:
+                section.remove(constraint)

@@ -1,0 +1,69 @@
+"""Xacro expanded to URDF in a child process that can open no file, reach no network and start no command.
+
+Xacro's expressions are Python. The child is given all files of the hand in memory, and then gives up what it could do
+harm with: see `worker.hands.xacro_child`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import PurePosixPath
+from typing import Final
+
+from service.model.errors import HandError
+from worker.hands.urdf import MAX_BYTES
+
+#: Largest hands on arms take a tenth of it [s].
+CPU_LIMIT_S: Final = 10
+MEMORY_LIMIT_BYTES: Final = 2**30
+_WALL_LIMIT_S: Final = 120.0
+#: What an expansion may read; meshes are only named.
+_READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
+
+
+def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
+    """The URDF that a xacro file expands to.
+
+    Args:
+        files: all files of the hand; includes and `$(find PACKAGE)` are sought among them only.
+        main: the file to expand.
+        arguments: values of `<xacro:arg>` by name.
+
+    Raises:
+        HandError: it cannot be expanded, or reaches for what lies outside the hand's folder; the message says why.
+    """
+    if find_spec("xacro") is None:
+        raise HandError(f"{main}: the package xacro is not installed: pip install 'graspd[worker]', or expand it first")
+    given = {
+        "main": main, "arguments": dict(arguments), "names": sorted(files), "memory": MEMORY_LIMIT_BYTES,
+        "cpu": CPU_LIMIT_S, "limit": MAX_BYTES,
+        "texts": {
+            name: files[name].decode(errors="replace")
+            for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ
+        },
+    }  # fmt: skip
+    passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
+    command = [sys.executable, "-m", "worker.hands.xacro_child"]
+    try:
+        done = subprocess.run(
+            command, input=json.dumps(given).encode(), capture_output=True, timeout=_WALL_LIMIT_S, check=False,
+            env=passed_on,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise HandError(f"{main}: expanding it does not end; expand it yourself and give the URDF") from None
+    try:
+        answer = json.loads(done.stdout)
+        urdf, error = answer["urdf"], answer["error"]
+    except (ValueError, KeyError, TypeError):
+        raise HandError(
+            f"{main}: expanding it takes more than {CPU_LIMIT_S} s or {MEMORY_LIMIT_BYTES >> 20} MiB; "
+            "expand it yourself and give the URDF"
+        ) from None
+    if error:
+        raise HandError(f"{main}: {error}")
+    return str(urdf).encode()

@@ -1,0 +1,180 @@
+"""Xacro in a process of its own: `python -m worker.hands.xacro_child` reads a JSON object and writes one.
+
+Three fences, because expressions in xacro are Python and what guards them in the library can be climbed: names that
+lead out of an expression are refused; an audit hook refuses whatever would touch files, processes or the network; and
+the kernel gives this process no new file descriptor, without which neither a file nor a socket nor a program opens.
+"""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+import io
+import json
+import os
+import posixpath
+import resource
+import sys
+from types import SimpleNamespace
+from typing import Any, Final
+from xml.dom import minidom
+
+#: Folder in which the hand's files seem to lie.
+_TOP: Final = "/hand"
+_MAX_NODES: Final = 100_000
+#: What the interpreter does of itself when it evaluates an expression.
+_HARMLESS: Final = frozenset({"compile", "exec", "builtins.id", "object.__getattr__"})
+#: Attributes that lead from a generator, a coroutine or a traceback to the frames around it.
+_FRAMES: Final = ("gi_", "cr_", "ag_", "f_", "tb_", "co_", "func_")
+
+
+class Refused(Exception):
+    """The file reaches for what it may not have."""
+
+
+def main() -> None:
+    """Expand the given xacro file on standard output."""
+    given = json.loads(sys.stdin.buffer.read())
+    try:
+        answer = {"urdf": _expand(given), "error": ""}
+    except Exception as error:
+        answer = {"urdf": "", "error": _told(error)}
+    os.write(1, json.dumps(answer).encode())
+    os._exit(0)
+
+
+def _expand(given: dict[str, Any]) -> str:
+    # All that an expansion needs is there before the doors are closed.
+    import encodings.idna
+    import encodings.utf_8
+
+    import xacro
+    import yaml
+    from defusedxml import minidom as safe
+    from xacro import substitution_args
+
+    texts: dict[str, str] = given["texts"]
+    names: list[str] = given["names"]
+
+    def named(path: str) -> str:
+        """Name of a file of the hand; Refused where the path leads out of its folder."""
+        inside = posixpath.normpath(posixpath.join(_TOP, path))
+        if not inside.startswith(_TOP + "/"):
+            said = path.removeprefix(_TOP + "/")
+            raise Refused(f"{said!r} lies outside the hand's folder; put it inside, or give the folder that holds both")
+        return inside.removeprefix(_TOP + "/")
+
+    def text_of(path: str) -> str:
+        name = named(path)
+        if name not in texts:
+            raise Refused(f"includes {name!r}, which is not there; add the file, or give the folder that holds it")
+        return texts[name]
+
+    def parse(source: Any, filename: str | None = None) -> minidom.Document:
+        return safe.parseString(text_of(str(filename)) if source is None else source)
+
+    def find(package: str) -> str:
+        folder = _package(package, names, texts)
+        if folder is None:
+            raise Refused(f"needs the package {package!r}; give the folder that holds both: --urdf NAME")
+        return posixpath.join(_TOP, folder)
+
+    def environment(name: str) -> str:
+        raise Refused(f"asks for the environment variable {name!r}; write its value out")
+
+    def evaluate(expression: str, symbols: dict[str, Any], scope: Any = None) -> Any:
+        # The table itself, which knows the scopes around it; a copy would not.
+        symbols.update(__builtins__={})
+        return eval(_checked(expression), symbols, scope)
+
+    def substitute(expression: str, context: dict[str, Any]) -> str:
+        values = {**_PLAIN, **{k: v for k, v in vars(xacro.math).items() if not k.startswith("_")}}
+        values |= {k: substitution_args.convert_value(str(v), "auto") for k, v in context.get("arg", {}).items()}
+        values |= {"find": find, "arg": lambda name: values[name], "dirname": lambda: _TOP}
+        return str(eval(_checked(expression), {"__builtins__": {}}, values))
+
+    xacro.parse, xacro.safe_eval = parse, evaluate
+    xacro.open = lambda path, *_: io.StringIO(text_of(path))
+    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, named(pattern))]  # noqa: E731
+    xacro.glob = SimpleNamespace(glob=pattern_of)
+    substitution_args._eval, substitution_args._eval_find = substitute, find
+    substitution_args._eval_env = substitution_args._eval_dict["env"] = environment
+    substitution_args._eval_optenv = lambda name, default="": default
+    xacro.verbosity = 0
+    del encodings, yaml
+    _close_doors(given["cpu"], given["memory"])
+    document = xacro.process_file(f"{_TOP}/{given['main']}", mappings=dict(given["arguments"]), verbosity=0)
+    text = document.toxml()
+    if len(text) > given["limit"]:
+        raise Refused(f"it expands to {len(text)} characters; at most {given['limit']} are taken")
+    return text
+
+
+_PLAIN: Final[dict[str, Any]] = {
+    "true": True, "false": False, "True": True, "False": False,
+    "list": list, "dict": dict, "map": map, "str": str, "float": float, "int": int,
+}  # fmt: skip
+
+
+def _checked(expression: str) -> Any:
+    """Code of an expression that names nothing from which one climbs out of it."""
+    tree = ast.parse(expression.strip(), "<expression>", "eval")
+    for count, node in enumerate(ast.walk(tree)):
+        name = getattr(node, "attr", None) or getattr(node, "id", None) or ""
+        if name.startswith(("__", *(_FRAMES if isinstance(node, ast.Attribute) else ()))):
+            raise Refused(f"an expression uses {name!r}, which no hand needs: {expression[:60]!r}")
+        if count > _MAX_NODES:
+            raise Refused("an expression is too long")
+    return compile(tree, "<expression>", "eval")
+
+
+def _package(package: str, names: list[str], texts: dict[str, str]) -> str | None:
+    """Folder of a ROS package among the files, relative to the top: by its manifest, else by its name."""
+    for name, text in texts.items():
+        if posixpath.basename(name) == "package.xml" and f"<name>{package}</name>" in "".join(text.split()):
+            return posixpath.dirname(name)
+    folders = {folder for name in names for folder in _parents(name)}
+    below = sorted((folder for folder in folders if posixpath.basename(folder) == package), key=len)
+    if below:
+        return below[0]
+    manifests = [name for name in names if posixpath.basename(name) == "package.xml"]
+    # A package may have been packed without the folder that bears its name.
+    return "" if not manifests else None
+
+
+def _parents(name: str) -> list[str]:
+    parts = name.split("/")[:-1]
+    return ["/".join(parts[: end + 1]) for end in range(len(parts))]
+
+
+def _close_doors(cpu_s: int, memory_bytes: int) -> None:
+    """From here on the process computes, and nothing else."""
+    os.environ.clear()
+    limits = {"AS": memory_bytes, "CPU": cpu_s, "CORE": 0, "FSIZE": 0, "NOFILE": 3}
+    for what, value in limits.items():
+        resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (value, value))
+    sys.addaudithook(_refuse)
+
+
+def _refuse(event: str, _arguments: tuple[Any, ...]) -> None:
+    if event not in _HARMLESS:
+        raise Refused(f"it reaches out of its folder ({event}); expand it yourself and give the URDF")
+
+
+def _told(error: BaseException) -> str:
+    """One line; of errors that wrap others the refusal within."""
+    at: BaseException | None = error
+    while at is not None:
+        if isinstance(at, Refused):
+            return str(at)
+        if type(at).__name__ == "EntitiesForbidden":
+            return "XML entities are refused; write the text out"
+        at = getattr(at, "exc", None) or at.__cause__ or at.__context__
+    line = " ".join(str(error).split())[:200] or type(error).__name__
+    if "Undefined substitution argument" in line:
+        return f"{line}; say its value: --xacro NAME=VALUE"
+    return f"cannot be expanded ({line}); correct it, or expand it yourself and give the URDF"
+
+
+if __name__ == "__main__":
+    main()

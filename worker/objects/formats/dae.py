@@ -1,0 +1,211 @@
+"""COLLADA: triangles of all meshes of the scene in metres, with the diffuse colours of their materials.
+
+The file's unit is applied and its up axis is not: so do the viewers of ROS, for which such meshes are made.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from defusedxml import ElementTree as SafeTree
+from defusedxml.common import DefusedXmlException
+
+from service.model.errors import MeshError
+from worker.objects.formats.soup import Soup, check_face_count, fan
+
+_MAX_DEPTH: Final = 32
+_MAX_NODES: Final = 10_000
+Element = ElementTree.Element
+#: Vertices (V, 3), triangles (F, 3) and the symbol of the material of a primitive.
+_Primitive = tuple[np.ndarray, np.ndarray, str]
+
+
+def read(data: bytes) -> Soup:
+    """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
+    root = _parse(data)
+    library = _Library(root)
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    colours: list[np.ndarray] = []
+    count = total = 0
+    for geometry, matrix, bound in _instances(root, library):
+        for points, triangles, symbol in library.primitives(geometry):
+            flipped = triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
+            faces.append(flipped + count)
+            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+            colour = library.colour(bound.get(symbol, symbol))
+            colours.append(np.tile(colour, (len(triangles), 1)))
+            count, total = count + len(points), total + len(triangles)
+            check_face_count(max(total, count // 3))
+    if not faces:
+        raise MeshError("the mesh has no faces; export a scene with a mesh")
+    known = np.concatenate(colours)
+    scaled = np.concatenate(vertices) * _unit(root)
+    return Soup(scaled, np.concatenate(faces), None if np.isnan(known).all() else known)
+
+
+def _parse(data: bytes) -> Element:
+    try:
+        root: Element = SafeTree.fromstring(data)
+    except DefusedXmlException:
+        raise MeshError("XML entities are refused; export the mesh again") from None
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise MeshError(f"not well-formed XML ({str(error)[:80]}); export the mesh again") from None
+    for element in root.iter():
+        # Versions 1.4 and 1.5 differ in the namespace, which says nothing here.
+        if isinstance(element.tag, str):
+            element.tag = element.tag.rpartition("}")[2]
+    if root.tag != "COLLADA":
+        raise MeshError(f"the XML root is <{root.tag[:40]}>, a DAE file begins with <COLLADA>")
+    return root
+
+
+def _unit(root: Element) -> float:
+    """Metres of one unit of the file."""
+    unit = root.find("asset/unit")
+    metres = float(unit.get("meter", "1")) if unit is not None else 1.0
+    if not 1e-9 < metres < 1e9:
+        raise MeshError(f"its unit is {metres:g} m; export in metres")
+    return metres
+
+
+class _Library:
+    """What the parts of a file call each other by."""
+
+    def __init__(self, root: Element) -> None:
+        self._known = {identity: element for element in root.iter() if (identity := element.get("id"))}
+        self._primitives: dict[str, list[_Primitive]] = {}
+        self._colours: dict[str, np.ndarray] = {}
+
+    def named(self, reference: str | None) -> Element:
+        found = self._known.get((reference or "").removeprefix("#"))
+        if found is None:
+            raise MeshError(f"it names {(reference or 'nothing')[:40]!r}, which is not there; export it as one file")
+        return found
+
+    def primitives(self, geometry: str) -> list[_Primitive]:
+        if geometry not in self._primitives:
+            mesh = self.named(geometry).find("mesh")
+            self._primitives[geometry] = [] if mesh is None else list(self._read(mesh))
+        return self._primitives[geometry]
+
+    def _read(self, mesh: Element) -> Iterator[_Primitive]:
+        for kind in ("triangles", "polylist", "polygons"):
+            for primitive in mesh.findall(kind):
+                inputs = primitive.findall("input")
+                stride = 1 + max((int(i.get("offset", "0")) for i in inputs), default=0)
+                source = next((i for i in inputs if i.get("semantic") == "VERTEX"), None)
+                if source is None or not 0 < stride <= 64:
+                    raise MeshError("a primitive has no vertices; export the mesh again")
+                positions = next(
+                    (i for i in self.named(source.get("source")).findall("input") if i.get("semantic") == "POSITION"),
+                    None,
+                )
+                points = self._points(positions.get("source") if positions is not None else None)
+                counts, order = _polygons(primitive, kind, stride)
+                corners = order[int(source.get("offset", "0")) :: stride]
+                if int(counts.sum()) != len(corners) or (counts < 0).any():
+                    raise MeshError("a primitive promises other corners than it has; export the mesh again")
+                yield points, fan(counts, corners), primitive.get("material", "")
+
+    def _points(self, reference: str | None) -> np.ndarray:
+        source = self.named(reference)
+        array = source.find("float_array")
+        accessor = source.find("technique_common/accessor")
+        values = _numbers(array)
+        stride = int(accessor.get("stride", "3")) if accessor is not None else 3
+        start = int(accessor.get("offset", "0")) if accessor is not None else 0
+        if not 3 <= stride <= 64 or start < 0:
+            raise MeshError(f"points of {stride} numbers are not read; export the mesh again")
+        count = max(len(values) - start, 0) // stride
+        return values[start : start + count * stride].reshape(count, stride)[:, :3]
+
+    def colour(self, material: str) -> np.ndarray:
+        """(3,) sRGB diffuse colour of a material; NaN where it has none."""
+        if material not in self._colours:
+            self._colours[material] = self._diffuse(material)
+        return self._colours[material]
+
+    def _diffuse(self, material: str) -> np.ndarray:
+        unknown = np.full(3, np.nan)
+        try:
+            instance = self.named(material).find("instance_effect")
+            effect = self.named(instance.get("url") if instance is not None else None)
+            found = next(effect.iter("diffuse"), None)
+            values = _numbers(found.find("color") if found is not None else None)
+        except (MeshError, ValueError):
+            return unknown
+        return np.clip(values[:3], 0, 1) if len(values) >= 3 and np.isfinite(values[:3]).all() else unknown
+
+
+def _polygons(primitive: Element, kind: str, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of each polygon, and the indices of all corners one after another."""
+    if kind == "polygons":
+        parts = [_numbers(part).astype(np.int64) for part in primitive.findall("p")]
+        counts = np.array([len(part) // stride for part in parts], dtype=np.int64)
+        return counts, np.concatenate(parts) if parts else np.zeros(0, np.int64)
+    order = _numbers(primitive.find("p")).astype(np.int64)
+    if kind == "polylist":
+        return _numbers(primitive.find("vcount")).astype(np.int64), order
+    return np.full(len(order) // (3 * stride), 3, dtype=np.int64), order
+
+
+def _numbers(element: Element | None) -> np.ndarray:
+    return np.array((element.text or "").split() if element is not None else [], dtype="S40").astype(float)
+
+
+def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarray, dict[str, str]]]:
+    """Geometry, 4x4 matrix and material of each symbol, of every mesh that the scene shows."""
+    shown = root.find("scene/instance_visual_scene")
+    scene = library.named(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
+    stack = [(node, np.eye(4), 0) for node in (scene.findall("node") if scene is not None else [])]
+    visited = 0
+    while stack:
+        node, parent, depth = stack.pop()
+        visited += 1
+        if depth > _MAX_DEPTH or visited > _MAX_NODES:
+            raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
+        matrix = parent @ _matrix(node)
+        for instance in node.findall("instance_geometry"):
+            bound = {
+                link.get("symbol", ""): link.get("target", "")
+                for link in instance.findall("bind_material/technique_common/instance_material")
+            }
+            yield instance.get("url", ""), matrix, bound
+        stack += [(child, matrix, depth + 1) for child in node.findall("node")]
+        stack += [(library.named(i.get("url")), matrix, depth + 1) for i in node.findall("instance_node")]
+
+
+def _matrix(node: Element) -> np.ndarray:
+    """Product of a node's transforms, in their order."""
+    matrix = np.eye(4)
+    for element in node:
+        step = np.eye(4)
+        match element.tag:
+            case "matrix":
+                step = _numbers(element).reshape(4, 4)
+            case "translate":
+                step[:3, 3] = _numbers(element).reshape(3)
+            case "scale":
+                step[:3, :3] = np.diag(_numbers(element).reshape(3))
+            case "rotate":
+                step[:3, :3] = _rotation(*_numbers(element).reshape(4))
+            case _:
+                continue
+        matrix = matrix @ step
+    return matrix
+
+
+def _rotation(x: float, y: float, z: float, degrees: float) -> np.ndarray:
+    """Rodrigues' formula; a zero axis turns nothing."""
+    length = math.sqrt(x * x + y * y + z * z)
+    if length < 1e-12:
+        return np.eye(3)
+    x, y, z = x / length, y / length, z / length
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = math.radians(degrees)
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
