@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -15,25 +15,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.errors import InputError
 from service.store.shards import Shard, read_shard, write_shard
+from worker.commands.grasp_sheet import GraspSheet
 from worker.engines.devices import Device
 from worker.files.choice import EveryOption, UnjudgedOption, choose
 from worker.files.of_shard import INHERITED, hand_of_shard, neighbours_of_shard, object_of_shard
-from worker.grasps import Posture
 from worker.rendering.camera_file import SAMPLED, read_cameras
 from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
-from worker.rendering.pages.sheets import best, best_kept, contact_sheet, figures, three_sides_sheet, views_page
+from worker.rendering.pages.sheets import best, best_kept, views_page
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
 from worker.run import Run
 
 app = typer.Typer(add_completion=False)
-
-#: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
-ALONE: Final = (300, SAMPLES)
-OF_THREE: Final = (160, 8)
 
 _Device = Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")]
 _Object = Annotated[str | None, typer.Option(help="The object's file; default: found by its digest.")]
@@ -109,8 +104,11 @@ def render(
 @reporting_errors
 def pictures(
     grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
-    count: Annotated[int, typer.Option("--count", "-n", min=1, max=400, help="How many of the best grasps.")] = 12,
+    count: Annotated[
+        int | None, typer.Option("--count", "-n", min=1, max=400, help="How many of the best grasps; 12, of ways 4.")
+    ] = None,
     three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
+    way: Annotated[bool, typer.Option("--way", help="Each grasp on its way: standoff, pregrasp, grasp, lift.")] = False,
     size: Annotated[
         int | None, typer.Option(min=32, max=2048, help="Edge of one picture [px]; 300, with --three-sides 160.")
     ] = None,
@@ -122,32 +120,17 @@ def pictures(
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("grasps.png"),
     json: JsonFlag = False,
 ) -> None:
-    """Draw the best valid grasps by epsilon with their figures on one sheet."""
+    """Draw the best valid grasps by epsilon with their figures on one sheet, in their scenes where they have any."""
+    if way and three:
+        raise InputError("--way and --three-sides exclude each other")
     base = read_shard(grasps, kind="base")
     chosen, word = choose(base, unjudged=unjudged, every=every)
-    model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
-    rows = best(base.arrays, count, chosen)
-    shown = Posture.from_columns(base.arrays).take(rows)
-    sides = THREE_SIDES if three else THREE_SIDES[:1]
-    edge, samples = OF_THREE if three else ALONE
-    edge = size or edge
-    drawn = grasp_pictures(
-        model,
-        obj,
-        shown.hand_pose,
-        shown.joint_positions,
-        (edge, edge),
-        sides,
-        run=Run(Device(device).resolve()),
-        samples=samples,
-    )
-    title = f"{base.attributes.get('hand', model.name)} on {base.attributes.get('object', obj.name)}"
-    subtitle = f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm"
-    captions = figures(base.arrays, rows)
-    if three:
-        output.write_bytes(three_sides_sheet(drawn, captions, title=title, subtitle=subtitle))
-    else:
-        output.write_bytes(contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle))
+    rows = best(base.arrays, count or (4 if way else 12), chosen)
+    sheet = GraspSheet(
+        base, hand_of_shard(base, hand), object_of_shard(base, object), rows,
+        "way" if way else "three sides" if three else "one side", Run(Device(device).resolve()), size,
+    )  # fmt: skip
+    output.write_bytes(sheet.png(subtitle=f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm"))
     if json:
         emit({"file": str(output), "grasps": len(rows), "of": int(chosen.sum()), "kind": word, "rows": rows.tolist()})
     else:

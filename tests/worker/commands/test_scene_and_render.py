@@ -11,7 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from service.store.shards import json_attribute, read_shard, write_shard
-from worker.commands import render
+from worker.commands import grasp_sheet
 from worker.commands.exchange import app as exchange
 from worker.commands.render import app as rendering
 from worker.commands.scene import app as scenes
@@ -100,6 +100,18 @@ def test_pictures_draws_the_best_first(base):
         assert image.format == "PNG"
 
 
+def test_pictures_of_a_way_show_each_posture_of_a_free_grasp(base):
+    output = base.with_name("way.png")
+    arguments = ["pictures", str(base), "-n", "2", "--size", "48", "--device", "cpu", "-o", str(output), "--json"]
+    alone, ways = (CliRunner().invoke(rendering, [*arguments, *more]) for more in ([], ["--way"]))
+    assert alone.exit_code == ways.exit_code == 0, ways.output
+    assert last_line(ways)["rows"] == [2, 1]
+    with Image.open(output) as image:
+        # Two rows of three pictures and their margins.
+        assert image.width > 3 * 48 and image.height > 2 * 48 + 74
+    assert CliRunner().invoke(rendering, [*arguments, "--way", "--three-sides"]).exit_code == 2
+
+
 def test_another_object_than_the_shards_is_refused(base):
     output = base.with_name("other.h5")
     result = CliRunner().invoke(scenes, [str(base), "--object", "mug", "-o", str(output)])
@@ -140,7 +152,7 @@ def test_three_sides_of_a_grasp_take_fewer_rays_than_one_large_picture(base, mon
         traced.append(len(sides) * size[0] * size[1] * samples)
         return np.zeros((len(pose), len(sides), size[1], size[0], 3), np.uint8)
 
-    monkeypatch.setattr(render, "grasp_pictures", count)
+    monkeypatch.setattr(grasp_sheet, "grasp_pictures", count)
     for arguments in ([], ["--three-sides"], ["--three-sides", "--size", "300"]):
         output = str(base.with_name("sheet.png"))
         assert CliRunner().invoke(rendering, ["pictures", str(base), "-o", output, *arguments]).exit_code == 0

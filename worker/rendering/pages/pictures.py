@@ -105,7 +105,7 @@ def _shoot(
 ) -> NDArray[np.uint8]:
     worlds, (width, height) = len(bodies), size
     points = np.concatenate(
-        [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), _hand_points(hand, bodies)], axis=1
+        [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), hand_points(hand, bodies)], axis=1
     )
     floor = np.tile(IDENTITY_POSE, (worlds, 1))
     floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * FLOOR_SIZE[2]
@@ -115,7 +115,7 @@ def _shoot(
     k = intrinsics(width, height, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
-        angles = np.array([_side(hand, world) + azimuth for world in bodies])
+        angles = np.array([side_of(hand, world) + azimuth for world in bodies])
         shot = Shot(
             world=np.arange(worlds, dtype=np.int32),
             extrinsics=np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)]),
@@ -127,7 +127,7 @@ def _shoot(
     return np.stack(sides, axis=1)
 
 
-def _side(hand: HandModel, bodies: Floats) -> float:
+def side_of(hand: HandModel, bodies: Floats) -> float:
     """Azimuth of a camera that looks across the direction in which the palm approaches [rad]."""
     towards = quat_rotate(bodies[0, 3:], hand.palm.approach)
     # Where the palm comes from straight above or below, its own x axis serves.
@@ -142,10 +142,11 @@ def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tup
     return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)
 
 
-def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
+def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int], *, elevation: float = ELEVATION) -> Floats:
     """Extrinsics (4, 4) of a camera at azimuth `angle` [rad] from whose picture the points (P, 3) stand out."""
     centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
-    direction = np.array([np.cos(angle) * np.cos(ELEVATION), np.sin(angle) * np.cos(ELEVATION), np.sin(ELEVATION)])
+    flat = np.cos(elevation)
+    direction = np.array([np.cos(angle) * flat, np.sin(angle) * flat, np.sin(elevation)])
     distance = 4.0 * float(np.linalg.norm(near - centre, axis=1).max())
     # Perspective changes with the distance; three rounds settle it to a per cent.
     for _ in range(3):
@@ -158,7 +159,7 @@ def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int]) -> 
     return look_at(centre + distance * direction, centre)
 
 
-def _hand_points(hand: HandModel, bodies: Floats) -> Floats:
+def hand_points(hand: HandModel, bodies: Floats) -> Floats:
     """(N, P, 3) corners of all pieces in the object frame."""
     body = np.concatenate([np.full(len(piece.vertices), piece.body) for piece in hand.pieces])
     corners = np.concatenate([piece.vertices for piece in hand.pieces])

@@ -1,0 +1,106 @@
+"""Sheets of the grasps of a base shard: hand and object, in their scene where they have one, alone or on their way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from service.model.scene_kinds import supports_in
+from service.readers.ways import Waypoint, scene_spec_of, way_of
+from service.store.shards import Shard
+from worker.files.of_shard import neighbours_of_shard
+from worker.grasps import Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.rendering.pages.pictures import SAMPLES, THREE_SIDES, grasp_pictures
+from worker.rendering.pages.sheets import contact_sheet, figures, label_page, three_sides_sheet
+from worker.rendering.pages.way_pictures import FREE_STRIP, STRIP, Around, way_pictures
+from worker.run import Run
+
+Kind = Literal["one side", "three sides", "way"]
+#: Edge of a grasp's picture [px] and rays a pixel. Tracing costs what goes with both: three sides half of one alone.
+LOOKS: Final[dict[Kind, tuple[int, int]]] = {
+    "one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GraspSheet:
+    """Some rows of a shard, drawn."""
+
+    shard: Shard
+    hand: HandModel
+    obj: ObjectModel
+    rows: NDArray[np.intp]
+    kind: Kind
+    run: Run
+    edge: int | None = None
+    """Of one picture [px]; None: as `LOOKS` says."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of one picture [px]."""
+        edge = self.edge or LOOKS[self.kind][0]
+        return edge, edge
+
+    @property
+    def scene(self) -> str:
+        """Kind of the scenes that the grasps were planned in; empty: none."""
+        spec = scene_spec_of(self.shard)
+        return "" if spec is None or spec.kind == "free" or "grasp/scene_index" not in self.shard.arrays else spec.kind
+
+    def png(self, *, subtitle: str) -> bytes:
+        """The sheet."""
+        said = self.shard.attributes
+        title = f"{said.get('hand', self.hand.name)} on {said.get('object', self.obj.name)}"
+        title += f", {self.scene}" if self.scene else ""
+        captions = figures(self.shard.arrays, self.rows)
+        if self.kind == "way":
+            names, drawn = self._ways()
+            below = [[f"{k + 1}   " + ",  ".join(" ".join(pair) for pair in one)] for k, one in enumerate(captions)]
+            cells = [[Image.fromarray(picture) for picture in strip] for strip in drawn]
+            return label_page(cells, names, below, title=title, subtitle=subtitle)
+        drawn = self._alone()
+        if self.kind == "three sides":
+            return three_sides_sheet(drawn, captions, title=title, subtitle=subtitle)
+        return contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle)
+
+    def _ways(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+        """Names of the postures, and the pictures (N, F, H, W, 3)."""
+        ways = [way_of(self.shard, int(row)) for row in self.rows]
+        names = STRIP if any(point.name == "lift" for point in ways[0]) else FREE_STRIP
+        drawn = self._drawn([[_named(way, name) for name in names] for way in ways], 1)
+        return names, drawn[:, 0]
+
+    def _alone(self) -> NDArray[np.uint8]:
+        """Pictures at the grasp (N, A, H, W, 3)."""
+        sides = 3 if self.kind == "three sides" else 1
+        if self.scene:
+            return self._drawn([[_named(way_of(self.shard, int(row)), "grasp")] for row in self.rows], sides)[:, :, 0]
+        shown = Posture.from_columns(self.shard.arrays).take(self.rows)
+        return grasp_pictures(
+            self.hand, self.obj, shown.hand_pose, shown.joint_positions, self.size, THREE_SIDES[:sides], run=self.run,
+            samples=LOOKS[self.kind][1],
+        )  # fmt: skip
+
+    def _drawn(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
+        return way_pictures(
+            self.hand, self.obj, frames, self._around(), self.size, sides=sides, run=self.run,
+            samples=LOOKS[self.kind][1],
+        )  # fmt: skip
+
+    def _around(self) -> Around:
+        spec = scene_spec_of(self.shard)
+        if not self.scene or spec is None:
+            return Around()
+        poses = np.asarray(self.shard["scene/object_pose"], float)
+        index = np.asarray(self.shard["grasp/scene_index"], np.intp)[self.rows]
+        return Around(supports_in(spec), poses, index, neighbours_of_shard(self.shard, []))
+
+
+def _named(way: list[Waypoint], name: str) -> Waypoint:
+    return next(point for point in way if point.name == name)

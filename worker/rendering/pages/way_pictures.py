@@ -1,0 +1,199 @@
+"""Pictures of grasps in their scenes and on their way, for people: one camera a grasp, from a side that shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.scene_spec import HalfSpace
+from service.model.transforms import IDENTITY_POSE, apply, compose
+from service.readers.ways import Waypoint
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.objects.model import Floats, ObjectModel
+from worker.rendering.cameras import intrinsics, look_at
+from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.pages.pictures import (
+    FIELD_OF_VIEW,
+    FLOOR,
+    FLOOR_SIZE,
+    OBJECT_LOOK,
+    SAMPLES,
+    STUDIO,
+    TOWARD_LAMP,
+    fit_camera,
+    hand_points,
+    side_of,
+)
+from worker.rendering.palette import hexadecimal
+from worker.rendering.scenery import Box, Look, Shot, Solid
+from worker.rendering.standing import Supports, seen_share, slab_poses, slabs
+from worker.rendering.tracer import Tracer
+from worker.run import ALONE, Run
+from worker.scenes.neighbours import Neighbours
+
+#: Postures that a strip shows; those that a grasp has.
+STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")
+FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
+#: Sides that are tried: so many around, at these heights above the horizon [rad].
+_AROUND: Final = 16
+_HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
+#: Two sides of one grasp are this far apart at least [rad], if they can be.
+_APART: Final = np.radians(50.0)
+#: Edge of the pictures that sides are judged by [px].
+_GLANCE: Final = 48
+#: Towards the lamp where a board is above the object: from before it, as high as a room's window.
+_UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
+#: Hand parts farther than this from the object do not draw the camera back [m].
+_NEAR_M: Final = 0.14
+_HIGH_M: Final = 3.0
+_TABLE: Final = Look(hexadecimal("#b9bfc2"), roughness=0.85)
+_WALL: Final = Look(hexadecimal("#7f97a5"), roughness=0.8)
+_BESIDE: Final = Look(hexadecimal("#8d86a3"), roughness=0.6)
+
+
+@dataclass(frozen=True)
+class Around:
+    """Where N grasps are: S scenes of an object with the same supports, or one free object that floats."""
+
+    supports: Supports = ()
+    object_pose: Floats = field(default_factory=lambda: np.array(IDENTITY_POSE)[None])
+    """(S, 7) in the scene frame."""
+    index: NDArray[np.intp] | None = None
+    """(N,) scene of each grasp; None: all in the first."""
+    neighbours: Neighbours | None = None
+
+    def scene(self, number: int) -> int:
+        """Scene of a grasp."""
+        return 0 if self.index is None else int(self.index[number])
+
+
+def way_pictures(
+    hand: HandModel,
+    obj: ObjectModel,
+    frames: Sequence[Sequence[Waypoint]],
+    around: Around,
+    size: tuple[int, int] = (300, 300),
+    *,
+    sides: int = 1,
+    run: Run = ALONE,
+    samples: int = SAMPLES,
+) -> NDArray[np.uint8]:
+    """Pictures of N grasps, F postures each, from A sides.
+
+    Args:
+        hand: its bodies are drawn.
+        obj: what is grasped, carried as far as each posture says.
+        frames: for each grasp F postures in the frame of the object at rest.
+        around: the scenes.
+        size: width and height [px].
+        sides: A sides of each grasp, those first that show most of object and fingers.
+        run: asked between passes whether to stop.
+        samples: rays per pixel.
+
+    Returns:
+        (N, A, F, H, W, 3) sRGB.
+
+    Raises:
+        TaskCancelled: `run.cancelled()` answered True.
+    """
+    if not frames:
+        return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
+    stage = _Stage(hand, obj, around, len(frames[0]), run)
+    return np.stack([stage.shoot(number, way, size, sides, samples) for number, way in enumerate(frames)])
+
+
+class _Stage:
+    """One tracer for all grasps: the frames of one grasp are its worlds."""
+
+    def __init__(self, hand: HandModel, obj: ObjectModel, around: Around, frames: int, run: Run) -> None:
+        self.hand, self.obj, self.around, self.frames, self.run = hand, obj, around, frames, run
+        self.others = around.neighbours.objects if around.neighbours else ()
+        self.lamp = TOWARD_LAMP
+        self.boxes = slabs(around.supports) or [Box(FLOOR_SIZE)]
+        objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (obj, *self.others)]
+        self.tracer = Tracer([*self.boxes, *objects, *hand_solids(hand)], frames, run.device)
+        planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [FLOOR]
+        bodies = [look_of(hand, body) for body in drawn_bodies(hand)]
+        self.looks = [*planes, OBJECT_LOOK, *(_BESIDE for _ in self.others), *bodies]
+
+    def shoot(
+        self, number: int, way: Sequence[Waypoint], size: tuple[int, int], sides: int, samples: int
+    ) -> NDArray[np.uint8]:
+        """(A, F, H, W, 3)"""
+        scene = self.around.scene(number)
+        rest = np.asarray(self.around.object_pose[scene], float)
+        roots = compose(rest, np.stack([point.hand_pose for point in way]))
+        bodies = body_poses(self.hand, roots, np.stack([point.joint_positions for point in way]))
+        things = np.stack([compose(rest, np.append(point.carried, IDENTITY_POSE[3:])) for point in way])
+        solid = np.stack([apply(pose, self.obj.hull_vertices) for pose in things])
+        points = np.concatenate([solid, hand_points(self.hand, bodies)], axis=1)
+        middles = 0.5 * (solid.min(axis=1) + solid.max(axis=1))
+        reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + _NEAR_M
+        near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
+        self._place(scene, things, bodies, float(points[..., 2].min()), middles[0])
+        above = middles[0] + np.array([0, 0, _HIGH_M])
+        covered = seen_share(self.around.supports, above, middles[:1]) < 1
+        self.lamp = _UNDER_A_BOARD if covered else TOWARD_LAMP
+        grasp = next((k for k, point in enumerate(way) if point.name == "grasp"), 0)
+        k = intrinsics(*size, FIELD_OF_VIEW)
+        pictures = []
+        for angle, height in self._best_sides(grasp, near, side_of(self.hand, bodies[grasp]), sides):
+            camera = fit_camera(near, angle, k, size, elevation=height)
+            shot = self._shot(np.arange(self.frames), np.stack([camera] * self.frames), k, size, angle, samples)
+            pictures.append(self.tracer.shoot(shot, self.run.quiet()).rgb)
+        return np.stack(pictures)
+
+    def _place(self, scene: int, things: Floats, bodies: Floats, lowest: float, middle: Floats) -> None:
+        if self.around.supports:
+            standing = slab_poses(self.around.supports, middle, 0.0)
+        else:
+            standing = IDENTITY_POSE[None] + np.array([0, 0, lowest - 0.01 - 0.5 * FLOOR_SIZE[2], 0, 0, 0, 0])
+        beside = self.around.neighbours.poses[scene] if self.around.neighbours else np.zeros((0, 7))
+        still = np.concatenate([standing, things[0][None], beside])
+        poses = np.tile(still, (self.frames, 1, 1))
+        poses[:, len(standing)] = things
+        self.tracer.place(
+            np.concatenate([poses, bodies[:, drawn_bodies(self.hand)]], axis=1), [self.looks] * self.frames
+        )
+
+    def _shot(
+        self, world: NDArray[np.intp], cameras: Floats, k: Floats, size: tuple[int, int], angle: float, samples: int
+    ) -> Shot:
+        return Shot(
+            world=world.astype(np.int32), extrinsics=cameras, intrinsics=k, width=size[0], height=size[1],
+            samples=samples, toward_lamp=self.lamp,
+            # The lamp goes round with the camera, so no side lies in the dark.
+            turn=np.full(self.frames, -angle), lamps=[STUDIO] * self.frames,
+        )  # fmt: skip
+
+    def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
+        """Azimuth and height [rad] of the sides that show most, apart from one another.
+
+        What counts is how much is seen of the object and of the hand, each as a share of the most that any side shows,
+        from labels alone; between equals the side that looks across the palm's way.
+        """
+        sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
+        centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
+        far = 1.15 * float(np.linalg.norm(near - centre, axis=1).max()) / np.sin(FIELD_OF_VIEW / 2)
+        eyes = [centre + far * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)]) for a, h in sides]
+        cameras = np.stack([look_at(eye, centre) for eye in eyes])
+        k = intrinsics(_GLANCE, _GLANCE, FIELD_OF_VIEW)
+        glance = self._shot(np.full(len(sides), world), cameras, k, (_GLANCE, _GLANCE), first, 1)
+        seen = self.tracer.shoot(replace(glance, shaded=False), self.run.quiet()).shape
+        thing = len(self.boxes)
+        shares = [(seen == thing).sum(axis=(1, 2)), (seen > thing + len(self.others)).sum(axis=(1, 2))]
+        score = sum(np.sqrt(share / max(1, share.max())) for share in shares)
+        across = np.array([abs(np.cos(a - first)) * np.cos(h) for a, h in sides])
+        order = np.argsort(-(score + 0.15 * across), kind="stable")
+        chosen: list[int] = []
+        for apart in (_APART, 0.0):
+            for one in order.tolist():
+                turns = [abs(np.angle(np.exp(1j * (sides[one][0] - sides[other][0])))) for other in chosen]
+                if len(chosen) < count and one not in chosen and min(turns, default=np.pi) >= apart:
+                    chosen.append(one)
+        return [sides[one] for one in chosen]
