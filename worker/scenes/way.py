@@ -16,24 +16,17 @@ from numpy.typing import NDArray
 
 from service.model.transforms import IDENTITY_POSE, quat_from_axis_angle, quat_rotate
 from worker.grasps import GraspSet, Posture
-from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.postures import wide_open
 from worker.quality.probe import Probe, probe_of
 from worker.scenes.clearance import MARGIN_M, approach
+from worker.scenes.coming import LOOKS, OBJECT_MARGIN_M, WAYPOINTS, come_open
 from worker.simulation.obstacles import obstacle_distances
 from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
 Floats = NDArray[np.float64]
 
-#: On its way the hand's points stay this far from the object [m].
-OBJECT_MARGIN_M: Final = 0.001
-#: Postures stored on the approach, the standoff first, the pregrasp last, and between them others that are looked at.
-WAYPOINTS: Final = 6
-_LOOKS: Final = 4
-#: Directions of retreat that are tried: the palm's own, mixed with these shares of the direction against gravity.
-SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
 _POINTS: Final = 600
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], each to so many sides.
 TILTS: Final = (0.4, 0.8, 1.2)
@@ -82,18 +75,18 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
     contact, closing, coming, lifting = (np.full(count, np.inf) for _ in range(4))
     touching = np.zeros(count, bool)
     raised = np.array(grasps.squeeze.hand_pose, float)
-    wide = Posture(grasps.pregrasp.hand_pose, wide_open(hand, obj, grasps.pregrasp, placed))
+    wide = wide_open(hand, obj, grasps.pregrasp, placed)
+    came = np.array(wide)
     for number, scene in enumerate(placed.scenes):
         rows = np.flatnonzero(placed.index == number)
         if not len(rows):
             continue
         mine = grasps.take(rows)
         between = obstacle_distances(hand, approach(mine.grasp, mine.pregrasp), scene).reshape(len(rows), -1)
-        before = obstacle_distances(hand, approach(mine.pregrasp, wide.take(rows)), scene).reshape(len(rows), -1)
+        path[rows], came[rows], coming[rows], touching[rows] = come_open(probe, mine.pregrasp, wide[rows], scene)
+        opened = Posture(mine.pregrasp.hand_pose, came[rows])
+        before = obstacle_distances(hand, approach(mine.pregrasp, opened), scene).reshape(len(rows), -1)
         contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
-        back = -quat_rotate(wide.hand_pose[rows, 3:], hand.palm.approach)
-        ways = [_unit((1 - share) * back + share * scene.up, scene.up) for share in SHARES_UP]
-        path[rows], coming[rows], touching[rows], _ = _coming(probe, wide.take(rows), scene, ways)
         rise = RISE_M * scene.up
         raised[rows, :3] += rise
         lifted = np.repeat(mine.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
@@ -103,7 +96,7 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
             obstacle_distances(hand, Posture(lifted.reshape(-1, 7), joints), scene).reshape(len(rows), -1).min(axis=1)
         )
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
-    return Way(path, wide.joint_positions, lift, contact, closing, coming, lifting, touching)
+    return Way(path, came, lift, contact, closing, coming, lifting, touching)
 
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
@@ -118,7 +111,7 @@ def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
     wide = _opened(probe, grasps.pregrasp, wide_open(hand, obj, grasps.pregrasp, nowhere))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
     ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
-    path, _, touching, chosen = _coming(probe, wide, nowhere.scenes[0], ways, both=True)
+    path, _, touching, chosen = _coming(probe, wide, nowhere.scenes[0], ways)
     raised = np.array(grasps.squeeze.hand_pose, float)
     raised[:, :3] += STANDOFF_M * chosen
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
@@ -129,10 +122,10 @@ def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Way:
 def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
     """Pregrasps with fingers opened to `joints` (n, J), but where that would bring them nearer to the object."""
     start = np.asarray(pregrasp.joint_positions, float)
-    room = np.minimum(OBJECT_MARGIN_M, _gaps(probe, pregrasp, True)) - 5e-4
+    room = np.minimum(OBJECT_MARGIN_M, _gaps(probe, pregrasp)) - 5e-4
     nearer = np.zeros(len(start), bool)
     for share in (1 / 3, 2 / 3, 1.0):
-        nearer |= _gaps(probe, Posture(pregrasp.hand_pose, start + share * (joints - start)), True) < room
+        nearer |= _gaps(probe, Posture(pregrasp.hand_pose, start + share * (joints - start))) < room
     return Posture(np.array(pregrasp.hand_pose, float), np.where(nearer[:, None], start, joints))
 
 
@@ -151,14 +144,12 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
 
 
 def _coming(
-    probe: Probe, pregrasp: Posture, scene: Surroundings, ways: Sequence[Floats], *, both: bool = False
+    probe: Probe, pregrasp: Posture, scene: Surroundings, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
     """Waypoints (n, W, 7), least distance from obstacles (n,), whether the object is touched (n,), and the direction of
     retreat (n, 3): the first of `ways`, (n, 3) each, that is free, or else the freest.
-
-    With `both`, points of the object are looked at from the hand's pieces as well.
     """
-    count, looks = len(pregrasp), (WAYPOINTS - 1) * _LOOKS + 1
+    count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     best = np.full(count, -np.inf)
     least = np.zeros(count)
     touching = np.ones(count, bool)
@@ -171,7 +162,7 @@ def _coming(
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_distances(probe.hand, postures, scene).reshape(len(open_), looks).min(axis=1)
-        gap = _gaps(probe, postures, both).reshape(len(open_), looks)
+        gap = _gaps(probe, postures).reshape(len(open_), looks)
         # The pregrasp itself may stand nearer than the margin: coming must not be nearer than it is.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
         score = np.minimum(room, MARGIN_M) - hits
@@ -186,10 +177,7 @@ def _coming(
     return poses, least, touching, chosen
 
 
-def _gaps(probe: Probe, postures: Posture, both: bool) -> Floats:
-    """(P,) least distance of the hand's points from the object, and with `both` of the object's from the hand [m]."""
-    if both:
-        found = probe.measure(postures)
-        return np.minimum(found.distance.min(axis=1), found.piece_distance.min(axis=1))
-    points = probe.posed_points(body_poses(probe.hand, postures.hand_pose, postures.joint_positions))
-    return np.asarray(probe.signed_distance(points.reshape(-1, 3))[0].reshape(len(postures), -1).min(axis=1))
+def _gaps(probe: Probe, postures: Posture) -> Floats:
+    """(P,) least distance of the hand's points from the object, and of the object's from the hand [m]."""
+    found = probe.measure(postures)
+    return np.minimum(found.distance.min(axis=1), found.piece_distance.min(axis=1))

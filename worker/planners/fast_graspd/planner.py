@@ -19,6 +19,7 @@ from worker.planners.fast_graspd.scene_starts import sample_scene_starts
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
 from worker.planners.fast_graspd.selection import best_of_each, merits, posture_of
 from worker.planners.fast_graspd.starts import Probe, sample_starts
+from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.planners.port import Wanted
 from worker.planners.threads import Steps, cut, run_parts
 from worker.quality.postures import pregrasp, squeeze
@@ -105,7 +106,10 @@ def _work(pair: Pair, part: Part, wanted: Wanted, steps: Steps) -> None:
     state = _descend(launches, data, n * fidelity.starts, fidelity.coarse_iterations, steps, "coarse", part.curve)
     losses = _losses(data, state)
     if finalists < fidelity.starts:
-        chosen = best_of_each(merits(hand, obj, state, losses), n, finalists)
+        merit = merits(hand, obj, state, losses)
+        if placed is not None:
+            merit += hindrance(coarse, state, np.repeat(placed.index, fidelity.starts))
+        chosen = best_of_each(merit, n, finalists)
         state, losses = state[chosen], losses[chosen]
     data = _in_scenes(Data(fine, n * finalists), placed, finalists)
     data.set_schedule(fine_schedule(fidelity))

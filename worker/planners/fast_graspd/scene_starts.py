@@ -1,4 +1,5 @@
-"""Approach sampling in scenes: as `starts`, from the directions that a scene leaves free, all hands drawn at once.
+"""Approach sampling in scenes, from the directions that a scene leaves free, all hands drawn at once: most reach across
+the object with opposed fingers, the others look at a random point of it as `starts` do.
 
 A start keeps `ROOM` from obstacles besides the margin it has later, so that the descent can turn the hand.
 """
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 from service.model.errors import InputError
 from service.model.transforms import quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
+from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.across import Openings, across
 from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe, start_generator
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
@@ -32,6 +35,10 @@ DRAWS: Final = 96
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
+#: Of `EVERY` starts of a grasp so many reach across the object; each as often as so many draws.
+EVERY: Final = 8
+REACHING: Final = 7
+REACHES: Final = 16
 #: Uniform numbers of one draw: face, two for the point, roll, gap, share and goal of a turn.
 _UNIFORM: Final = 7
 
@@ -83,8 +90,11 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(indices) * each * len(RETREATS), room=ROOM)
     ways = [free_ways(scene, obj) for scene in placed.scenes]
+    openings = [Openings.of(oppositions_of(hand), obj, scene) for scene in placed.scenes]
     scene = np.repeat(placed.index, each)
-    count, surface = len(scene), _Surface.of(obj)
+    reaching = np.arange(len(scene)) % each % EVERY < REACHING
+    reaching &= np.array([len(openings[s].sums) > 0 for s in scene], bool)
+    count, around = len(scene), _Around(hand, obj, _Surface.of(obj), ways, openings)
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.array([g.standard_normal((DRAWS, 2 + hand.dofs)) for g in generators])
@@ -94,7 +104,8 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
         rows = np.flatnonzero(depth > CLEAR)
         if not len(rows):
             break
-        states = _draws(hand, obj, surface, uniform[rows, number], normal[rows, number], [ways[s] for s in scene[rows]])
+        reach = reaching[rows] & (number < REACHES)
+        states = around.draws(uniform[rows, number], normal[rows, number], scene[rows], reach)
         probe.data.set_scenes(np.repeat(scene[rows], len(RETREATS)))
         found = probe.depths(states).reshape(len(rows), len(RETREATS))
         # The nearest clear distance, or else the least deep.
@@ -118,26 +129,54 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
     return best
 
 
-def _draws(
-    hand: HandModel, obj: ObjectModel, surface: _Surface, uniform: Floats, normal: Floats, ways: list[Floats]
-) -> HandState:
-    """Candidates (n * len(RETREATS) hands), each at each distance, from random numbers (n, 7) and (n, 2 + D)."""
-    face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
-    u, v = uniform[:, 1:2], uniform[:, 2:3]
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    corner = surface.corners[face]
-    point = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
-    away = _tilted(surface.normals[face], TILT * normal[:, :2])
-    away = np.array([_turned(a, w, t) for a, w, t in zip(away, ways, uniform[:, 5:7], strict=True)])
-    align = _frames(-away) @ _frames(hand.palm.approach[None])[0].T
-    roll = quat_from_axis_angle(-away, 2 * np.pi * uniform[:, 3])
-    rotation = quat_multiply(roll, quat_from_matrix(align))
-    span = hand.upper - hand.lower
-    q = np.clip(hand.preshape + POSTURE_NOISE * span * normal[:, 2:], hand.lower, hand.upper)
-    gap = GAP[0] + (GAP[1] - GAP[0]) * uniform[:, 4:5] + np.array(RETREATS)[None]
-    pivot = (point - obj.centre_of_mass)[:, None] + gap[..., None] * away[:, None]
-    repeat = len(RETREATS)
-    return HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
+@dataclass(frozen=True)
+class _Around:
+    """What draws of one hand around one object share."""
+
+    hand: HandModel
+    obj: ObjectModel
+    surface: _Surface
+    ways: list[Floats]
+    """Free directions of each scene."""
+    openings: list[Openings]
+
+    def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> HandState:
+        """Candidates (n * len(RETREATS) hands), each at each distance, from random numbers (n, 7) and (n, 2 + D), in
+        scenes (n,); `reach` (n,): across the object."""
+        n, dofs = len(uniform), self.hand.dofs
+        found = [np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))]
+        for s in np.unique(scene):
+            for rows in (np.flatnonzero((scene == s) & reach), np.flatnonzero((scene == s) & ~reach)):
+                if not len(rows):
+                    continue
+                if reach[rows[0]]:
+                    given = uniform[rows, :6], normal[rows, 2:], self.ways[s]
+                    parts = across(self.hand, self.obj, self.openings[s], *given)
+                else:
+                    parts = self._towards(uniform[rows], normal[rows], self.ways[s])
+                for whole, part in zip(found, parts, strict=True):
+                    whole[rows] = part
+        pivot, rotation, q, away = found
+        pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
+        repeat = len(RETREATS)
+        return HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
+
+    def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Hands that look at random points of the surface, as `across` gives them."""
+        hand, obj, surface = self.hand, self.obj, self.surface
+        face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
+        u, v = uniform[:, 1:2], uniform[:, 2:3]
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        corner = surface.corners[face]
+        point = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
+        away = _tilted(surface.normals[face], TILT * normal[:, :2])
+        away = np.array([_turned(a, ways, t) for a, t in zip(away, uniform[:, 5:7], strict=True)])
+        align = _frames(-away) @ _frames(hand.palm.approach[None])[0].T
+        roll = quat_from_axis_angle(-away, 2 * np.pi * uniform[:, 3])
+        rotation = quat_multiply(roll, quat_from_matrix(align))
+        q = np.clip(hand.preshape + POSTURE_NOISE * hand.span * normal[:, 2:], hand.lower, hand.upper)
+        gap = GAP[0] + (GAP[1] - GAP[0]) * uniform[:, 4:5]
+        return point - obj.centre_of_mass + gap * away, rotation, q, away
 
 
 def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:

@@ -1,0 +1,209 @@
+"""Postures in which a hand's fingers oppose one another: between how wide a thing they can take hold of.
+
+A hand holds between one finger, as a rule the thumb, and others whose pads look at it. Such postures are found by
+sampling and random steps, for as many widths as there are.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.transforms import quat_conjugate, quat_rotate
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel
+from worker.hands.surface import sample_surface
+
+#: Postures that are wanted, from so many times as many, and random steps that make them better.
+POSTURES: Final = 160
+CROWD: Final = 25
+CLIMBS: Final = 100
+#: How well pads face along the line between them (cosine), how little the palm looks along it (cosine), and how far
+#: before the palm it lies [m].
+FACING: Final = 0.75
+SQUARE: Final = 0.7
+AHEAD_M: Final = 0.02
+#: Least distance of opposed pads [m].
+THINNEST_M: Final = 0.002
+#: Differences of width that weigh like a radian of facing [m].
+WIDTH_M: Final = 0.02
+#: Spread of dofs that do not close the hand about the pre-shape, and of fingers that close together: shares of a range.
+SIDEWAYS: Final = 0.15
+UNEVEN: Final = 0.06
+#: Share of a fingertip's speed, and so of its length, within which its points are its pad.
+PAD: Final = 0.5
+#: Points of the hand's surface that pads are made of.
+_POINTS: Final = 1000
+_STILL: Final = (0.0, 0, 0, 1, 0, 0, 0)
+
+Pad = tuple[Floats, Floats]
+
+
+@dataclass(frozen=True)
+class Oppositions:
+    """K postures of a hand whose pads face one another, in the order of their widths; root frame."""
+
+    q: Floats
+    """(K, D)"""
+    axis: Floats
+    """(K, 3) unit, from the one finger's pad to the others'."""
+    middle: Floats
+    """(K, 3) between them [m]."""
+    width: Floats
+    """(K,) between them, ascending [m]."""
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def widest(self) -> float:
+        """The greatest width [m]; 0 for a hand that cannot oppose its fingers."""
+        return float(self.width[-1]) if len(self) else 0.0
+
+
+_known: LRUCache[str, Oppositions] = LRUCache(16)
+_lock = threading.Lock()
+
+
+def oppositions_of(hand: HandModel) -> Oppositions:
+    """The opposed postures of a hand, from memory where they are known; none of a hand with one finger."""
+    with _lock:
+        if hand.content not in _known:
+            _known[hand.content] = _oppositions(hand)
+        return _known[hand.content]
+
+
+def _oppositions(hand: HandModel) -> Oppositions:
+    if len(hand.fingertips) < 2:
+        return Oppositions(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    pads = [_pad(hand, body) for body in hand.fingertips]
+    tried = []
+    for one in range(len(pads)):
+        seen = _Seen.of(hand, pads, one, _postures(hand, one, POSTURES))
+        tried.append((float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()), one))
+    one = min(tried)[1]
+    q = _postures(hand, one, CROWD * POSTURES)
+    seen = _Seen.of(hand, pads, one, q)
+    # Of postures about as wide the best, which then climbs.
+    order = np.argsort(seen.width, kind="stable").reshape(POSTURES, CROWD)
+    q = q[order[np.arange(POSTURES), seen.cost(seen.width)[order].argmin(axis=1)]]
+    q, seen = _climbed(hand, pads, one, q, np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES))
+    good = np.flatnonzero(
+        (seen.facing > FACING) & (seen.square < SQUARE) & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)
+    )
+    good = good[np.argsort(seen.width[good], kind="stable")]
+    return Oppositions(q[good], seen.axis[good], seen.middle[good], seen.width[good])
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Where the pads of N postures are."""
+
+    axis: Floats
+    middle: Floats
+    width: Floats
+    facing: Floats
+    """(N,) cosine of the pads against the line between them, the worse side's."""
+    square: Floats
+    """(N,) how much the palm looks along that line: 0 not at all."""
+    ahead: Floats
+    """(N,) how far the middle lies before the palm [m]."""
+
+    @classmethod
+    def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _Seen:
+        tips = body_poses(hand, np.tile(_STILL, (len(q), 1)), hand.expand(q))[:, list(hand.fingertips)]
+        place = quat_rotate(tips[..., 3:], np.array([p[0] for p in pads])) + tips[..., :3]
+        looks = quat_rotate(tips[..., 3:], np.array([p[1] for p in pads]))
+        others = [f for f in range(len(pads)) if f != one]
+        a, b = place[:, one], place[:, others].mean(axis=1)
+        width = np.linalg.norm(b - a, axis=1)
+        axis = (b - a) / np.maximum(width, 1e-9)[:, None]
+        towards = -np.einsum("nfi,ni->nf", looks[:, others], axis).mean(axis=1)
+        middle, ahead = 0.5 * (a + b), hand.palm.approach
+        return cls(
+            axis=axis, middle=middle, width=width,
+            facing=np.minimum(np.einsum("ni,ni->n", looks[:, one], axis), towards),
+            square=np.abs(axis @ ahead), ahead=(middle - hand.palm.centre) @ ahead,
+        )  # fmt: skip
+
+    def cost(self, wanted: Floats) -> Floats:
+        """(N,) how far from an opposition of the widths `wanted` (N,)."""
+        near = np.maximum(0.0, AHEAD_M + 0.01 - self.ahead) / WIDTH_M
+        aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
+        return np.asarray(-3 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + near + aside)
+
+
+def _climbed(hand: HandModel, pads: list[Pad], one: int, q: Floats, wanted: Floats) -> tuple[Floats, _Seen]:
+    """Postures that random steps, ever smaller, made better, each for its width."""
+    rng = np.random.default_rng(one)
+    finger, rank = _ranks(hand)
+    best = _Seen.of(hand, pads, one, q).cost(wanted)
+    for step in np.geomspace(0.3, 0.03, CLIMBS):
+        together = np.where(hand.closing != 0, rng.standard_normal((len(q), rank.max() + 1))[:, rank], 0.0)
+        noise = np.where(finger == one, rng.standard_normal((len(q), hand.dofs)), together)
+        noise = noise * (rng.random(noise.shape) < 0.6)
+        tried = np.clip(q + step * hand.span * noise, hand.lower, hand.upper)
+        cost = _Seen.of(hand, pads, one, tried).cost(wanted)
+        better = cost < best
+        q[better], best[better] = tried[better], cost[better]
+    return q, _Seen.of(hand, pads, one, q)
+
+
+def _postures(hand: HandModel, one: int, count: int) -> Floats:
+    """(count, D): all dofs of one finger by themselves; the joints of the others close alike, rank by rank."""
+    rng = np.random.default_rng(one)
+    finger, rank = _ranks(hand)
+    opened = np.where(hand.closing >= 0, hand.lower, hand.upper)
+    closed = np.where(hand.closing >= 0, hand.upper, hand.lower)
+    by_rank = rng.random((count, rank.max() + 1))[:, rank] + UNEVEN * rng.standard_normal((count, hand.dofs))
+    alone = rng.random((count, hand.dofs))
+    q = opened + np.clip(np.where(finger == one, alone, by_rank), 0, 1) * (closed - opened)
+    aside = hand.preshape + SIDEWAYS * hand.span * rng.standard_normal((count, hand.dofs))
+    still = (hand.closing == 0) & (finger != one)
+    return np.asarray(np.where(still, np.clip(aside, hand.lower, hand.upper), q), float)
+
+
+def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(D,) the finger of each dof, -1 where several share it, -2 where it drives none; and how many joints of that
+    finger lie between the dof and the tip."""
+    finger, rank = np.full(hand.dofs, -2, np.intp), np.zeros(hand.dofs, np.intp)
+    for number, tip in enumerate(hand.fingertips):
+        seen, body = 0, tip
+        while body > 0:
+            dof = int(hand.dof[body])
+            finger[dof] = number if finger[dof] in (-2, number) else -1
+            rank[dof] = seen
+            seen, body = seen + 1, int(hand.parent[body])
+    return finger, rank
+
+
+def _pad(hand: HandModel, tip: int) -> Pad:
+    """Where and whereto a fingertip presses, body frame: the end of the side that its last joint moves ahead."""
+    points = sample_surface(hand, _POINTS)
+    mine = points.body == tip
+    place, normal = points.position[mine], points.normal[mine]
+    chain, body = [], tip
+    while body > 0:
+        chain.append(body)
+        body = int(hand.parent[body])
+    driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
+    if not len(place) or not driven:
+        return np.zeros(3), np.array([0.0, 0, 1])
+    dof = int(hand.dof[driven[0]])
+    step = np.zeros(hand.dofs)
+    step[dof] = 1e-4 * (hand.closing[dof] or 1.0)
+    q = np.stack([hand.preshape, hand.preshape + step])
+    pose = body_poses(hand, np.tile(_STILL, (2, 1)), hand.expand(q))[:, tip]
+    moved = quat_rotate(pose[:, None, 3:], place[None]) + pose[:, None, :3]
+    move = quat_rotate(quat_conjugate(pose[0, 3:]), moved[1] - moved[0])
+    speed = np.linalg.norm(move, axis=1)
+    ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > 0.7
+    far = speed >= speed.max() - PAD * np.ptp(speed)
+    chosen = next((part for part in (ahead & far, ahead) if part.any()), far)
+    look = normal[chosen].mean(axis=0)
+    return place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9)

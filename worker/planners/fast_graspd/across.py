@@ -1,0 +1,178 @@
+"""Starts across an object: a hand whose fingers oppose one another, opened a little wider than the object is there.
+
+An object is held where two patches of its surface look away from each other (antipodal points: Nguyen, "Constructing
+force-closure grasps", 1988). They are found by comparing samples of the surface with one another.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.transforms import quat_from_matrix
+from worker.hands.model import HandModel
+from worker.hands.oppositions import Oppositions, oppositions_of
+from worker.objects.model import ObjectModel
+from worker.simulation.obstacles import MARGIN_M
+from worker.simulation.surroundings import Surroundings
+
+Floats = NDArray[np.float64]
+
+#: Points of the surface that pairs are made of, and how far their line may turn from their normals (cosine).
+SAMPLES: Final = 500
+ACROSS: Final = 0.9
+#: Least distance of the two points [m].
+THINNEST_M: Final = 0.002
+#: Room between pad and object, each side [m].
+ROOM_M: Final = (0.003, 0.015)
+#: Pairs this far beside the centre of mass, as gravity sees it, are drawn e times less often [m]; any pair is drawn at
+#: `FAR` of the best one's chance, and what is steep or hard to get at still less.
+BESIDE_M: Final = 0.03
+FAR: Final = 0.02
+STEEP: Final = 0.5
+SELDOM: Final = 0.1
+#: Noise of the posture as a share of each joint's range, ways that are compared, and differences of width that postures
+#: are taken from [m].
+NOISE: Final = 0.03
+WAYS: Final = 4
+ALIKE_M: Final = (0.002, 0.006)
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """P pairs of surface points of an object that look away from each other, object frame."""
+
+    middle: Floats
+    """(P, 3) [m]"""
+    axis: Floats
+    """(P, 3) unit."""
+    width: Floats
+    """(P,) [m]"""
+
+    def __len__(self) -> int:
+        return len(self.width)
+
+    def ends(self) -> tuple[Floats, Floats]:
+        """The two points (P, 3) of each pair."""
+        half = 0.5 * self.width[:, None] * self.axis
+        return self.middle - half, self.middle + half
+
+
+_known: LRUCache[str, Crossings] = LRUCache(16)
+_lock = threading.Lock()
+
+
+def crossings_of(obj: ObjectModel) -> Crossings:
+    """The pairs of an object, from memory where they are known."""
+    with _lock:
+        if obj.content not in _known:
+            _known[obj.content] = _crossings(obj)
+        return _known[obj.content]
+
+
+def _crossings(obj: ObjectModel) -> Crossings:
+    place, normal = _surface(obj)
+    line = place[None] - place[:, None]
+    width = np.linalg.norm(line, axis=-1)
+    unit = line / np.maximum(width, 1e-9)[..., None]
+    leaves = -np.einsum("ijk,ik->ij", unit, normal)
+    enters = np.einsum("ijk,jk->ij", unit, normal)
+    i, j = np.nonzero(np.triu((np.minimum(leaves, enters) > ACROSS) & (width > THINNEST_M), 1))
+    return Crossings(0.5 * (place[i] + place[j]), unit[i, j], width[i, j])
+
+
+def _surface(obj: ObjectModel) -> tuple[Floats, Floats]:
+    """(SAMPLES, 3) area-uniform points and the normals of their faces."""
+    rng = np.random.default_rng(0)
+    corners = obj.vertices[obj.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    share = (np.arange(SAMPLES) + rng.random(SAMPLES)) / SAMPLES
+    face = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), share), len(area) - 1)
+    u, v = rng.random((2, SAMPLES, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    c = corners[face]
+    return c[:, 0] + u * (c[:, 1] - c[:, 0]) + v * (c[:, 2] - c[:, 0]), cross[face] / area[face, None].clip(1e-18)
+
+
+@dataclass(frozen=True)
+class Openings:
+    """What a hand may take hold of in one scene."""
+
+    pairs: Crossings
+    sums: Floats
+    """(P,) cumulative chance; empty: there is nothing."""
+    within_reach: bool
+    """Whether a pair lies clear of the obstacles and is no wider than the hand opens: the geometric condition for any
+    grasp between opposed fingers."""
+
+    @classmethod
+    def of(cls, known: Oppositions, obj: ObjectModel, scene: Surroundings) -> Openings:
+        pairs = crossings_of(obj)
+        fits = pairs.width + 2 * ROOM_M[0] <= known.widest
+        if not fits.any():
+            return cls(pairs, np.zeros(0), False)
+        aside = pairs.middle - obj.centre_of_mass
+        aside = aside - (aside @ scene.up)[:, None] * scene.up
+        chance = np.exp(-((np.linalg.norm(aside, axis=1) / BESIDE_M) ** 2)) + FAR
+        room = np.full(len(pairs), np.inf)
+        for obstacle in scene.obstacles:
+            for end in pairs.ends():
+                room = np.minimum(room, obstacle.distance(end))
+        easy = room >= MARGIN_M
+        chance *= np.where(np.abs(pairs.axis @ scene.up) < STEEP, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM)
+        chance *= fits
+        return cls(pairs, np.cumsum(chance) / chance.sum(), bool((fits & easy).any()))
+
+
+def across(
+    hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, normal: Floats, ways: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Hands that reach across the object.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        opening: pairs to take hold of, at least one.
+        uniform: (n, 6) random numbers.
+        normal: (n, D) normally distributed ones.
+        ways: (K, 3) free directions away from the object.
+
+    Returns:
+        Palm centres (n, 3) from the centre of mass [m], rotations (n, 4), dofs (n, D), directions of retreat (n, 3).
+    """
+    known = oppositions_of(hand)
+    pair = np.minimum(np.searchsorted(opening.sums, uniform[:, 0]), len(opening.sums) - 1)
+    axis = opening.pairs.axis[pair] * np.where(uniform[:, 1] < 0.5, 1.0, -1.0)[:, None]
+    width = opening.pairs.width[pair] + 2 * (ROOM_M[0] + (ROOM_M[1] - ROOM_M[0]) * uniform[:, 2])
+    low = np.searchsorted(known.width, width - ALIKE_M[0])
+    high = np.maximum(np.searchsorted(known.width, width + ALIKE_M[1]), low + 1)
+    posture = np.minimum(low + (uniform[:, 3] * (high - low)).astype(int), len(known) - 1)
+    q = np.clip(known.q[posture] + NOISE * hand.span * normal, hand.lower, hand.upper)
+    # Of a few free ways the one that lies most across the line.
+    share = (uniform[:, 4:5] + np.arange(WAYS) * 0.6180339887) % 1.0
+    tried = ways[(share * len(ways)).astype(int)]
+    best = np.abs(np.einsum("nki,ni->nk", tried, axis)).argmin(axis=1)
+    palm = np.tile(hand.palm.approach, (len(pair), 1))
+    turn = _frames(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(_frames(known.axis[posture], palm), -1, -2)
+    away = -np.einsum("nij,nj->ni", turn, palm)
+    reach = known.middle[posture] - hand.palm.centre
+    # Between holding with the fingertips and with the palm against the object.
+    deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
+    pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
+    return pivot - obj.centre_of_mass, quat_from_matrix(turn), q, away
+
+
+def _frames(first: Floats, second: Floats) -> Floats:
+    """(n, 3, 3) rotations whose first column is `first` (n, 3) and whose second lies as near `second` as it can."""
+    y = second - np.einsum("ni,ni->n", first, second)[:, None] * first
+    helper = np.eye(3)[np.argmin(np.abs(first), axis=1)]
+    other = helper - np.einsum("ni,ni->n", first, helper)[:, None] * first
+    y = np.where(np.linalg.norm(y, axis=1, keepdims=True) > 1e-3, y, other)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([first, y, np.cross(first, y)], axis=-1)
