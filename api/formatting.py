@@ -69,10 +69,19 @@ def stamp(value: str) -> str:
 
 
 #: The names that templates call them by.
+_PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
+
+
+def place(kind: str) -> str:
+    """Where grasps of a kind of scene are used; empty: a free object."""
+    return _PLACES.get(kind, "")
+
+
 FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "metric": metric,
     "count": count,
     "percent": percent,
+    "place": place,
     "duration": duration,
     "bytes": size,
     "stamp": stamp,

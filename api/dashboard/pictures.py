@@ -15,7 +15,7 @@ from service.store.integrity import read_checked
 from service.store.shards import open_shard
 from service.store.store import Store
 
-Channel = Literal["rgb", "depth", "segmentation"]
+Channel = Literal["rgb", "depth", "segmentation", "rgb_hand"]
 
 #: A views shard of 48 pictures is a few megabytes; a page asks for several pictures of the same one.
 _KEPT_SHARDS: Final = 2
@@ -81,4 +81,7 @@ def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
     return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
 
 
-_PAINTERS: Final = {"rgb": lambda pixels: pixels, "depth": paint_depth, "segmentation": paint_segmentation}
+_PAINTERS: Final = {
+    "rgb": lambda pixels: pixels, "rgb_hand": lambda pixels: pixels, "depth": paint_depth,
+    "segmentation": paint_segmentation,
+}  # fmt: skip

@@ -32,6 +32,8 @@ class Tile:
     jobs: int = 0
     progress: float | None = None
     note: str = ""
+    scene: str = "free"
+    """Kind of the scene in which its grasps are valid."""
 
     @property
     def share(self) -> float | None:
@@ -66,6 +68,7 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             standing=dataset.options.standing,
             progress=cell.progress if cell.state is State.RUNNING else None,
             note=cell.reason or "",
+            scene=dataset.options.place.kind,
         )
         for cell in cells
     }

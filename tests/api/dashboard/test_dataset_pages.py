@@ -129,3 +129,18 @@ def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
     assert f"<dt>{word.capitalize()}</dt><dd>32" in http.get("/datasets").text
     home = http.get("/").text
     assert f"32 of 32 {word}" in home and f'32<span class="sub">{word}' in home
+
+
+@pytest.mark.parametrize(("scene", "place"), [("free", ""), ("bin", " in a bin")])
+def test_the_share_of_a_cell_says_in_which_scene_its_grasps_are_valid(
+    http: TestClient, parts: Parts, scene: str, place: str
+) -> None:
+    given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "scene": scene}
+    actions.create(parts, DatasetRequest.model_validate(given))
+    DatasetRounds(parts).advance()
+    finish_all(parts, add_job(parts, scene=scene))
+    valid = parts.index.datasets.get("k").valid
+    page = " ".join(http.get("/datasets/k").text.split())
+    assert f"32 grasps each{place} ·" in page
+    assert f">{valid} valid{place}<" in page
+    assert ("Valid grasps in scenes" in page) == bool(place)

@@ -89,3 +89,15 @@ def test_metrics_are_bounded_from_both_sides(
     items = http.get("/v1/grasps", params={**bounds, "limit": 200}).json()["items"]
     assert bool(items) == kept
     assert all(item["epsilon"] <= bounds.get("max_epsilon", 99) for item in items)
+
+
+def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, parts: Parts) -> None:
+    free, table = add_job(parts), add_job(parts, scene="table", scenes=1)
+    for record in (free, table):
+        finish_all(parts, record)
+    page = http.get("/grasps", params={"scene": "any", "valid": "true"}).text
+    assert '<span class="note">table</span>' in page and 'aria-current="true">valid in a scene' in page
+    assert '<span class="note">table</span>' not in http.get("/grasps", params={"scene": "free"}).text
+    assert "valid grasps on a table" in " ".join(http.get(f"/jobs/{table.id}").text.split())
+    assert "Valid in their scenes" in http.get(f"/jobs/{table.id}").text
+    assert "Valid in their scenes" not in http.get(f"/jobs/{free.id}").text
