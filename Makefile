@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: help install demo test test-slow check format browser screenshots docs pins audit clean
+.PHONY: gpu-check help install demo test test-slow check format browser screenshots docs pins audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
@@ -45,6 +45,10 @@ screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/dashb
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
+
+gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills (no GPU needed)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,gpu-check]'
+	$(BIN)/python -m benchmarks.gpu_check
 
 pins: $(STAMP) ## versions that the images install: those of .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel]'
