@@ -18,6 +18,7 @@ from service.model.errors import InputError
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
+_FILES: Final = (".json", ".yaml", ".yml")
 #: A scene is no larger than this [m].
 FARTHEST_M: Final = 10.0
 #: Largest scene file [bytes].
@@ -148,8 +149,9 @@ def scene_option(text: str, *, beside: Path | None = None) -> str | dict[str, An
     """
     if text in KINDS:
         return text
-    path = Path(text) if beside is None else beside / text
-    return parse_scene(str(path)).model_dump(mode="json", include={"supports", "target"}, exclude_none=True)
+    is_file = Path(text).suffix.lower() in _FILES
+    found = read_scene(Path(text) if beside is None else beside / text) if is_file else parse_scene(text)
+    return found.model_dump(mode="json", include={"supports", "target"}, exclude_none=True)
 
 
 def parse_scene(text: str, *, faces: str = "drawn") -> SceneSpec:
@@ -161,7 +163,7 @@ def parse_scene(text: str, *, faces: str = "drawn") -> SceneSpec:
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
-    if text not in KINDS and path.suffix.lower() not in (".json", ".yaml", ".yml"):
+    if text not in KINDS and path.suffix.lower() not in _FILES:
         raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file")
     found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
     if faces == found.faces:

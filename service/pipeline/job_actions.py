@@ -17,6 +17,7 @@ from service.model.planning import lane_of, message_of
 from service.model.records import JobRecord
 from service.pipeline import fidelity_choice
 from service.pipeline.backends import Parts
+from service.pipeline.scene_check import check_scene
 from service.queue.port import Event, EventKind
 from service.store.deletions import refuse_pending
 from service.store.records import add_job_event, job_events, put_record, read_record
@@ -47,12 +48,14 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owne
 
     Raises:
         NotFoundError: unknown hand or object.
-        InputError: the hand or object was refused when it was checked; no chart tells which fidelity meets the target.
+        InputError: the hand or object was refused when it was checked; no chart tells which fidelity meets the target;
+            the object stands in a support of its scene (SceneError).
         ConflictError: the check of the hand or object is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
     hand = usable(parts, AssetKind.HAND, request.hand)
     obj = usable(parts, AssetKind.OBJECT, request.object)
+    check_scene(request, obj)
     parts.queue.ping()
     request = fidelity_choice.explicit(parts.store, request.model_copy(update={"hand": hand.name, "object": obj.name}))
     return JobRecord(

@@ -57,7 +57,8 @@ def finish(parts: Parts, record: JobRecord, task: PlannedTask) -> ShardManifest:
     attributes: dict[str, Attribute] = {"hand": record.request.hand, "object": record.request.object}
     attributes |= {"shard_id": task.output, "batch": task.batch}
     if task.inputs:
-        attributes["base_shard" if task.stage is Stage.SCENE else "scene_shard"] = task.inputs[0]
+        reads_base = task.stage is (Stage.RENDER if record.request.in_scene else Stage.SCENE)
+        attributes["base_shard" if reads_base else "scene_shard"] = task.inputs[0]
     if task.stage is Stage.SYNTHESIZE:
         attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
     return publish(parts, record, task, arrays, attributes)
@@ -144,7 +145,7 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
 
 
 def _scene(random: np.random.Generator, count: int, request: JobRequest) -> Arrays:
-    return scene_columns(random, count, request.scenes)
+    return scene_columns(random, 0 if request.in_scene else count, request.scenes)
 
 
 def scene_columns(random: np.random.Generator, count: int, scenes: int, clear: float = 0.5) -> Arrays:

@@ -8,27 +8,33 @@ import numpy as np
 import pytest
 
 from service.index.rebuild import differences
-from service.model.domain import AssetKind, JobRequest, State
+from service.model.domain import AssetKind, JobRequest, Stage, State
 from service.store.shards import read_shard
 from tests.system.conftest import System
 from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.simulation.surroundings import Scenes
 
 pytestmark = pytest.mark.chaos
 
 
-def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable[..., System]) -> None:
+@pytest.mark.parametrize("scene", ["free", "table"])
+def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable[..., System], scene: str) -> None:
     system = start(fakes=False, lease_s=2.0, retry_backoff_s=0.1)
     index = system.parts.index
-    request = JobRequest(hand="barrett", object="block", grasps=24, fidelity="draft", seed=7)
+    request = JobRequest(hand="barrett", object="block", grasps=24, fidelity="draft", seed=7, scene=scene)
     system.until(
         lambda: {a.name for kind in AssetKind for a in index.assets.page(kind=kind).items} >= {"barrett", "block"},
         20, "the built-in assets are published",
     )  # fmt: skip
     job = system.submit(request)
     system.until(
-        lambda: any(0 < task.done < 0.9 * task.total for task in index.jobs.tasks(job=job, state=State.RUNNING).items),
+        lambda: any(
+            task.stage is Stage.SYNTHESIZE and 0 < task.done < 0.9 * task.total
+            for task in index.jobs.tasks(job=job, state=State.RUNNING).items
+        ),
         60, "the synthesis is under way",
     )  # fmt: skip
     system.kill("worker-0")
@@ -37,9 +43,13 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     assert [attempt.kind for attempt in index.jobs.attempts(job=job)] == ["WorkerLost"]
     (shard,) = index.shards.page(job=job, kind="base").items
     kept = read_shard(system.parts.store.get(shard.key))
-    undisturbed = certified_grasps(
-        hand_from_path("barrett"), object_from_path("block", face_error_m=request.knobs.face_error_m), request, count=24
-    ).grasps
+    block = object_from_path("block", face_error_m=request.knobs.face_error_m)
+    scenes = None
+    if request.in_scene:
+        poses = rest_poses(request.place, block, count=request.scenes, seed=request.seed)["scene/object_pose"]
+        scenes = Scenes(supports_of(request.place), poses)
+        np.testing.assert_array_equal(kept["scene/object_pose"], poses)
+    undisturbed = certified_grasps(hand_from_path("barrett"), block, request, count=24, scenes=scenes).grasps
     np.testing.assert_array_equal(kept["grasp/hand_pose"], undisturbed.grasp.hand_pose)
     np.testing.assert_array_equal(kept["grasp/joint_positions"], undisturbed.grasp.joint_positions)
     assert differences(index, system.parts.store) == []

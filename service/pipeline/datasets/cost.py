@@ -128,7 +128,7 @@ def _estimate(
     if Stage.SCENE in stages:
         seconds[Stage.SCENE] = batches * options.scenes * scene.seconds
         ends[Stage.SCENE] = _ends(seconds[Stage.SCENE], scene)
-        storage["scene"] = sums.kept * options.scenes * scene.size_bytes
+        storage["scene"] = (batches if options.in_scene else sums.kept) * options.scenes * scene.size_bytes
     if Stage.RENDER in stages:
         seconds[Stage.RENDER] = pixels * picture.seconds
         ends[Stage.RENDER] = _ends(seconds[Stage.RENDER], picture)
@@ -183,7 +183,7 @@ def _plan(
 
 
 def _later_rates(costs: Batches, options: JobOptions, machine: Machine) -> tuple[StageRate, StageRate]:
-    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], machine)
+    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, machine)
     return scene, picture_rate(costs(Stage.RENDER) if options.views else [], options, machine)
 
 

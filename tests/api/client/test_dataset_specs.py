@@ -86,3 +86,14 @@ def test_the_million_of_the_examples_is_a_spec() -> None:
     assert found.total == 1_000_000 and len(hands) == 3
     assert found.shared_out({"hands": hands}, 100)["grasps"] * 3 * 100 >= 1_000_000
     assert len(hands) * 10_000 < MAX_CELLS
+
+
+def test_a_scene_is_a_kind_or_a_file_beside_the_spec(tmp_path: Path) -> None:
+    (tmp_path / "shelf.yaml").write_text("supports: [{kind: half_space}]\n")
+    text = 'hands = ["allegro"]\nobjects = ["mug"]\nscene = '
+    assert asked(spec(tmp_path, text + '"table"')).options["scene"] == "table"
+    inline = {"supports": [{"kind": "half_space", "normal": [0, 0, 1], "offset": 0}]}
+    assert asked(spec(tmp_path, text + '"shelf.yaml"')).options["scene"] == inline
+    assert asked(spec(tmp_path, text + '"table"'), scene="bin").options["scene"] == "bin"
+    with pytest.raises(InputError, match="unknown scene 'moon'"):
+        asked(spec(tmp_path, text + '"moon"'))

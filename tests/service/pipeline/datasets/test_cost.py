@@ -11,7 +11,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
-from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, machine_of
+from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, STORED_PLACE, machine_of
 from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
 
 #: Seconds that a stage of the fakes says it took.
@@ -186,3 +186,20 @@ def test_what_is_not_known_yet_is_named_and_estimated(parts: Parts) -> None:
 @pytest.mark.parametrize(("referee", "word"), [("none", "sound"), ("certificate", "valid")])
 def test_an_estimate_says_what_it_counts(parts: Parts, referee: str, word: str) -> None:
     assert estimate(parts.index, wanted(referee=referee)).counted == word
+
+
+def test_grasps_in_scenes_have_a_price_of_their_own(parts: Parts) -> None:
+    """Neither are free grasps measured for them, nor do they tell what free ones cost."""
+    run(parts, scenes=2)
+    stored = estimate(parts.index, wanted(scene="table", scenes=2))
+    assert {rate.batches for rate in stored.rates} == {0} and all("in a scene" in rate.origin for rate in stored.rates)
+    assert stored.tried > estimate(parts.index, wanted(scenes=2)).tried
+    assert stored.storage_by_kind["scene"] == 4 * 2 * STORED_PLACE.size_bytes
+    there = wanted(scene="table", scenes=2, name="placed")
+    actions.create(parts, there)
+    plan_all(parts)
+    for job in jobs_of(parts, "placed"):
+        finish(parts, job)
+    placed = estimate(parts.index, there)
+    assert placed.measured_share == 1
+    assert placed.seconds_by_stage["scene"] == pytest.approx(4 * FAKE_SECONDS)
