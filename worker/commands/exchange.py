@@ -19,7 +19,7 @@ from worker.run import Run
 app = typer.Typer(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first of them goes by two names.
-ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "isaac", "csv")
+ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *ROBOTS)
 IMPORTS: Final = ("dexgraspbench", "dexgraspnet", "multidex", "ddgc", "reference")
 
@@ -42,6 +42,16 @@ def export(
         typer.Option("--tool-frame", help="For robots: a link of the hand, or x y z qw qx qy qz in its root link."),
     ] = None,
     speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits that is used.")] = 0.5,
+    arm: Annotated[
+        str | None, typer.Option(help="For robots: an arm's URDF; only grasps it can carry out are written.")
+    ] = None,
+    mount: Annotated[str | None, typer.Option(help="The arm's link that the hand is mounted on.")] = None,
+    base: Annotated[
+        str | None, typer.Option(help="The arm's base in the scene, or seen from a free object: x y z qw qx qy qz.")
+    ] = None,
+    mount_pose: Annotated[
+        str | None, typer.Option(help="The hand's root link in the mount: x y z qw qx qy qz.")
+    ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
@@ -54,7 +64,7 @@ def export(
     if format_ in ROBOTS:
         from worker.files.robot_export import Wishes, export_grasps
 
-        wishes = Wishes(hand, object_, unjudged, every, best, tool, speed)
+        wishes = Wishes(hand, object_, unjudged, every, best, tool, speed, arm, mount, base, mount_pose)
         done = export_grasps(source, format_, wishes, output)
         written, notes = done.counts, done.notes
     elif format_ == "webdataset":

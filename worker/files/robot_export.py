@@ -10,18 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.transforms import IDENTITY_POSE
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
 from worker.files.choice import choose
-from worker.files.exchange.robots.bundle import Bundle
+from worker.files.exchange.robots.bundle import Bundle, Carrier
 from worker.files.of_shard import hand_files_of_shard
 from worker.hands.description import Description, describe
+from worker.quality.referee.decomposition import decompose
 from worker.rendering.pages.sheets import best as best_of
+from worker.robots.arm import read_arm
 from worker.robots.execution import Executions, executions
-from worker.robots.frames import tool_frame
+from worker.robots.frames import parse_pose, tool_frame
+from worker.robots.reach import Reach
 from worker.robots.timing import ASSUMED_M_S, ASSUMED_RAD_S, Limits, Trajectory, hand_limits, straight_paths, timed
+from worker.run import ALONE, Run
 
-FORMATS: Final = ("mujoco", "moveit", "isaac", "csv")
+FORMATS: Final = ("mujoco", "usd", "glb", "moveit", "isaac", "csv")
 #: Other names of formats.
 ALIASES: Final = {"urdf+yaml": "moveit"}
 
@@ -39,29 +44,35 @@ class Wishes:
     tool: str | None = None
     speed: float = 0.5
     """Share of the velocity limits that trajectories use."""
+    arm: str | None = None
+    """The arm's description; the next three say how it stands and carries the hand."""
+    mount: str | None = None
+    base: str | None = None
+    mount_pose: str | None = None
 
 
 @dataclass
 class Written:
     """What came of an export."""
 
-    counts: dict[str, int]
+    counts: dict[str, Any]
     notes: list[str] = field(default_factory=list)
     """Lines for the user: what was assumed, what was left out and why."""
 
 
-def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path) -> Written:
+def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run: Run = ALONE) -> Written:
     """Write grasps of a base shard as a robot or its simulator reads them.
 
     Raises:
-        InputError: unknown format, no such grasps, a tool frame that is none, no grasp that can be reached, or an extra
-            package that a format needs is absent.
+        InputError: unknown format, no such grasps, a tool frame or mount that is none, no grasp that can be reached, or
+            an extra package is absent.
     """
     format_ = ALIASES.get(format_, format_)
     if format_ not in FORMATS:
         raise InputError(f"there is no robot format {format_!r}; choose one of {', '.join(FORMATS)}")
     if not 0 < wishes.speed <= 1:
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
+    _check_arm(wishes)
     shard = read_shard(source, kind="base")
     files = hand_files_of_shard(shard, wishes.hand)
     description = describe(files.files, files.options)
@@ -69,11 +80,52 @@ def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path) -> W
     found = _found(source, shard, description, wishes, written)
     limits = hand_limits(found.hand)
     written.notes += _assumptions(limits)
-    found = found.take(np.arange(len(found))[: wishes.best or None])
-    bundle = Bundle(found, [_trajectory(found, row, limits, wishes.speed) for row in range(len(found))], description)
+    if wishes.arm is None:
+        found = found.take(np.arange(len(found))[: wishes.best or None])
+        trajectories = [_trajectory(found, row, limits, wishes.speed) for row in range(len(found))]
+        bundle = Bundle(found, trajectories, description)
+    else:
+        bundle = _carried(found, description, limits, wishes, written, run)
     paths = _write(bundle, format_, folder, files.files)
-    written.counts = {"grasps": len(found), "files": len(paths)}
+    written.counts |= {"grasps": len(bundle.found), "files": len(paths)}
     return written
+
+
+def _check_arm(wishes: Wishes) -> None:
+    """Raises InputError where an arm lacks its mount or base, or they lack an arm."""
+    if wishes.arm is None:
+        if wishes.mount or wishes.base or wishes.mount_pose:
+            raise InputError("--mount, --mount-pose and --base go with an arm; name its file: --arm ARM.urdf")
+        return
+    if not wishes.mount:
+        raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
+
+
+def _carried(
+    found: Executions, description: Description, limits: Limits, wishes: Wishes, written: Written, run: Run
+) -> Bundle:
+    """The grasps that the arm carries out, with its trajectories."""
+    assert wishes.arm is not None and wishes.mount is not None
+    base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
+    mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
+    arm = read_arm(wishes.arm, wishes.mount, mount_pose)
+    reach = Reach(arm, base, found, decompose(found.obj))
+    reached = reach.all(wishes.best, run)
+    why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common())
+    if not reached.rows:
+        raise InputError(
+            f"the arm {arm.model.name} carries out none of {reached.tried} grasps ({why}); place it elsewhere: --base"
+        )
+    written.counts |= {"tried": reached.tried, "reach_share": round(reached.share, 4), "refused": dict(reached.refused)}
+    if reached.refused:
+        written.notes.append(f"the arm carries out {len(reached.rows)} of {reached.tried} grasps; left out: {why}")
+    of_arm = hand_limits(arm.model)
+    written.notes += _assumptions(of_arm)
+    names = (*arm.model.joint_names, *found.hand.joint_names)
+    velocity = np.concatenate([of_arm.velocity, limits.velocity])
+    trajectories = [timed(paths, names, velocity, speed=wishes.speed) for paths in reached.paths]
+    kept = found.take(np.array(reached.rows, np.intp))
+    return Bundle(kept, trajectories, description, Carrier(arm, base, reach.world, reached.paths))
 
 
 def _found(source: Path, shard: Shard, description: Description, wishes: Wishes, written: Written) -> Executions:
@@ -113,16 +165,18 @@ def _assumptions(limits: Limits) -> list[str]:
 
 
 def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, bytes]) -> list[Path]:
-    from worker.files.exchange.robots import isaac, moveit, mujoco_scene, tables
+    from worker.files.exchange.robots import isaac, moveit, mujoco_scene, posed_glb, tables, usd_stage
 
     if format_ == "csv":
         return tables.write(bundle, folder)
     if format_ == "isaac":
         return isaac.write(bundle, folder)
+    if format_ == "glb":
+        return posed_glb.write(bundle, folder)
+    if format_ == "usd":
+        return usd_stage.write(bundle, folder)
     if format_ == "moveit":
         return moveit.write(bundle, folder, hand_files)
     if format_ == "mujoco":
-        from worker.quality.referee.decomposition import decompose
-
         return mujoco_scene.write(bundle, folder, decompose(bundle.found.obj))
     raise InputError(format_)

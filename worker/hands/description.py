@@ -30,7 +30,7 @@ def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = Non
         HandError: the files describe no usable hand.
     """
     settings = parse_options(files, options)
-    robot = read_robot(files, main_file(files, settings))
+    robot = read_robot(files, main_file(files, settings), settings.xacro)
     tree = build_tree(robot, settings)
     return Description(
         dict(tree.links), frozenset(name for name in tree.joint_names if robot.joints[name].mimic is not None)

@@ -57,13 +57,25 @@ def assemble(
 ) -> HandModel:
     """The model of a checked robot and options."""
     tree = build_tree(robot, options)
+    hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest), tree, options)
+    return replace(hand, neighbours=resting_neighbours(hand))
+
+
+def body_model(
+    robot: Robot, tree: Tree, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
+) -> HandModel:
+    """Bodies, joints and pieces of a tree, without what makes them a hand: palm, fingers, closing, neighbours.
+
+    Raises:
+        HandError: nothing of it can touch, or a mesh or a number cannot be used.
+    """
     base = str(PurePosixPath(main).parent).removeprefix(".")
     pieces = _pieces(robot, tree, files, base)
     if not pieces:
         raise HandError("no link of the hand has collision geometry, so nothing can touch; drop less")
     moving = [tree.drives[joint.name] if joint else None for joint in tree.joint]
     dofs = len(tree.dof_names)
-    hand = HandModel(
+    return HandModel(
         name=name,
         digest=digest,
         root_link=tree.body_names[0],
@@ -93,8 +105,6 @@ def assemble(
         arm=chain_to(robot, tree.body_names[0]),
         visuals=Visuals(_placed_visuals(robot, tree), files, base),
     )
-    hand = complete(hand, tree, options)
-    return replace(hand, neighbours=resting_neighbours(hand))
 
 
 def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:

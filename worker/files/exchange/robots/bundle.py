@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import pathlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,22 @@ from service.model.transforms import compose, invert
 from worker.files.exchange.imported import plain_name
 from worker.hands.description import Description
 from worker.hands.model import Floats
+from worker.robots.arm import Arm
 from worker.robots.execution import Executions
-from worker.robots.timing import Trajectory
+from worker.robots.timing import Path, Trajectory
+from worker.robots.world import World
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """The arm that carries the hand, where it stands, and its motions."""
+
+    arm: Arm
+    base: Floats
+    """(7,) its base in the frame of the grasps."""
+    world: World
+    paths: list[list[Path]]
+    """Of each grasp; joints are the arm's, then the hand's."""
 
 
 @dataclass(frozen=True)
@@ -25,21 +39,19 @@ class Bundle:
     trajectories: list[Trajectory]
     """One for each grasp; its joints are the arm's, if there is one, then the hand's."""
     description: Description
-    base_link: str = ""
-    """Name of the arm's base; empty: no arm."""
-    base: Floats | None = None
-    """(7,) the arm's base in the frame of the grasps."""
+    carrier: Carrier | None = None
+    """The arm, if there is one."""
 
     @property
     def frame(self) -> str:
         """Name of the frame in which poses are written: the arm's base, the scene, or the object."""
-        if self.base is not None:
-            return self.base_link
+        if self.carrier is not None:
+            return self.carrier.arm.model.root_link
         return "scene" if self.found.placed is not None else plain_name(self.found.obj.name)
 
     def seen(self, pose: Floats) -> Floats:
         """Poses (..., 7) in the frame `frame`."""
-        return np.asarray(pose, float) if self.base is None else compose(invert(self.base), pose)
+        return np.asarray(pose, float) if self.carrier is None else compose(invert(self.carrier.base), pose)
 
     def seen_tool(self, root_pose: Floats) -> Floats:
         """Poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
@@ -63,7 +75,7 @@ class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mis
         return True
 
 
-def dump_yaml(file: Path, value: Any) -> Path:
+def dump_yaml(file: pathlib.Path, value: Any) -> pathlib.Path:
     """Write a value as YAML, in the order of its keys."""
     file.write_text(yaml.dump(value, Dumper=_Plain, sort_keys=False, default_flow_style=None, width=120))
     return file

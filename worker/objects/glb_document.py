@@ -1,0 +1,109 @@
+"""A binary glTF 2.0 document under construction: triangles and points, opened by any glTF tool."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+_FLOAT, _BYTE, _U32 = 5126, 5120, 5125
+_POINTS: Final = 0
+_ARRAY, _ELEMENTS = 34962, 34963
+
+
+class Document:
+    """A glTF 2.0 document with one buffer, under construction."""
+
+    def __init__(self) -> None:
+        self._chunks: list[bytes] = []
+        self._size = 0
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._meshes: list[dict[str, Any]] = []
+        self._materials: list[dict[str, Any]] = []
+
+    def triangles(
+        self,
+        vertices: NDArray[Any],
+        faces: NDArray[Any],
+        normals: NDArray[Any],
+        colour: tuple[float, float, float] | None = None,
+    ) -> dict[str, Any]:
+        """A primitive of vertices (V, 3), faces (F, 3), unit normals per face corner (F, 3, 3) and a linear colour."""
+        # A vertex on a crease becomes as many as it has normals; 127 steps a half axis are under half a degree.
+        small = np.round(127 * normals.reshape(-1, 3)).astype(np.int8)
+        corners = np.concatenate([faces.reshape(-1, 1), small], axis=1)
+        unique, index = np.unique(corners, axis=0, return_inverse=True)
+        padded = np.zeros((len(unique), 4), np.int8)
+        padded[:, :3] = unique[:, 1:]
+        attributes = {
+            "POSITION": self.vectors(vertices[unique[:, 0]]),
+            "NORMAL": self._accessor(padded, _BYTE, "VEC3", _ARRAY, {"byteStride": 4}, {"normalized": True}),
+        }
+        indices = self._accessor(index.reshape(-1).astype(np.uint32), _U32, "SCALAR", _ELEMENTS, {}, {})
+        primitive: dict[str, Any] = {"attributes": attributes, "indices": indices}
+        return primitive if colour is None else primitive | {"material": self._material(colour)}
+
+    def points(self, values: NDArray[Any]) -> dict[str, Any]:
+        """A primitive of points (N, 3)."""
+        return {"attributes": {"POSITION": self.vectors(values)}, "mode": _POINTS}
+
+    def _material(self, colour: tuple[float, float, float]) -> int:
+        look = {"baseColorFactor": [*plain(colour), 1.0], "metallicFactor": 0.1, "roughnessFactor": 0.6}
+        material = {"pbrMetallicRoughness": look, "doubleSided": True}
+        if material not in self._materials:
+            self._materials.append(material)
+        return self._materials.index(material)
+
+    def vectors(self, values: NDArray[Any]) -> int:
+        """An accessor of points (N, 3)."""
+        data = np.ascontiguousarray(values, np.float32)
+        bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
+        return self._accessor(data, _FLOAT, "VEC3", _ARRAY, {}, bounds)
+
+    def mesh(self, primitives: list[dict[str, Any]]) -> int:
+        self._meshes.append({"primitives": primitives})
+        return len(self._meshes) - 1
+
+    def bytes(self, nodes: list[dict[str, Any]], extras: dict[str, Any]) -> bytes:
+        """The file; node 0 is the root of the scene."""
+        document = {
+            "asset": {"version": "2.0", "generator": "graspd", "extras": extras},
+            "extensionsUsed": ["KHR_mesh_quantization"],
+            "extensionsRequired": ["KHR_mesh_quantization"],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": nodes,
+            "meshes": self._meshes,
+            **({"materials": self._materials} if self._materials else {}),
+            "accessors": self._accessors,
+            "bufferViews": self._views,
+            "buffers": [{"byteLength": self._size}],
+        }
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        binary = b"".join(self._chunks)
+        parts = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
+
+    def _accessor(
+        self, data: NDArray[Any], component: int, kind: str, target: int, view: dict[str, Any], facts: dict[str, Any]
+    ) -> int:
+        chunk = data.tobytes()
+        span = {"buffer": 0, "byteOffset": self._size, "byteLength": len(chunk), "target": target}
+        self._views.append(span | view)
+        self._accessors.append(
+            {"bufferView": len(self._views) - 1, "componentType": component, "count": len(data), "type": kind} | facts
+        )
+        chunk += b"\0" * (-len(chunk) % 4)
+        self._chunks.append(chunk)
+        self._size += len(chunk)
+        return len(self._accessors) - 1
+
+
+def plain(values: Any) -> list[float]:
+    """Rounded numbers for a node."""
+    return [round(float(value), 7) for value in values]
