@@ -76,7 +76,7 @@ def export(
     if json:
         emit({"folder": str(output), "format": format_, **written, **({"notes": notes} if notes else {})})
         return
-    typer.echo(f"{output}: " + ", ".join(f"{number} {what}" for what, number in written.items()))
+    typer.echo(f"{output}: " + ", ".join(f"{n} {what}" for what, n in written.items() if isinstance(n, int)))
     for note in notes:
         typer.echo(note, err=True)
 

@@ -111,7 +111,7 @@ def _carried(
     arm = read_arm(wishes.arm, wishes.mount, mount_pose)
     reach = Reach(arm, base, found, decompose(found.obj))
     reached = reach.all(wishes.best, run)
-    why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common())
+    why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
         raise InputError(
             f"the arm {arm.model.name} carries out none of {reached.tried} grasps ({why}); place it elsewhere: --base"
@@ -165,7 +165,7 @@ def _assumptions(limits: Limits) -> list[str]:
 
 
 def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, bytes]) -> list[Path]:
-    from worker.files.exchange.robots import isaac, moveit, mujoco_scene, posed_glb, tables, usd_stage
+    from worker.files.exchange.robots import isaac, moveit, mujoco_arm, mujoco_scene, posed_glb, tables, usd_stage
 
     if format_ == "csv":
         return tables.write(bundle, folder)
@@ -178,5 +178,5 @@ def _write(bundle: Bundle, format_: str, folder: Path, hand_files: dict[str, byt
     if format_ == "moveit":
         return moveit.write(bundle, folder, hand_files)
     if format_ == "mujoco":
-        return mujoco_scene.write(bundle, folder, decompose(bundle.found.obj))
+        return mujoco_scene.write(bundle, folder, decompose(bundle.found.obj)) + mujoco_arm.write(bundle, folder)
     raise InputError(format_)

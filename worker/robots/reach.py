@@ -46,7 +46,7 @@ class Reached:
     paths: list[list[Path]] = field(default_factory=list)
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
-    """How many of the others for which of `REASONS`."""
+    """How many of the others for which reason."""
     tried: int = 0
 
     @property
@@ -93,45 +93,43 @@ class Reach:
 
     def one(self, row: int) -> tuple[list[Path] | None, str]:
         """The motions of one grasp, or why there are none: the reason of the start that got farthest."""
-        ways = [
-            path
-            for phase in ("approach", "shape", "close", "squeeze", "lift")
-            for path in straight_paths(self.found, row, LONG if phase in _LONG_PHASES else SHORT)
-            if path.phase == phase
-        ]
-        rng, farthest = np.random.default_rng(row), 0
+        long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
+        ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
+        rng, farthest, reason = np.random.default_rng(row), -1, ""
         arm = self.arm.model
         for start in range(STARTS):
             middle = 0.5 * (arm.lower + arm.upper)
             q = middle if start == 0 else rng.uniform(arm.lower, arm.upper)
-            found, stage = self._from(q, ways, row)
+            found, why = self._from(q, ways, row)
             if found is not None:
                 return found, ""
-            farthest = max(farthest, stage)
-        return None, REASONS[farthest]
+            stage = next(k for k, one in enumerate(REASONS) if why.startswith(one))
+            if stage > farthest:
+                farthest, reason = stage, why
+        return None, reason
 
-    def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, int]:
-        """The motions from one start, or how far it got."""
+    def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
+        """The motions from one start, or why there are none."""
         approach, *others = ways
         arrived = self._solve(q, approach.hand_pose[-1], STEPS)
         if arrived is None:
-            return None, 0
+            return None, REASONS[0]
         back = self._follow(arrived, approach.hand_pose[::-1])
         if back is None:
-            return None, 1
+            return None, REASONS[1]
         joined, at = [back[::-1]], arrived
         for path in others:
             onward = self._follow(at, path.hand_pose)
             if onward is None:
-                return None, 1
+                return None, REASONS[1]
             joined.append(onward)
             at = onward[-1]
-        if self._collides(joined, ways, row):
-            return None, 2
+        if pair := self._collision(joined, ways, row):
+            return None, f"{REASONS[2]} of {pair}"
         return [
             replace(path, joints=np.concatenate([self.arm.model.expand(arm), path.joints], axis=1))
             for path, arm in zip(ways, joined, strict=True)
-        ], 3
+        ], ""
 
     def _follow(self, q: Floats, poses: Floats) -> Floats | None:
         """(M, A) dofs along root poses (M, 7) of the hand, the first of which q has; None: not without a jump."""
@@ -169,13 +167,14 @@ class Reach:
         arm = self.arm.model
         return bool((q >= arm.lower - 1e-6).all() and (q <= arm.upper + 1e-6).all())
 
-    def _collides(self, joined: list[Floats], ways: list[Path], row: int) -> bool:
+    def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
+        """The first two bodies that meet on the way; empty: none do."""
         rest = np.asarray(self.found.object_pose[row], float)
         for arm, path in zip(joined, ways, strict=True):
             for q, joints, pose in zip(arm, path.joints, path.hand_pose, strict=True):
                 at = rest.copy()
                 if path.phase == "lift":
                     at[:3] += pose[:3] - path.hand_pose[0, :3]
-                if self.world.touches(q, joints, at):
-                    return True
-        return False
+                if pair := self.world.touches(q, joints, at):
+                    return pair
+        return ""

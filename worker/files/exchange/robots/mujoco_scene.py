@@ -45,12 +45,12 @@ def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
     spec = scene_spec(found.hand, found.obj, pieces, physics, supports)
     spec.modelname = f"{plain_name(found.hand.name)} and {plain_name(found.obj.name)}"
     tree = ElementTree.fromstring(spec.to_xml())
-    site = {"name": "object_frame", "pos": _text(-scene.centre), "size": "0.002", "group": "4"}
-    SubElement(_one(tree, ".//body[@name='object']"), "site", site)
+    site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
+    SubElement(one(tree, ".//body[@name='object']"), "site", site)
     _settle(tree, found)
-    _dress(tree, found)
+    dress(tree, found, ("body0", "object", "supports"))
     _add_keys(tree, bundle, scene)
-    _rename(tree, _names(found.hand))
+    rename(tree, _names(found.hand))
     ElementTree.indent(tree)
     file, script = folder / "scene.xml", folder / "replay.py"
     file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
@@ -60,7 +60,7 @@ def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
 
 def _settle(tree: Element, found: Executions) -> None:
     """Supports stand still in the world; gravity as in the lift test: on the object alone."""
-    option = _one(tree, "option")
+    option = one(tree, "option")
     support = tree.find(".//body[@name='supports']")
     if support is not None:
         support.attrib.pop("mocap", None)
@@ -68,28 +68,31 @@ def _settle(tree: Element, found: Executions) -> None:
         option.set("gravity", "0 0 0")
     else:
         option.set("gravity", f"0 0 {-GRAVITY:g}")
-        for body in _one(tree, ".//body[@name='body0']").iter("body"):
+        for body in one(tree, ".//body[@name='body0']").iter("body"):
             body.set("gravcomp", "1")
     flag = option.find("flag")
     if flag is not None:
         flag.attrib.pop("gravity", None)
 
 
-def _dress(tree: Element, found: Executions) -> None:
-    """Colours, light and a camera: nothing of it moves a body."""
-    for name, colour in (("body0", "hand"), ("object", "object"), ("supports", "support")):
+def dress(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
+    """Colours of hand, object and supports (bodies of these names), light and a camera: nothing of it moves a body."""
+    for name, colour in zip(names, _COLOURS, strict=False):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):
                 geom.set("rgba", _COLOURS[colour])
-    world, size = _one(tree, "worldbody"), 2 * found.obj.radius + 0.3
+    world, size = one(tree, "worldbody"), 2 * found.obj.radius + 0.3
     middle = found.object_pose[0, :3]
     world.insert(
-        0, Element("light", pos=_text(middle + np.array([0.5, -0.5, 2.0])), dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9")
+        0,
+        Element(
+            "light", pos=element_text(middle + np.array([0.5, -0.5, 2.0])), dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9"
+        ),
     )
     visual = SubElement(tree, "visual")
     SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.4 0.4 0.4")
     SubElement(visual, "global", azimuth="130", elevation="-25", offwidth="1280", offheight="960")
-    SubElement(tree, "statistic", center=_text(middle), extent=_text([size]))
+    SubElement(tree, "statistic", center=element_text(middle), extent=element_text([size]))
 
 
 def _add_keys(tree: Element, bundle: Bundle, scene: Scene) -> None:
@@ -111,7 +114,12 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
     at = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
     qpos[scene.object_qpos : scene.object_qpos + 7] = compose(at, np.array([*scene.centre, 1, 0, 0, 0]))
     control = found.hand.reduce(command.joint_positions[row]) * scene.dof_gain + scene.dof_shift
-    return {"qpos": _text(qpos), "ctrl": _text(control), "mpos": _text(pose[:3]), "mquat": _text(pose[3:])}
+    return {
+        "qpos": element_text(qpos),
+        "ctrl": element_text(control),
+        "mpos": element_text(pose[:3]),
+        "mquat": element_text(pose[3:]),
+    }
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
@@ -124,7 +132,8 @@ def _names(hand: HandModel) -> Mapping[str, str]:
     return found | {f"joint{b}": name if name not in taken else f"hand_{name}" for b, name in joints}
 
 
-def _rename(tree: Element, names: Mapping[str, str]) -> None:
+def rename(tree: Element, names: Mapping[str, str]) -> None:
+    """Give bodies, joints and actuators other names, wherever they are named."""
     for element in tree.iter():
         if element.tag in ("mesh", "geom", "key", "site"):
             continue
@@ -133,11 +142,13 @@ def _rename(tree: Element, names: Mapping[str, str]) -> None:
                 element.set(attribute, names[element.attrib[attribute]])
 
 
-def _one(tree: Element, path: str) -> Element:
+def one(tree: Element, path: str) -> Element:
+    """An element that is there."""
     found = tree.find(path)
     assert found is not None, path
     return found
 
 
-def _text(values: Any) -> str:
+def element_text(values: Any) -> str:
+    """Numbers as MJCF has them."""
     return " ".join(f"{float(value):.12g}" for value in np.ravel(values))

@@ -49,7 +49,9 @@ def hand_meshes(found: Executions) -> list[Solid]:
 
 def object_mesh(found: Executions) -> Solid:
     """The object in its own frame."""
-    return Solid(plain_name(found.obj.name), found.obj.vertices, found.obj.faces, found.obj.corner_normals, OBJECT_COLOUR)
+    return Solid(
+        plain_name(found.obj.name), found.obj.vertices, found.obj.faces, found.obj.corner_normals, OBJECT_COLOUR
+    )
 
 
 def support_meshes(found: Executions) -> list[Solid]:
