@@ -110,6 +110,7 @@ def _making(contents: Contents, tally: Tally) -> Row:
         "fidelities": [_knobs(text) for text in _said(tally, "fidelity")],
         "levels": _said(tally, "verdict_level"),
         "verdict_keys": len(tally.values.get("verdict_key", {})),
+        "scenes": sorted({str(_knobs(text).get("kind", "")) for text in _said(tally, "scene")} - {"", "free"}),
         "wants": _said(tally, "want"),
         "seeds": _said(tally, "seed"),
         "friction": _said(tally, "mu"),
@@ -153,6 +154,7 @@ def _validity(cells: Iterable[CellTally]) -> Row:
         "audited": audited,
         "audit_dropped": audited - held,
         "false_valid": share(audited - held, audited),
+        "lift_hard": share(sum(cell.lift_hard for cell in cells), sum(cell.lift_tested for cell in cells)),
         "seconds": round(sum(cell.seconds for cell in cells), 3),
     }
 

@@ -24,7 +24,7 @@ from worker.cards.contents import Contents
 COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     "base": (
         "grasp/hand_pose", "grasp/joint_positions", "quality/thresholds_m", *(metric.path for metric in GRASP_METRICS),
-        *standing.COLUMNS, "quality/audit",
+        *standing.COLUMNS, "quality/audit", "quality/lift_hard",
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
     "views": (),

@@ -48,6 +48,10 @@ class CellTally:
     clear: int = 0
     """Of these, grasps that are clear of what is around in one scene at least."""
     pictures: int = 0
+    lift_tested: int = 0
+    """Valid grasps of scenes that were lifted at half the friction too."""
+    lift_hard: int = 0
+    """Of these, grasps that held."""
     seconds: float = 0.0
     """Of workers, over all stages."""
     rejected: Counter[str] = field(default_factory=Counter)
@@ -104,7 +108,7 @@ class Tally:
 
 
 _ATTRIBUTES: Final = ("method", "fidelity", "seed", "want", "device", "worker", "code_version", "verdict_level", "mu",
-                      "source", "verdict_key")  # fmt: skip
+                      "source", "verdict_key", "scene")  # fmt: skip
 
 
 def tally_of(contents: Contents, pieces: Iterable[Piece]) -> Tally:
@@ -159,6 +163,9 @@ def _add_base(tally: Tally, cell: CellTally, piece: Piece, hand: AssetFacts) -> 
     if (audit := columns.get("quality/audit")) is not None:
         cell.audited += int(np.count_nonzero(audit[valid] >= 0))
         cell.audit_held += int(np.count_nonzero(audit[valid] == 1))
+    if (hard := columns.get("quality/lift_hard")) is not None:
+        cell.lift_tested += int(np.count_nonzero(hard[valid] >= 0))
+        cell.lift_hard += int(np.count_nonzero(hard[valid] == 1))
     thresholds = np.asarray(columns["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     tally.threshold_m[float(thresholds[at])] += 1

@@ -24,6 +24,7 @@ from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
 from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import best, best_kept, views_page
+from worker.rendering.pages.typography import with_palette
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
 from worker.run import Run
@@ -109,6 +110,7 @@ def pictures(
     ] = None,
     three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
     way: Annotated[bool, typer.Option("--way", help="Each grasp on its way: standoff, pregrasp, grasp, lift.")] = False,
+    palette: Annotated[bool, typer.Option("--palette", help="256 colours: a third of the bytes.")] = False,
     size: Annotated[
         int | None, typer.Option(min=32, max=2048, help="Edge of one picture [px]; 300, with --three-sides 160.")
     ] = None,
@@ -130,7 +132,8 @@ def pictures(
         base, hand_of_shard(base, hand), object_of_shard(base, object), rows,
         "way" if way else "three sides" if three else "one side", Run(Device(device).resolve()), size,
     )  # fmt: skip
-    output.write_bytes(sheet.png(subtitle=f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm"))
+    page = sheet.png(subtitle=f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm")
+    output.write_bytes(with_palette(page) if palette else page)
     if json:
         emit({"file": str(output), "grasps": len(rows), "of": int(chosen.sum()), "kind": word, "rows": rows.tolist()})
     else:

@@ -20,6 +20,7 @@ from worker.rendering.camera_file import GivenCameras
 from worker.rendering.cameras import FIELD_OF_VIEW, distance_to_fill, look_at
 from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import label_page, scene_cells
+from worker.rendering.pages.typography import with_palette
 from worker.rendering.views import Extras, render
 from worker.run import Run
 from worker.scenes import Neighbours, drop, drop_together, transfer
@@ -54,7 +55,7 @@ def paint(
     for name, page in pages.items():
         say(f"{name} ...")
         path = folder / f"{name}.png"
-        path.write_bytes(page())
+        path.write_bytes(with_palette(page()))
         written.append(path)
     return written
 

@@ -24,6 +24,7 @@ from service.pipeline.datasets.spec import DatasetRequest
 from service.settings import Settings
 from service.store.manifests import publish_shard
 from service.store.records import put_record, read_record
+from service.store.shards import json_attribute
 from service.store.store import open_store
 from tests.api.factories import add_builtins, poses, scene_columns
 from tests.memory_queue import MemoryQueue
@@ -106,6 +107,9 @@ def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[st
         rng = np.random.default_rng([task.batch, *map(ord, record.request.hand + record.request.object)])
         message = message_of(record, task, attempt=1, max_attempt=3)
         scenes = record.request.scenes
+        place: dict[str, Any] = {}
+        if record.request.in_scene:
+            place = {"scene": json_attribute(record.request.place.model_dump(mode="json"))}
         if task.stage is Stage.SYNTHESIZE:
             base = _base(rng, record.request.hand, task.count, task.batch)
             change(record.request.hand, record.request.object, base)
@@ -117,11 +121,17 @@ def _finish(parts: Parts, record: JobRecord, change: Callable[[str, str, dict[st
                 "joint_names": list(joints), "mu": 1.0, "want": "valid", "tried": tried,
                 "verdict_level": "certificate", "verdict_key": "k",
             }  # fmt: skip
+            if place:
+                # At half the friction every other grasp of a scene lifts.
+                base["quality/lift_hard"] = (np.arange(made) % 2).astype(np.int8)
+                attributes |= place
             output = Output(base, attributes, {"planner_seconds": 1.0, "rejected": rejected})
+        elif task.stage is Stage.SCENE and place:
+            output = Output(_scene(rng, 0, scenes), place)
         elif task.stage is Stage.SCENE:
             output = Output(_scene(rng, len(base["quality/valid"]), scenes), {"base_shard": task.inputs[0]})
         else:
-            output = Output(_views(scenes * record.request.views), {"scene_shard": task.inputs[0]})
+            output = Output(_views(scenes * record.request.views), {"scene_shard": task.inputs[0], **place})
         manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(parts.store, manifest, data)
         parts.index.write.add_manifest(manifest)

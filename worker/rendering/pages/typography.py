@@ -67,3 +67,8 @@ def png(image: Image.Image) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
+
+
+def with_palette(page: bytes) -> bytes:
+    """The same PNG in 256 colours: a third of the bytes, for pages of documents."""
+    return png(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))
