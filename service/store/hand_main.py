@@ -18,6 +18,7 @@ SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
 _HEAD_BYTES: Final = 1 << 16
 _PROLOG: Final = re.compile(rb"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
 _ROOT: Final = re.compile(rb"\s*<([A-Za-z_][\w:.-]*)")
+_COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
 _MACROS: Final = (b"<xacro:", b"${", b"$(")
 _FORMATS_OF: Final[dict[bytes, Format]] = {b"robot": "urdf", b"mujoco": "mjcf"}
 
@@ -28,7 +29,7 @@ def format_of(name: str, data: bytes) -> Format | None:
     if suffix not in SUFFIXES:
         return None
     found = _FORMATS_OF.get(_root_element(data[:_HEAD_BYTES]))
-    if found == "urdf" and any(sign in data for sign in _MACROS):
+    if found == "urdf" and any(sign in _COMMENT.sub(b"", data) for sign in _MACROS):
         return "xacro"
     # A file that calls itself a URDF is taken at its word, so that its reader says what is wrong with it.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]

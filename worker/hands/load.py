@@ -24,7 +24,7 @@ from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions,
 from worker.hands.primitives import volume
 from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
-from worker.hands.shapes import Hulls, make_piece
+from worker.hands.shapes import Hulls, make_pieces
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
 
@@ -120,7 +120,7 @@ def _pieces(robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str) -> 
     for link, (body, pose) in tree.links.items():
         for shape in robot.links[link].shapes:
             placed = compose(pose, shape.pose)
-            pieces.append(make_piece(shape, body=body, pose=placed, link=link, files=files, base=base, hulls=hulls))
+            pieces += make_pieces(shape, body=body, pose=placed, link=link, files=files, base=base, hulls=hulls)
     return tuple(pieces)
 
 

@@ -1,4 +1,4 @@
-"""Collision elements of a robot as convex pieces: primitives stay exact, meshes become reduced convex hulls."""
+"""Collision elements of a robot as convex pieces: primitives stay exact, meshes become reduced hulls."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from service.model.errors import HandError, MeshError
 from service.model.transforms import IDENTITY_POSE, Floats, apply
+from worker.hands.hollows import parts_of
 from worker.hands.model import ConvexPiece
 from worker.hands.primitives import hull, signed_distance, tessellate, volume
 from worker.hands.references import find_mesh
@@ -21,13 +22,13 @@ MAX_HULL_VERTICES: Final = 50
 MAX_PIECE_M: Final = 2.0
 
 
-Hulls = dict[tuple[str, tuple[float, ...]], tuple[Floats, Ints]]
+Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
 
 
-def make_piece(
+def make_pieces(
     shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
-) -> ConvexPiece:
-    """The convex piece of a collision element.
+) -> list[ConvexPiece]:
+    """The convex pieces of a collision element: one, but of a mesh with hollows several.
 
     Args:
         shape: the element.
@@ -43,29 +44,39 @@ def make_piece(
     """
     if shape.kind != "mesh":
         vertices, faces = tessellate(shape.kind, shape.size)
-        return ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)
+        return [ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)]
     if shape.mesh is not None:
-        vertices, faces = reduce_hull(shape.mesh[0])
-        return ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
-    name = find_mesh(shape.filename, files, base, link)
-    key = (name, shape.size)
-    if key not in hulls:
-        hulls[key] = _mesh_hull(name, shape.size, files[name], link)
-    vertices, faces = hulls[key]
-    return ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
+        found = _hulls(*shape.mesh)
+    else:
+        name = find_mesh(shape.filename, files, base, link)
+        key = (name, shape.size)
+        if key not in hulls:
+            hulls[key] = _mesh_hulls(name, shape.size, files[name], link)
+        found = hulls[key]
+    return [
+        ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
+        for vertices, faces in found
+    ]
 
 
-def _mesh_hull(name: str, scale: tuple[float, ...], data: bytes, link: str) -> tuple[Floats, Ints]:
+def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> list[tuple[Floats, Ints]]:
     try:
-        points = read_mesh(name, data).vertices * np.asarray(scale)
+        soup = read_mesh(name, data)
     except MeshError as error:
         raise HandError(f"collision mesh of link {link!r}: {error}") from None
+    points = soup.vertices * np.asarray(scale)
     if np.ptp(points, axis=0).max() > MAX_PIECE_M:
         raise HandError(
             f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
             'if it is in millimetres give it scale="0.001 0.001 0.001"'
         )
-    return reduce_hull(points)
+    return _hulls(points, soup.faces.astype(np.int32))
+
+
+def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
+    parts = parts_of(points, faces)
+    # A hull is that of all points of a file; some have points that no face names.
+    return [reduce_hull(part) for part in (parts if len(parts) > 1 else (points,))]
 
 
 def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:

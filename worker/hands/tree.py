@@ -12,6 +12,7 @@ from service.model.transforms import IDENTITY_POSE, compose, quat_from_axis_angl
 from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
 from worker.hands.robot import UNLIMITED_M, Joint, Mimic, Robot, chain_to
+from worker.hands.roots import pick_root
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     _check_names(robot, options)
     mimics = {name: joint.mimic for name, joint in robot.joints.items()}
     mimics |= {name: Mimic(c.of, c.multiplier, c.offset) for name, c in options.couplings.items()}
-    root = _pick_root(robot, options)
+    root = pick_root(robot, options)
     kept = _kept_joints(robot, root, set(options.drop))
     drives = {j.name: _resolve(j.name, mimics, robot, options) for j in kept if j.type != "fixed"}
     frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
@@ -86,44 +87,6 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
                 raise HandError(f"asset.json names the {kind} {name!r}, which the URDF does not have")
             if kind == "joint" and robot.joints[name].type == "fixed":
                 raise HandError(f"asset.json names the joint {name!r}, which cannot move")
-
-
-def _pick_root(robot: Robot, options: HandOptions) -> str:
-    """The chosen root; else the URDF's, moved down past dropped links, and past the joints of an arm or a wrist."""
-    if options.root:
-        return options.root
-    root, drop = robot.root, set(options.drop)
-    while root in drop:
-        children = [j.child for j in robot.joints.values() if j.parent == root]
-        if len(children) != 1:
-            raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
-        root = children[0]
-    return _below_arm(robot, root, options)
-
-
-def _below_arm(robot: Robot, root: str, options: HandOptions) -> str:
-    """Where a hand on an arm begins: behind the last moving joint before the fingers part; else the root itself."""
-    start, at = root, root
-    palm = options.palm.link if options.palm else None
-    while at != palm:
-        onward = [joint for joint in robot.joints.values() if joint.parent == at and _moves(robot, joint, options)]
-        if len(onward) != 1:
-            # A tree that never parts is a single finger: nothing above it is an arm.
-            return start if onward else root
-        (joint,) = onward
-        at = joint.child
-        if joint.type != "fixed" and joint.name not in options.fix:
-            start = at
-    return start
-
-
-def _moves(robot: Robot, joint: Joint, options: HandOptions) -> bool:
-    """Whether the joint, or one behind it, moves."""
-    if joint.child in options.drop:
-        return False
-    if joint.type != "fixed" and joint.name not in options.fix:
-        return True
-    return any(_moves(robot, after, options) for after in robot.joints.values() if after.parent == joint.child)
 
 
 def joints_above(robot: Robot, link: str) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ wrongly; this reader refuses each by name. It knows only what a hand needs: link
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import Final
@@ -23,6 +24,8 @@ MAX_BYTES: Final = 4 * 2**20
 #: Visual elements beyond this many are not drawn.
 MAX_VISUALS: Final = 1024
 Colour = tuple[float, float, float]
+_PREFIX: Final = re.compile(rb"[<\s/]([A-Za-z_][\w.-]{0,40}):[A-Za-z_]")
+_MAX_PREFIXES: Final = 100
 
 
 def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
@@ -44,13 +47,26 @@ def _parse_xml(data: bytes, filename: str) -> ElementTree.Element:
     if len(data) > MAX_BYTES:
         raise LimitError(f"{filename}: {len(data)} bytes of XML; at most {MAX_BYTES} are taken")
     try:
-        root: ElementTree.Element = SafeTree.fromstring(data)
+        root = _with_prefixes(data)
     except DefusedXmlException:
         raise HandError(f"{filename}: XML entities are refused; write the text out") from None
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise HandError(f"{filename}: not well-formed XML ({error}); export the URDF again") from None
     if root.tag != "robot":
         raise HandError(f"{filename}: the XML root is <{root.tag[:40]}>, a URDF begins with <robot>")
+    return root
+
+
+def _with_prefixes(data: bytes) -> ElementTree.Element:
+    """The tree of an XML text; prefixes of foreign elements (`drake:...`) that nobody declared are declared here."""
+    try:
+        root: ElementTree.Element = SafeTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise
+        prefixes = sorted(set(_PREFIX.findall(data)) - {b"xml", b"xmlns"})
+        declared = b"".join(b' xmlns:%s="urn:%s"' % (prefix, prefix) for prefix in prefixes[:_MAX_PREFIXES])
+        root = SafeTree.fromstring(data.replace(b"<robot", b"<robot" + declared, 1))
     return root
 
 

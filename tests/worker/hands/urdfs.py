@@ -9,11 +9,21 @@ def link(name: str, body: str = BOX) -> str:
     return f'<link name="{name}">{body}</link>'
 
 
-def joint(name: str, parent: str, child: str, *, kind: str = "revolute", extra: str = "", limit: str = "") -> str:
+def joint(
+    name: str,
+    parent: str,
+    child: str,
+    *,
+    kind: str = "revolute",
+    extra: str = "",
+    limit: str = "",
+    origin: str = "0 0 0.04",
+    axis: str = "0 1 0",
+) -> str:
     limit = limit or '<limit lower="0" upper="1.5" effort="1" velocity="2"/>'
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="0 0 0.04"/><axis xyz="0 1 0"/>{limit}{extra}</joint>'
+        f'<origin xyz="{origin}"/><axis xyz="{axis}"/>{limit}{extra}</joint>'
     )
 
 

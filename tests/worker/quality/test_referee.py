@@ -21,10 +21,11 @@ from tests.worker.quality.helpers import pad_hand, plate_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.objects.convex import union_volume
 from worker.quality import postures
 from worker.quality.postures import pregrasp, squeeze
 from worker.quality.referee import protocol
-from worker.quality.referee.decomposition import ConvexPieces, decompose, union_volume
+from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from worker.quality.referee.model import OBJECT_MASS, MujocoOptions, blend, build

@@ -8,24 +8,19 @@ Excess is what the pieces' union has more of volume, over the object's surface: 
 from __future__ import annotations
 
 import hashlib
-import io
-import json
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import manifold3d as m3d
 import numpy as np
 from numpy.typing import NDArray
 
 from service.model.digests import digest_json
 from service.model.errors import MeshError
 from worker.hands.primitives import triangle_areas
+from worker.objects.convex import coacd_parts, default_cache, keep_parts, load_parts, union_volume
 from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
@@ -98,12 +93,6 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     return pieces
 
 
-def default_cache() -> Path:
-    """Folder for what can be made again."""
-    home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "graspd" / "convex"
-
-
 def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
     """Where `decompose` keeps the pieces of an object; its stem is a digest of all that they follow from."""
     return _file(_Key(obj), cache or default_cache())
@@ -128,12 +117,10 @@ class _Key:
 @lru_cache(maxsize=64)
 def _load_or_make(key: _Key, cache: Path) -> ConvexPieces:
     file = _file(key, cache)
-    if file.is_file():
-        with np.load(file) as stored:
-            parts = tuple(stored[name] for name in sorted(stored.files))
-    else:
+    parts = load_parts(file) if file.is_file() else None
+    if parts is None:
         parts = _make(key.obj)
-        _store(file, parts)
+        keep_parts(file, parts)
     volume = union_volume(parts)
     return ConvexPieces(parts, volume / key.obj.volume, _excess(volume, key.obj), _digest(parts))
 
@@ -146,49 +133,18 @@ def _excess(volume: float, obj: ObjectModel) -> float:
     return (volume - obj.volume) / float(triangle_areas(obj.vertices, obj.faces).sum())
 
 
-def _store(file: Path, parts: tuple[Floats, ...]) -> None:
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_suffix(f".{os.getpid()}.tmp.npz")
-        arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
-        np.savez(partial, **arrays)
-        partial.replace(file)
-    except OSError:
-        # A folder that cannot be written only costs time.
-        return
-
-
 def _make(obj: ObjectModel) -> tuple[Floats, ...]:
     best: tuple[Floats, ...] = (obj.hull_vertices,)
     excess = _excess(union_volume(best), obj)
     for threshold in THRESHOLDS:
         if excess <= GOOD_EXCESS_M:
             break
-        parts = tuple(part for part in _coacd(obj, threshold) if _solid(part))
+        made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, TIMEOUT_S)
+        parts = tuple(part for part in made if _solid(part))
         found = _excess(union_volume(parts), obj)
         if parts and found < excess:
             best, excess = parts, found
     return best
-
-
-def _coacd(obj: ObjectModel, threshold: float) -> tuple[Floats, ...]:
-    """Pieces by CoACD. It holds the interpreter lock, so it runs in a process of its own and stops no heartbeat."""
-    given = io.BytesIO()
-    options = json.dumps({"threshold": threshold, **_COACD})
-    np.savez(given, vertices=obj.vertices, faces=obj.faces, options=np.array(options))
-    command = [sys.executable, "-m", "worker.quality.referee.coacd_child"]
-    try:
-        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=TIMEOUT_S, check=True)
-    except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
-        return ()
-    with np.load(io.BytesIO(done.stdout)) as stored:
-        return tuple(stored[name] for name in stored.files)
-
-
-def union_volume(parts: tuple[Floats, ...]) -> float:
-    """Volume of the union of the hulls of the parts [m^3]."""
-    solids = [m3d.Manifold.hull_points(np.ascontiguousarray(part * 1e3, np.float32)) for part in parts]
-    return float(m3d.Manifold.batch_boolean(solids, m3d.OpType.Add).volume()) * 1e-9 if solids else 0.0
 
 
 def _solid(part: Floats) -> bool:

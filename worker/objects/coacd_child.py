@@ -1,4 +1,4 @@
-"""CoACD in a process of its own: `python -m worker.quality.referee.coacd_child` reads an npz and writes one.
+"""CoACD in a process of its own: `python -m worker.objects.coacd_child` reads an npz and writes one.
 
 In: arrays `vertices`, `faces`, and `options` (JSON). Out: one array of corners per piece.
 """

@@ -1,0 +1,75 @@
+"""Convex pieces of a mesh by CoACD (Wei et al. 2022), in a process of its own."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import manifold3d as m3d
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def coacd_parts(
+    vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], timeout_s: float
+) -> tuple[Floats, ...]:
+    """Corners (V, 3) of each convex piece; none where CoACD fails or takes longer than `timeout_s`.
+
+    CoACD holds the interpreter lock, so it runs in a child and stops no heartbeat.
+
+    Args:
+        vertices: (V, 3) of the mesh.
+        faces: (F, 3) triangles.
+        options: arguments of `coacd.run_coacd`, the threshold among them.
+        timeout_s: wall time.
+    """
+    given = io.BytesIO()
+    np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
+    command = [sys.executable, "-m", "worker.objects.coacd_child"]
+    try:
+        done = subprocess.run(command, input=given.getvalue(), capture_output=True, timeout=timeout_s, check=True)
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired, OSError):
+        return ()
+    with np.load(io.BytesIO(done.stdout)) as stored:
+        return tuple(stored[name] for name in stored.files)
+
+
+def union_volume(parts: tuple[Floats, ...]) -> float:
+    """Volume of the union of the hulls of the parts [m^3]."""
+    solids = [m3d.Manifold.hull_points(np.ascontiguousarray(part * 1e3, np.float32)) for part in parts]
+    return float(m3d.Manifold.batch_boolean(solids, m3d.OpType.Add).volume()) * 1e-9 if solids else 0.0
+
+
+def default_cache() -> Path:
+    """Folder for what can be made again: `$XDG_CACHE_HOME/graspd/convex`."""
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "graspd" / "convex"
+
+
+def load_parts(file: Path) -> tuple[Floats, ...] | None:
+    """Parts kept in a file; None where there is none that can be read."""
+    try:
+        with np.load(file) as stored:
+            return tuple(stored[name] for name in sorted(stored.files))
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
+    """Keep parts in a file; a folder that cannot be written only costs time."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        partial = file.with_suffix(f".{os.getpid()}.tmp.npz")
+        arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
+        np.savez(partial, **arrays)
+        partial.replace(file)
+    except OSError:
+        return
