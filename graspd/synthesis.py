@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ def synthesize(
     scene: str | Path = "free",
     scenes: int = 4,
     faces: Literal["drawn", "all"] = "drawn",
+    beside: Sequence[str | Path] = (),
     want: Literal["valid", "raw"] = "valid",
     budget: float = 4.0,
     referee: Literal["letter", "certificate", "screen", "none"] = "certificate",
@@ -48,6 +49,7 @@ def synthesize(
         scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/scenes.md).
         scenes: scenes that they are shared out to.
         faces: drawn: as drops fall; all: a scene for each stable face.
+        beside: up to eight other objects, files or names, that are dropped around it.
         want: valid: that many valid grasps; raw: of any kind.
         budget: grasps tried for each one wanted, at most.
         referee: level at which MuJoCo judges; none: nobody, and grasps are sound at best.
@@ -79,8 +81,9 @@ def synthesize(
     except ValidationError as error:
         raise InputError(validation_line(error)) from None
     request = request.model_copy(update={"fidelity": chosen_fidelity(fidelity)})
+    place = parse_scene(str(scene), faces=faces, beside=[str(one) for one in beside])
     made = synthesized(
-        str(hand), str(object), request, place=parse_scene(str(scene), faces=faces), scenes=scenes,
+        str(hand), str(object), request, place=place, scenes=scenes,
         mesh=object_options(units=units, scale_to=scale_to), device=device, threads=threads,
         report=_reporter(progress, count) if progress else None,
     )  # fmt: skip

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -19,6 +20,7 @@ SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
 _FILES: Final = (".json", ".yaml", ".yml")
+MOST_NEIGHBOURS: Final = 8
 #: A scene is no larger than this [m].
 FARTHEST_M: Final = 10.0
 #: Largest scene file [bytes].
@@ -66,6 +68,21 @@ class Box(_Part):
         return self
 
 
+class NeighbourSpec(_Part):
+    """Another object in the scene."""
+
+    object: str = Field(min_length=1, max_length=1024)
+    """A built-in object, or a mesh; in a scene file a relative path starts at the file's folder."""
+    pose: Pose | None = None
+    """Its frame in the scene; None: it is dropped around the target."""
+
+    @model_validator(mode="after")
+    def _turned(self) -> Self:
+        if self.pose is not None:
+            _check_quaternion(self.pose)
+        return self
+
+
 Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
@@ -108,8 +125,12 @@ class SceneSpec(_Part):
     faces: Literal["drawn", "all"] = "drawn"
     """drawn: resting faces come as often as drops end on them; all: one scene for each stable face."""
 
+    neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
+    """Others than the object."""
+
     @model_validator(mode="after")
     def _whole(self) -> Self:
+        self._check_neighbours()
         if self.kind == "file" and not self.supports:
             raise ValueError("a scene file needs supports: at least one half_space or box")
         if self.kind != "file" and (self.supports or self.target is not None):
@@ -121,6 +142,19 @@ class SceneSpec(_Part):
             if self.faces == "all":
                 raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
         return self
+
+    def _check_neighbours(self) -> None:
+        placed = {one.pose is not None for one in self.neighbours}
+        if not placed:
+            return
+        if self.kind not in ("table", "file"):
+            raise ValueError(f"neighbours stand on a table or in a scene file, not with scene {self.kind}")
+        if len(placed) > 1:
+            raise ValueError("give all neighbours a pose, or none: those without are dropped together")
+        if placed == {True} and self.kind != "file":
+            raise ValueError("neighbours with poses belong into a scene file")
+        if placed == {False} and (self.target is not None or self.faces == "all"):
+            raise ValueError("neighbours without a pose are dropped with the target: give all of them poses")
 
 
 def scene_of(option: str | SceneDocument, *, faces: Literal["drawn", "all"] = "drawn") -> SceneSpec:
@@ -151,11 +185,14 @@ def scene_option(text: str, *, beside: Path | None = None) -> str | dict[str, An
         return text
     is_file = Path(text).suffix.lower() in _FILES
     found = read_scene(Path(text) if beside is None else beside / text) if is_file else parse_scene(text)
+    if found.neighbours:
+        raise InputError(f"scene {text} has neighbours: jobs have none yet, `graspd synth --scene` plans with them")
     return found.model_dump(mode="json", include={"supports", "target"}, exclude_none=True)
 
 
-def parse_scene(text: str, *, faces: str = "drawn") -> SceneSpec:
-    """The scene that a user names: one of `KINDS`, or a JSON or YAML file; `faces` as in `SceneSpec`.
+def parse_scene(text: str, *, faces: str = "drawn", beside: Sequence[str] = ()) -> SceneSpec:
+    """The scene that a user names: one of `KINDS`, or a JSON or YAML file; `faces` as in `SceneSpec`, and `beside`
+    objects that are dropped around the target.
 
     Raises:
         InputError: unknown kind, unreadable file, or nonsense in it, in one line.
@@ -166,10 +203,12 @@ def parse_scene(text: str, *, faces: str = "drawn") -> SceneSpec:
     if text not in KINDS and path.suffix.lower() not in _FILES:
         raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file")
     found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
-    if faces == found.faces:
+    if faces == found.faces and not beside:
         return found
+    more = [{"object": name} for name in beside]
+    said = found.model_dump(exclude={"faces", "neighbours"})
     try:
-        return SceneSpec(**{**found.model_dump(), "faces": faces})
+        return SceneSpec(**said, faces=faces, neighbours=[*(one.model_dump() for one in found.neighbours), *more])
     except ValidationError as error:
         raise InputError(f"scene {text}: {_first(error)}") from None
 
@@ -186,9 +225,18 @@ def read_scene(path: Path) -> SceneSpec:
     if not isinstance(found, dict):
         raise InputError(f"the scene file {path} must hold one object with supports and a target")
     try:
-        return SceneSpec(**{"kind": "file", **found})
+        return _found_from(path.parent, SceneSpec(**{"kind": "file", **found}))
     except (ValidationError, TypeError) as error:
         raise InputError(f"the scene file {path} is wrong: {_first(error)}") from None
+
+
+def _found_from(folder: Path, spec: SceneSpec) -> SceneSpec:
+    """The scene with the neighbours' files as seen from here."""
+    beside = tuple(
+        one.model_copy(update={"object": str(folder / one.object)}) if (folder / one.object).is_file() else one
+        for one in spec.neighbours
+    )
+    return spec.model_copy(update={"neighbours": beside})
 
 
 def _loaded(text: str, path: Path) -> object:

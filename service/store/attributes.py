@@ -28,7 +28,6 @@ _TYPES: Final[Mapping[str, tuple[type, ...]]] = {
     "texts": (list,),
 }
 _BASE: Final = ("base",)
-_SCENES: Final = ("scene", "views")
 
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "schema": RootAttribute("text", "`graspd/base@1`, `graspd/scene@1` or `graspd/views@1`"),
@@ -69,12 +68,14 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "source": RootAttribute("text", "imported grasps: an address or a citation", _BASE),
     "licence": RootAttribute("text", "imported grasps: the terms on which they may be used", _BASE),
     "base_shard": RootAttribute(
-        "text", "the shard whose grasps were carried over, or were planned in the scenes that are shown", _SCENES
+        "text",
+        "the shard whose grasps were carried over, or were planned in the scenes that are shown",
+        ("scene", "views"),
     ),
     "scene_shard": RootAttribute("text", "the shard whose scenes are shown, or hold the grasps", ("base", "views")),
-    "neighbours": RootAttribute("texts", "names of the objects beside it", _SCENES),
-    "neighbour_digests": RootAttribute("texts", "digests of their files", _SCENES),
-    "neighbour_sources": RootAttribute("texts", "where a command of this machine read them; empty: built in", _SCENES),
+    "neighbours": RootAttribute("texts", "names of the objects beside it"),
+    "neighbour_digests": RootAttribute("texts", "digests of their files"),
+    "neighbour_sources": RootAttribute("texts", "where a command of this machine read them; empty: built in"),
 }
 
 

@@ -126,6 +126,14 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "share of drops that come to rest on the same face of the convex hull",
             optional=True,
         ),
+        "scene/neighbour_pose": Column(
+            "S M 7",
+            "f8",
+            "m, 1",
+            "scene",
+            "frames of the other objects in each scene; names in attribute neighbours",
+            optional=True,
+        ),
         "grasp/scene_index": Column("N", "i4", "1", "none", "row of the grasp's scene in /scene", optional=True),
         "grasp/approach": Column(
             "N W 7",
@@ -145,7 +153,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "enum",
             "none",
             "lift test: 0 not tried, 1 lifted, 2 penetration, 3 touched on the way, 4 lost while closing, 5 not lifted,"
-            " 6 turned, 7 diverged",
+            " 6 turned, 7 diverged, 8 neighbour moved",
             optional=True,
         ),
         "quality/lift_hard": Column(

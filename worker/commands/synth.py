@@ -62,6 +62,9 @@ def synth(
     ] = "free",
     scenes: Annotated[int, typer.Option(help="Scenes that the grasps are shared out to.", min=1, max=4096)] = 4,
     faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
+    with_: Annotated[
+        list[str] | None, typer.Option("--with", help="Another object on the table: file or built-in; up to eight.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Make grasps of one hand on one object as a job does, judged and measured, into an HDF5 file.
@@ -79,8 +82,8 @@ def synth(
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
     with _bar(grasps, quiet=json) as report:
         made = synthesized(
-            hand, object_, request, place=parse_scene(scene, faces=faces), scenes=scenes, mesh=mesh, device=device,
-            threads=threads, report=report,
+            hand, object_, request, place=parse_scene(scene, faces=faces, beside=with_ or []), scenes=scenes, mesh=mesh,
+            device=device, threads=threads, report=report,
         )  # fmt: skip
     out.write_bytes(write_shard("base", made.arrays, made.attributes))
     found = {"file": str(out), **made.summary()}

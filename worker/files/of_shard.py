@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Final
@@ -13,12 +14,14 @@ import numpy as np
 from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError
 from service.readers.ways import scene_spec_of
+from service.store.attributes import Attribute
 from service.store.shards import Shard
 from worker.files.origin import Found, Sought, at, find, options_of
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object, object_from_path
+from worker.scenes.beside import neighbour_of
 from worker.scenes.kinds import supports_of
 from worker.scenes.neighbours import Neighbours
 from worker.simulation.surroundings import Placed, Scenes
@@ -111,6 +114,17 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
     return Neighbours(objects, np.asarray(shard["scene/neighbour_pose"], float))
 
 
+def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> dict[str, Attribute]:
+    """What a shard says of the objects beside its own, given as files or names; nothing if there are none."""
+    if not others:
+        return {}
+    return {
+        "neighbours": [other.name for other in others],
+        "neighbour_digests": [other.digest for other in others],
+        "neighbour_sources": [str(Path(name).resolve()) if Path(name).is_file() else "" for name in given],
+    }
+
+
 def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
     folder = None if shard.path is None else shard.path.resolve().parent
     wanted = Sought(AssetKind.OBJECT, name, digest, source, folder=folder)
@@ -127,8 +141,11 @@ def placed_of_shard(shard: Shard) -> Placed | None:
         return None
     if (spec := scene_spec_of(shard)) is None:
         raise InputError("the shard has grasps in scenes, but its attribute scene does not say which")
-    poses = np.asarray(shard["scene/object_pose"], float)
-    return Scenes(supports_of(spec), poses).placed(np.asarray(shard["grasp/scene_index"], np.intp))
+    scenes = Scenes(supports_of(spec), np.asarray(shard["scene/object_pose"], float))
+    if (beside := neighbours_of_shard(shard, [])) is not None:
+        neighbours = tuple(neighbour_of(other) for other in beside.objects)
+        scenes = replace(scenes, neighbours=neighbours, neighbour_pose=beside.poses)
+    return scenes.placed(np.asarray(shard["grasp/scene_index"], np.intp))
 
 
 def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from service.store.shards import json_attribute
 from worker.certified import Certified, certified_grasps, joined_columns
 from worker.engines.devices import Device
 from worker.files.base_attributes import base_attributes
+from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M, beside_attributes
 from worker.files.origin import remembered
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -25,13 +26,14 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
 from worker.run import Progress, Run
-from worker.scenes.kinds import rest_poses, supports_of
-from worker.simulation.surroundings import Scenes
+from worker.scenes.beside import scenes_of
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].
 _TOLD_M: Final = 0.005
 FREE: Final = SceneSpec()
+#: Columns of the scenes that a shard has.
+_KEPT: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
 
 
 @dataclass(frozen=True)
@@ -123,8 +125,10 @@ def synthesized(
     thing = object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options)
     chosen = Device(device).resolve()
     began = time.perf_counter()
-    poses = rest_poses(place, thing, count=scenes, seed=request.seed) if place.kind != "free" else {}
-    where = Scenes(supports_of(place), poses["scene/object_pose"]) if poses else None
+    others = [object_from_path(one.object, face_error_m=NEIGHBOUR_FACE_ERROR_M) for one in place.neighbours]
+    where, poses = None, dict[str, Any]()
+    if place.kind != "free":
+        where, poses = scenes_of(place, thing, others, count=scenes, seed=request.seed)
     sizes = [(first, min(BATCH_SIZE, request.grasps - first)) for first in range(0, request.grasps, BATCH_SIZE)]
     alone = Run(chosen, threads) if cancelled is None else Run(chosen, threads, cancelled=cancelled)
     batches = [
@@ -136,11 +140,20 @@ def synthesized(
     ]  # fmt: skip
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
-    arrays |= {name: poses[name] for name in ("scene/object_pose", "scene/rest_probability") if name in poses}
+    arrays |= {name: poses[name] for name in _KEPT if name in poses}
     attributes = _attributes(model, thing, request, batches, chosen, seconds) | remembered(hand, obj, options)
     if poses:
-        attributes["scene"] = json_attribute(place.model_dump(mode="json"))
+        attributes["scene"] = json_attribute(_as_stored(place, others))
+        attributes |= beside_attributes(others, [one.object for one in place.neighbours])
     return Synthesized(arrays, attributes, batches, request, place, seconds)
+
+
+def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:
+    """The scene as a shard tells it: neighbours by their names, not by files of this machine."""
+    said = place.model_dump(mode="json")
+    for one, other in zip(said["neighbours"], others, strict=True):
+        one["object"] = other.name
+    return said
 
 
 def chosen_fidelity(name: str, contact_solver: str = "") -> Fidelity:

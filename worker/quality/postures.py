@@ -19,7 +19,7 @@ from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, balanced
-from worker.simulation.obstacles import feature_distances
+from worker.simulation.obstacles import body_distances
 from worker.simulation.surroundings import Placed
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
@@ -272,14 +272,14 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
 def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
     """(B, fingers) least distance of each finger from the obstacles of its scene on paths (B, K, D); inf: no finger."""
     count, steps, _ = paths.shape
-    finger = finger_of_body(hand)[hand.features.body]
+    finger = finger_of_body(hand)
     out = np.full((count, max(1, len(hand.fingertips))), np.inf)
     for number, scene in enumerate(placed.scenes):
         rows = np.flatnonzero(placed.index == number)
         if not len(rows):
             continue
         joints = hand.expand(paths[rows]).reshape(len(rows) * steps, -1)
-        found = feature_distances(hand, Posture(np.repeat(hand_pose[rows], steps, axis=0), joints), scene)
+        found = body_distances(hand, Posture(np.repeat(hand_pose[rows], steps, axis=0), joints), scene)
         found = found.reshape(len(rows), steps, -1).min(axis=1)
         for f in np.unique(finger[finger >= 0]):
             out[rows, f] = found[:, finger == f].min(axis=1)

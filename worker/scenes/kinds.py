@@ -60,7 +60,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
     if spec.kind in ("bin", "shelf"):
         size = BIN_SIZE if spec.kind == "bin" else SHELF_SIZE[::-1]
         poses = np.array([_inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)])
-    _check_free(obj, poses, supports)
+    check_free(obj, poses, supports)
     return {**found, "scene/object_pose": poses}
 
 
@@ -105,13 +105,18 @@ def _inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.r
     return np.concatenate([rng.uniform(-room - low, room - high), pose[2:]])
 
 
-def _check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
+def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
+    """Refuses poses (S, 7) in which an object stands deeper in a support than rounding brings it.
+
+    Raises:
+        InputError: it does.
+    """
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
         for number, support in enumerate(supports):
             depth = -float(support.distance(corners).min())
             if depth > SUNK:
                 raise SceneError(
-                    f"{obj.name} stands {1e3 * depth:.1f} mm deep in support {number} of its scene; move the target or "
-                    "the support"
+                    f"{obj.name} stands {1e3 * depth:.1f} mm deep in support {number} of its scene; move it or the "
+                    "support"
                 )

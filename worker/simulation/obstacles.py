@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.transforms import quat_rotate
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import obstacles as kernels
+from worker.simulation.kernels import solids as solid_kernels
 from worker.simulation.surroundings import Obstacle, Surroundings
 
 Floats = NDArray[np.float64]
 
 #: Distance that a hand keeps from obstacles [m]: twice what a scene's certificate asks, for the way is swept in steps.
 MARGIN_M: Final = 0.004
-_ENDLESS: Final = 1e9
+#: Distances from solids are not told apart beyond this [m].
+FAR_M: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -54,21 +59,57 @@ class PosedFeatures:
         return np.asarray((self.centre @ normal.T - offset - reach).max(axis=-1))
 
 
-def feature_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
-    """(P, F) signed distance of each of the hand's features from the nearest obstacle [m]; inf where there is none.
+def body_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+    """(P, L) signed distance of each of the hand's bodies from the nearest obstacle [m]; inf where there is none.
 
-    Against half-spaces it is exact, beyond the edges of others a lower bound.
+    Against half-spaces it is exact, and against solids that the hand is apart from, but for links that are hulls near
+    an edge or a corner: there it is a lower bound. Farther than `FAR_M` from a solid counts as that.
     """
     posed = PosedFeatures.of(hand, postures)
-    least = np.full(posed.centre.shape[:2], np.inf)
+    least = np.full((len(posed.centre), len(hand.features)), np.inf)
     for obstacle in scene.obstacles:
-        least = np.minimum(least, posed.distance(obstacle))
-    return least
+        if not len(obstacle.corners):
+            least = np.minimum(least, posed.distance(obstacle))
+    out = np.full((len(least), hand.bodies), np.inf)
+    for body in np.unique(hand.features.body):
+        out[:, body] = least[:, hand.features.body == body].min(axis=1)
+    solids = tuple(o for o in scene.obstacles if len(o.corners))
+    return np.minimum(out, _solid_distances(hand, postures, Surroundings(solids, scene.up))) if solids else out
+
+
+def _solid_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+    """(P, L) as `body_distances`, in float32: coordinates of 0.3 m are known to 3e-8."""
+    bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
+    device = _device_hand(hand)
+    obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
+    with wp.ScopedDevice("cpu"):
+        position: Any = wp.array(bodies[..., :3], dtype=wp.vec3)
+        rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
+        least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
+        wp.launch(
+            solid_kernels.distances, (len(bodies), len(hand.pieces)),
+            inputs=[obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M],
+            outputs=[least], device="cpu",
+        )  # fmt: skip
+    return least.numpy().astype(float)
+
+
+_hands: LRUCache[str, DeviceHand] = LRUCache(8)
+_lock = threading.Lock()
+
+
+def _device_hand(hand: HandModel) -> DeviceHand:
+    with _lock:
+        if (found := _hands.get(hand.content)) is None:
+            # Loading here keeps threads from compiling the same module at once.
+            wp.load_module(module=solid_kernels, device="cpu")
+            found = _hands[hand.content] = DeviceHand.create(hand, "cpu")
+        return found
 
 
 def obstacle_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
-    """(P,) least of the `feature_distances` of each posture [m]."""
-    return np.asarray(feature_distances(hand, postures, scene).min(axis=1))
+    """(P,) least of the `body_distances` of each posture [m]."""
+    return np.asarray(body_distances(hand, postures, scene).min(axis=1))
 
 
 @dataclass(frozen=True)
@@ -79,6 +120,8 @@ class DeviceObstacles:
     solids: Any
     count: int
     """Features."""
+    any_solid: bool
+    """Whether an obstacle is no half-space."""
 
     @classmethod
     def create(
@@ -101,7 +144,9 @@ class DeviceObstacles:
         """
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
-        obstacles = [o for scene in scenes for o in scene.obstacles]
+        sorted_ = [sorted(scene.obstacles, key=lambda o: len(o.corners) > 0) for scene in scenes]
+        endless = [sum(not len(o.corners) for o in one) for one in sorted_]
+        obstacles = [o for one in sorted_ for o in one]
         planes = np.concatenate([np.zeros((0, 4)), *(o.planes for o in obstacles)])
         planes[:, 3] -= planes[:, :3] @ centre
         with wp.ScopedDevice(device):
@@ -112,14 +157,24 @@ class DeviceObstacles:
             features.radius = wp.array(found.radius, dtype=wp.float32)
             features.margin = wp.array(kept, dtype=wp.float32)
             features.weight = wp.ones(len(found), dtype=wp.float32)
+            features.first = wp.array(found.first, dtype=wp.int32)
+            features.first_edge = wp.array(found.first_edge, dtype=wp.int32)
+            features.start = wp.array(found.edges[:, 0], dtype=wp.vec3)
+            features.end = wp.array(found.edges[:, 1], dtype=wp.vec3)
+            features.thickness = wp.array(found.thickness, dtype=wp.float32)
             solids = kernels.Obstacles()
-            solids.first = wp.array(_starts([len(s.obstacles) for s in scenes]), dtype=wp.int32)
+            first = _starts([len(one) for one in sorted_])
+            solids.first = wp.array(first, dtype=wp.int32)
+            solids.first_solid = wp.array(first[:-1] + np.array(endless, np.int32), dtype=wp.int32)
             solids.first_plane = wp.array(_starts([len(o.planes) for o in obstacles]), dtype=wp.int32)
             solids.planes = wp.array(planes, dtype=wp.vec4)
             spheres = [_sphere(o.corners - centre) for o in obstacles]
             solids.centre = wp.array(np.array([s[0] for s in spheres]).reshape(-1, 3), dtype=wp.vec3)
             solids.radius = wp.array(np.array([s[1] for s in spheres]), dtype=wp.float32)
-        return cls(features, solids, len(found))
+            edges = np.concatenate([np.zeros((0, 2, 3)), *(o.corners[o.edges] for o in obstacles)]) - centre
+            solids.first_edge = wp.array(_starts([len(o.edges) for o in obstacles]), dtype=wp.int32)
+            solids.start, solids.end = (wp.array(edges[:, k], dtype=wp.vec3) for k in (0, 1))
+        return cls(features, solids, len(found), any(len(o.corners) for o in obstacles))
 
 
 def _starts(lengths: Sequence[int]) -> NDArray[np.int32]:
@@ -127,8 +182,8 @@ def _starts(lengths: Sequence[int]) -> NDArray[np.int32]:
 
 
 def _sphere(corners: Floats) -> tuple[Floats, float]:
-    """A bounding sphere; of a body without corners, one without end."""
+    """A bounding sphere; of a body without end none is asked for."""
     if not len(corners):
-        return np.zeros(3), _ENDLESS
+        return np.zeros(3), 0.0
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return centre, float(np.linalg.norm(corners - centre, axis=1).max())

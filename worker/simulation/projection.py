@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.transforms import quat_from_axis_angle, quat_multiply
 from worker.simulation.data import Data
-from worker.simulation.kernels import obstacles
+from worker.simulation.kernels import obstacles, solids
 from worker.simulation.kernels import projection as kernels
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
@@ -141,6 +141,13 @@ class Projection:
                 obstacles.residuals, (d.capacity, m.obstacles.count),
                 inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, *pose, o.obstacle_near,
                         o.obstacle_target],
+                outputs=[r], device=m.device,
+            )  # fmt: skip
+        if m.obstacles is not None and m.obstacles.any_solid:
+            wp.launch(
+                solids.residuals, (d.capacity, m.pieces),
+                inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, *pose,
+                        o.obstacle_near, o.obstacle_target],
                 outputs=[r], device=m.device,
             )  # fmt: skip
         wp.launch(

@@ -10,7 +10,7 @@ from typing import Final
 
 from service.model.errors import InputError
 from worker.simulation.data import Data
-from worker.simulation.kernels import kinematics, obstacles, optimizers, penalties, pieces, surface
+from worker.simulation.kernels import kinematics, obstacles, optimizers, penalties, pieces, solids, surface
 from worker.simulation.launches import Launches
 from worker.simulation.model import REFERENCE_SAMPLES, SOLVERS, Model
 
@@ -107,6 +107,13 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
             obstacles.penalty, (d.capacity, m.obstacles.count),
             inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, d.iteration, d.schedule.penetration,
                     d.body_p, d.body_q, room],
+            outputs=[*wrench, d.depths.obstacles],
+        )  # fmt: skip
+    if m.obstacles is not None and m.obstacles.any_solid:
+        out.add(
+            solids.penalty, (d.capacity, m.pieces),
+            inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, d.iteration,
+                    d.schedule.penetration, d.body_p, d.body_q, room],
             outputs=[*wrench, d.depths.obstacles],
         )  # fmt: skip
 

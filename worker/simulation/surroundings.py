@@ -7,7 +7,7 @@ many as their hulls have faces. Frames: the object's, as everywhere in planning.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import invert, quat_conjugate, quat_rotate, quat_to_matrix
+from service.model.transforms import compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
+from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +35,8 @@ class Obstacle:
     """(K, 4) outward unit normal and offset [m]."""
     corners: Floats
     """(V, 3) corners [m]; none where the body has no end, as a half-space."""
+    edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
+    """(E, 2) corners that an edge joins."""
 
     def __post_init__(self) -> None:
         if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
@@ -68,13 +71,14 @@ class Obstacle:
         normals = np.concatenate([R.T, -R.T])
         planes = np.column_stack([normals, normals @ pose[:3] + np.concatenate([half, half])])
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), float).reshape(3, -1).T
-        return cls(planes, pose[:3] + (signs * half) @ R.T)
+        edges = np.array([(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+        return cls(planes, pose[:3] + (signs * half) @ R.T, edges)
 
     def moved(self, pose: Floats) -> Obstacle:
         """The obstacle carried along by `pose` (7,): its frame's coordinates in the outer frame."""
         normals = quat_rotate(pose[3:], self.planes[:, :3])
         planes = np.column_stack([normals, self.planes[:, 3] + normals @ pose[:3]])
-        return Obstacle(planes, quat_rotate(pose[3:], self.corners) + pose[:3])
+        return Obstacle(planes, quat_rotate(pose[3:], self.corners) + pose[:3], self.edges)
 
     def seen_from(self, pose: Floats) -> Obstacle:
         """The obstacle, given in an outer frame, in the frame that stands at `pose` (7,) in it."""
@@ -95,22 +99,39 @@ class Surroundings:
 
 
 @dataclass(frozen=True)
+class Neighbour:
+    """Another object in a scene, as convex pieces in its own frame."""
+
+    obj: ObjectModel
+    pieces: tuple[Floats, ...]
+    """Corners (V, 3) of each piece: what the referee simulates."""
+    solids: tuple[Obstacle, ...]
+    """The same pieces, or a little more, with few faces: what a hand stays clear of."""
+    error_m: float
+    """Farthest that a solid stands out from its piece [m]."""
+
+
+@dataclass(frozen=True)
 class Scenes:
-    """S scenes of one object that have the same supports."""
+    """S scenes of one object that have the same supports and neighbours."""
 
     supports: tuple[Obstacle, ...]
     """Tables, boards and walls in the scene frame, z up."""
     object_pose: Floats
     """(S, 7) of the object in the scene frame."""
+    neighbours: tuple[Neighbour, ...] = ()
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
+    """(S, M, 7) of the neighbours in the scene frame."""
 
     def placed(self, index: NDArray[np.intp]) -> Placed:
         """Grasps in these scenes, by the number of the scene (N,)."""
-        return Placed(self.supports, self.object_pose, np.asarray(index, np.intp))
+        index = np.asarray(index, np.intp)
+        return Placed(self.supports, self.object_pose, index, self.neighbours, self.neighbour_pose)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """N grasps, each in one of S scenes that have the same supports."""
+    """N grasps, each in one of S scenes that have the same supports and neighbours."""
 
     supports: tuple[Obstacle, ...]
     """Tables, boards and walls in the scene frame, z up."""
@@ -118,15 +139,40 @@ class Placed:
     """(S, 7) of the object in the scene frame."""
     index: NDArray[np.intp]
     """(N,) scene of each grasp."""
+    neighbours: tuple[Neighbour, ...] = ()
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
+    """(S, M, 7) of the neighbours in the scene frame."""
 
     @cached_property
     def scenes(self) -> tuple[Surroundings, ...]:
         """The S scenes, seen from the object."""
         return tuple(
-            Surroundings(tuple(o.seen_from(pose) for o in self.supports), quat_rotate(quat_conjugate(pose[3:]), UP))
-            for pose in np.asarray(self.object_pose, float)
+            Surroundings(
+                tuple(o.seen_from(pose) for o in self.supports) + self._beside(number),
+                quat_rotate(quat_conjugate(pose[3:]), UP),
+            )
+            for number, pose in enumerate(np.asarray(self.object_pose, float))
+        )
+
+    @property
+    def everywhere(self) -> Scenes:
+        """The scenes, without the grasps."""
+        return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
+
+    def neighbours_of(self, scene: int) -> Floats:
+        """(M, 7) poses of the neighbours in the object frame."""
+        if not self.neighbours:
+            return np.zeros((0, 7))
+        return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
+
+    def _beside(self, scene: int) -> tuple[Obstacle, ...]:
+        poses = self.neighbours_of(scene)
+        return tuple(
+            solid.moved(pose) for one, pose in zip(self.neighbours, poses, strict=True) for solid in one.solids
         )
 
     def take(self, rows: NDArray[np.intp] | slice) -> Placed:
         """Some of the grasps, in the order of `rows`."""
-        return Placed(self.supports, self.object_pose, self.index[rows])
+        taken = replace(self, index=self.index[rows])
+        vars(taken)["scenes"] = self.scenes  # they are the same: not to be made anew
+        return taken

@@ -86,3 +86,27 @@ def test_a_free_object_has_no_faces_to_choose() -> None:
         SceneSpec(kind="free", faces="all")
     with pytest.raises(InputError, match="free"):
         parse_scene("free", faces="all")
+
+
+@pytest.mark.parametrize(
+    ("beside", "reason"),
+    [
+        ([{"object": "mug", "pose": [0, 0, 0, 1, 0, 0, 0]}] * 9, "neighbours"),
+        ([{"object": ""}], "object"),
+        ([{"object": "mug", "pose": [0, 0, 0, 2, 0, 0, 0]}], "unit length"),
+        ([{"object": "mug"}, {"object": "mug", "pose": [0, 0, 0, 1, 0, 0, 0]}], "all neighbours a pose, or none"),
+    ],
+)
+def test_nonsense_about_neighbours_is_told_in_one_line(tmp_path: Path, beside: list, reason: str) -> None:
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps({**TABLE, "neighbours": beside}))
+    with pytest.raises(InputError, match=reason) as error:
+        parse_scene(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_a_neighbours_mesh_is_found_beside_the_scene_file(tmp_path: Path) -> None:
+    (tmp_path / "cup.stl").write_bytes(b"")
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps({**TABLE, "neighbours": [{"object": "cup.stl"}, {"object": "mug"}]}))
+    assert [one.object for one in parse_scene(str(path)).neighbours] == [str(tmp_path / "cup.stl"), "mug"]

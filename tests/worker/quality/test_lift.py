@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import quat_multiply, quat_rotate
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 from worker.grasps import GraspSet, Posture
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
 from worker.quality.referee.model import MujocoOptions, build
-from worker.simulation.surroundings import Obstacle, Placed
+from worker.simulation.surroundings import Neighbour, Obstacle, Placed
 
 HALF, HEIGHT = 0.03, 0.05
 HAND = pad_hand()
@@ -114,3 +114,45 @@ def test_a_box_whose_mesh_has_its_origin_elsewhere_stands_still_and_is_lifted_al
     test._run(1.0)
     moved, turned = test._motion()
     assert moved < 5e-4 and turned < 1e-3
+
+
+def beside(place: tuple[float, float], size: tuple[float, float, float]) -> Lift:
+    """The test with a neighbour that stands on the table at `place`, as seen from the box's middle."""
+    other = object_from_mesh(trimesh.creation.box(size))
+    neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
+    pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
+    placed = dataclasses.replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
+    return Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports, placed.neighbours), placed)
+
+
+def test_a_neighbour_that_stands_aside_changes_nothing() -> None:
+    trial = beside((0.0, 0.3), (0.05, 0.05, 0.1)).lift(grasp(0.05), 0)
+    assert trial.outcome is LiftOutcome.LIFTED
+    assert trial.margin == pytest.approx(lift_test().lift(grasp(0.05), 0).margin, abs=0.02)
+
+
+def test_a_hand_that_comes_through_a_neighbour_has_touched_it() -> None:
+    coming = grasp(0.05, np.array([0, 1.0, 0]))
+    size = (0.2, 0.02, 0.2)
+    assert beside((0.0, -0.09), size).lift(coming, 0).outcome is LiftOutcome.TOUCHED_ON_THE_WAY
+    assert beside((0.0, 0.09), size).lift(coming, 0).outcome is LiftOutcome.LIFTED
+
+
+def test_a_neighbour_that_leans_has_toppled() -> None:
+    test = beside((0.0, 0.3), (0.05, 0.05, 0.1))
+    test._begin(grasp(0.05), 0)
+    free = test.scene.neighbours[0]
+    turned = np.array([np.cos(np.radians(8)), np.sin(np.radians(8)), 0, 0])
+    test.data.qpos[free.qpos + 3 : free.qpos + 7] = quat_multiply(test._beside[0][3:], turned)
+    assert test._neighbours_moved()
+
+
+def test_a_neighbour_may_turn_where_it_stands() -> None:
+    test = beside((0.0, 0.3), (0.05, 0.05, 0.1))
+    test._begin(grasp(0.05), 0)
+    free = test.scene.neighbours[0]
+    about = np.array([np.cos(0.5), 0, 0, np.sin(0.5)])
+    test.data.qpos[free.qpos + 3 : free.qpos + 7] = quat_multiply(test._beside[0][3:], about)
+    assert not test._neighbours_moved()
+    test.data.qpos[free.qpos] += 0.021
+    assert test._neighbours_moved()

@@ -7,26 +7,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.transforms import quat_rotate
+from service.model.transforms import compose, quat_rotate
 from tests.worker.simulation.rigs import ball, rig, still
+from tests.worker.simulation.solids import nearest_edges
 from tests.worker.simulation.test_penalties import RELATIVE, bodies_of, differences
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.simulation.data import Data
 from worker.simulation.model import LossOptions, Model
 from worker.simulation.obstacles import DeviceObstacles
+from worker.simulation.outer import outer_solid
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.record import record_evaluation, record_placement
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Surroundings
 
 MARGIN = 0.004
+BALL = np.random.default_rng(5).normal(size=(300, 3))
+BALL = 0.04 * BALL / np.linalg.norm(BALL, axis=1, keepdims=True) + [0.33, 0.02, 0.02]
 SCENES = {
     "table": (Obstacle.half_space([0.1, -0.2, 1.0], -0.02),),
     "corner of two walls": (
         Obstacle.half_space([0, 0, 1], -0.03),
         Obstacle.box([0.327, 0.013, 0.011, 0.9, 0.1, 0.2, 0.3], [0.11, 0.6, 0.4]),
     ),
+    "a stick and a board": (
+        Obstacle.box([0.30, 0.02, 0.02, 0.9, 0.1, 0.2, 0.3], [0.012, 0.3, 0.011]),
+        Obstacle.box([0.33, 0.03, 0.05, 0.6, 0.5, -0.2, 0.3], [0.4, 0.5, 0.006]),
+    ),
+    "a round neighbour": (outer_solid(BALL)[0],),
 }
 
 
@@ -59,14 +68,24 @@ def reaching(hand: HandModel) -> HandState:
     return HandState(np.array([[0.3, 0.02, 0.0]]), (rotation / np.linalg.norm(rotation))[None], q[None])
 
 
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    [
+        *((name, "table") for name in ("allegro", "barrett", "shadow")),
+        ("allegro", "corner of two walls"),
+        ("shadow", "corner of two walls"),
+        ("allegro", "a stick and a board"),
+        ("shadow", "a round neighbour"),
+    ],
+)
 def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) -> None:
     hand, obstacles = hand_from_path(name), SCENES[scene]
     state = reaching(hand)
 
     def energy(at: HandState) -> float:
         short = [np.minimum(distances(hand, at, o) - MARGIN, 0.0) for o in obstacles]
+        solids = [o for o in obstacles if len(o.corners)]
+        short += [nearest_edges(hand, bodies_of(hand, at), o, MARGIN) - MARGIN for o in solids]
         return float(sum((s**2).sum() for s in short))
 
     model, data = simulation_in(hand, obstacles)
@@ -110,3 +129,25 @@ def test_a_hand_without_a_scene_feels_no_obstacle() -> None:
     data.set_state(reaching(hand))
     record_placement(model, data).run()
     assert data.depths.obstacles.numpy()[0] == 0.0
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_the_projection_brings_a_hand_out_of_a_stick_between_its_corners(name: str) -> None:
+    """The stick is pushed into the largest face of the palm: no corner of the hand is near it."""
+    hand = hand_from_path(name)
+    state = reaching(hand)
+    bodies = bodies_of(hand, state)
+    palm = max((p for p in hand.pieces if p.kind == "box"), key=lambda p: sorted(p.size)[1])
+    frame = compose(bodies[palm.body], palm.pose)
+    thin = int(np.argmin(palm.size))
+    middle = np.zeros(3)
+    middle[thin] = 0.5 * palm.size[thin] + 0.004
+    size = np.full(3, 0.01)
+    size[(thin + 1) % 3] = 0.5
+    pose = compose(frame, np.concatenate([middle, [np.cos(0.2), *(np.sin(0.2) * np.eye(3)[thin])]]))
+    stick = Obstacle.box(pose, size)
+    assert nearest_edges(hand, bodies, stick, MARGIN).min() < -5e-4
+    model, data = simulation_in(hand, (stick,))
+    found, _ = Projection(model, data, ProjectionOptions()).run(state, 60)
+    posed = bodies_of(hand, found)
+    assert min(nearest_edges(hand, posed, stick, 0.1).min(), distances(hand, found, stick).min()) > MARGIN - 1e-4

@@ -18,7 +18,6 @@ from worker.files.exchange.imported import Imported, Origin, plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
 from worker.run import ALONE, Run
-from worker.simulation.surroundings import Scenes
 
 
 def write_scored(
@@ -55,7 +54,7 @@ def write_scored(
         )  # fmt: skip
     except ValueError:
         raise InputError(f"unknown level {referee!r}; choose letter, certificate, screen or none") from None
-    scenes = None if found.placed is None else Scenes(found.placed.supports, found.placed.object_pose)
+    scenes = None if found.placed is None else found.placed.everywhere
     made = scored(found.hand, found.obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")

@@ -71,5 +71,5 @@ def _build(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
         for i, piece in enumerate(hand.pieces):
             if piece.body == b:
                 add_shape(spec, body.add_geom(friction=friction, name=f"hand{i}"), piece, f"hand{i}")
-    add_object(spec, obj, pieces, friction, MASS)
+    add_object(spec, obj, pieces.vertices, friction, MASS)
     return spec.compile()

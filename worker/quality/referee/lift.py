@@ -3,6 +3,7 @@
 letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
 lift: the hand comes from its standoff and must touch nothing on the way; after the lift it holds for 2 s, cut short as
 the certificate's pushes are.
+Neighbours stand on the table as free bodies; at level lift they must not be moved 2 cm, nor toppled.
 The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
 """
 
@@ -17,12 +18,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.transforms import invert, slerp
+from service.model.transforms import invert, quat_conjugate, quat_rotate, slerp
 from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet, Posture
-from worker.quality.referee.model import Scene, blend
+from worker.quality.referee.model import OBJECT_MASS, Scene, blend
 from worker.quality.referee.protocol import (
     MAX_PENETRATION_M,
+    MAX_ROTATION,
     PUSH,
     STAGE_S,
     STAGES,
@@ -34,6 +36,9 @@ from worker.simulation.surroundings import RISE_M, Placed
 
 Floats = NDArray[np.float64]
 
+#: A neighbour may be moved by this [m], and tilted by this [rad]: more is toppled. It may turn about the vertical.
+NEIGHBOUR_MOVED_M: Final = 0.02
+NEIGHBOUR_TILTED: Final = MAX_ROTATION
 #: Postures looked at between two waypoints of an approach.
 LOOKS: Final = 4
 #: The open hand may be this deep in the object's convex pieces on its way [m]: they stand out from its surface, where
@@ -52,6 +57,7 @@ class LiftOutcome(IntEnum):
     NOT_LIFTED = 5
     TURNED = 6
     DIVERGED = 7
+    NEIGHBOUR_MOVED = 8
 
 
 @dataclass
@@ -75,6 +81,7 @@ class Lift(Test):
         super().__init__(scene)
         self.placed = placed
         self._goal = np.zeros(3)
+        self._beside = placed.neighbours_of(0)
 
     def letter(self, grasps: GraspSet, row: int) -> LiftTrial:  # type: ignore[override]
         """As published: success is read once, when the root has risen."""
@@ -100,13 +107,17 @@ class Lift(Test):
         outcome = self._judge(inner)
         if outcome is Outcome.HELD:
             outcome = self._hold(inner)
-        return self._ended(trial, outcome)
+        trial = self._ended(trial, outcome)
+        if trial.success and self._neighbours_moved():
+            trial.outcome = LiftOutcome.NEIGHBOUR_MOVED
+        return trial
 
     def _begin(self, grasps: GraspSet, row: int) -> LiftTrial:
         """The scene as this grasp has it; the object at rest; gravity on the object alone, as published."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
+        self._beside = self.placed.neighbours_of(number)
         self._goal = np.zeros(3)
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
@@ -119,6 +130,20 @@ class Lift(Test):
         self.scene.place(self.data, hand_pose, joints)
         self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
         self.data.xfrc_applied[self.scene.object_body, :3] = -PUSH * self._up
+        for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
+            centre = pose[:3] + quat_rotate(pose[3:], free.centre)
+            self.data.qpos[free.qpos : free.qpos + 7] = [*centre, *pose[3:]]
+            self.data.xfrc_applied[free.body, :3] = -PUSH / OBJECT_MASS * free.mass * self._up
+
+    def _neighbours_moved(self) -> bool:
+        """Whether a neighbour is not where it stood, or has toppled."""
+        for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
+            now = self.data.qpos[free.qpos : free.qpos + 7]
+            moved = float(np.linalg.norm(now[:3] - pose[:3] - quat_rotate(pose[3:], free.centre)))
+            standing = quat_rotate(now[3:], quat_rotate(quat_conjugate(pose[3:]), self._up))
+            if moved > NEIGHBOUR_MOVED_M or float(standing @ self._up) < np.cos(NEIGHBOUR_TILTED):
+                return True
+        return False
 
     def _depths_here(self) -> tuple[float, float]:
         """Deepest penetration of the hand into the object, and into itself or a support [m]."""

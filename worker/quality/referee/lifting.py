@@ -23,7 +23,7 @@ from worker.quality.referee import lift as protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
-from worker.quality.referee.model import MujocoOptions, build
+from worker.quality.referee.model import DENSITY, MujocoOptions, build
 from worker.run import ALONE, Run
 from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed
@@ -94,7 +94,7 @@ def judge_lifts(
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
-    scene = build(hand, obj, pieces, physics, placed.supports)
+    scene = build(hand, obj, pieces, physics, placed.supports, placed.neighbours)
     tests: queue.SimpleQueue[Lift] = queue.SimpleQueue()
     workers = max(1, min(run.cores, len(grasps)))
     for _ in range(workers):
@@ -135,4 +135,8 @@ def lift_key(
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}
     physics = asdict(MujocoOptions().hardened() if hard else MujocoOptions())
-    return digest_json([REVISION, pushes, level, physics, digest_bytes(supports), constants])
+    terms = [REVISION, pushes, level, physics, digest_bytes(supports), constants]
+    if placed.neighbours:
+        corners = b"".join(np.round(piece, 9).tobytes() for one in placed.neighbours for piece in one.pieces)
+        terms += [digest_bytes(corners), [DENSITY, protocol.NEIGHBOUR_MOVED_M, protocol.NEIGHBOUR_TILTED]]
+    return digest_json(terms)

@@ -16,11 +16,13 @@ from worker.grasps import Posture
 from worker.hands.model import ConvexPiece, HandModel, JointType
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.simulation.surroundings import Obstacle
+from worker.simulation.surroundings import Neighbour, Obstacle
 
 Floats = NDArray[np.float64]
 
 OBJECT_MASS: Final = 0.1
+#: Of neighbours [kg/m^3].
+DENSITY: Final = 500.0
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (0.6, 0.02)
 HARD: Final = (0.5, 0.1)
@@ -62,6 +64,17 @@ COARSE: Final = MujocoOptions(timestep=0.006, root="fixed")
 
 
 @dataclass(frozen=True)
+class FreeBody:
+    """Where a neighbour is in a compiled model; its body's frame stands in its centre of mass."""
+
+    body: int
+    qpos: int
+    centre: Floats
+    """(3,) of mass in its object frame."""
+    mass: float
+
+
+@dataclass(frozen=True)
 class Scene:
     """A compiled model with the places of its parts. The model is read-only: threads share it, each with its data."""
 
@@ -82,7 +95,9 @@ class Scene:
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     support_geoms: NDArray[np.bool_]
-    """(G,) geoms of the scene's supports; the scene frame is the mocap body 1."""
+    """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
+    neighbours: tuple[FreeBody, ...]
+    """The other objects of the scene."""
 
     def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
         """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
@@ -101,14 +116,22 @@ class Scene:
 
 
 def build(
-    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions, supports: Sequence[Obstacle] = ()
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    physics: MujocoOptions,
+    supports: Sequence[Obstacle] = (),
+    neighbours: Sequence[Neighbour] = (),
 ) -> Scene:
-    """Compile the scene of a hand and an object, with the supports that it stands on or between, if any."""
-    model = scene_spec(hand, obj, pieces, physics, supports).compile()
+    """Compile the scene of a hand and an object, with the supports that it stands on or between and what stands beside
+    it, if any."""
+    model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
     gain, shift = _leading(hand)
     body_of_geom = model.geom_bodyid
     object_body = model.body("object").id
-    support = body_of_geom == (model.body("supports").id if supports else -1)
+    beside = tuple(_free_body(model, f"neighbour{k}", one.obj) for k, one in enumerate(neighbours))
+    stand = [one.body for one in beside] + ([model.body("supports").id] if supports else [])
+    support = np.isin(body_of_geom, stand)
     return Scene(
         model=model,
         hand=hand,
@@ -122,13 +145,25 @@ def build(
         dof_shift=shift,
         centre=obj.centre_of_mass,
         support_geoms=np.asarray(support),
+        neighbours=beside,
     )
 
 
+def _free_body(model: Any, name: str, obj: ObjectModel) -> FreeBody:
+    body = model.body(name).id
+    return FreeBody(body, int(model.joint(name).qposadr[0]), obj.centre_of_mass, float(model.body_mass[body]))
+
+
 def scene_spec(
-    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions, supports: Sequence[Obstacle] = ()
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    physics: MujocoOptions,
+    supports: Sequence[Obstacle] = (),
+    neighbours: Sequence[Neighbour] = (),
 ) -> Any:
-    """What `build` compiles: bodies `body0` ..., joints `joint1` ..., actuators `dof0` ..., object, supports."""
+    """What `build` compiles: bodies `body0` ..., joints `joint1` ..., actuators `dof0` ..., object, supports,
+    `neighbour0` ..."""
     spec = mujoco.MjSpec()
     # MJCF angles are degrees by default: radians there freeze every finger silently.
     spec.compiler.degree = False
@@ -142,9 +177,11 @@ def scene_spec(
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | NOT_IN_3_3_2
     friction = [*physics.friction, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
-    add_object(spec, obj, pieces, friction, OBJECT_MASS)
+    add_object(spec, obj, pieces.vertices, friction, OBJECT_MASS)
     if supports:
         _add_supports(spec, supports, friction)
+    for k, one in enumerate(neighbours):
+        add_object(spec, one.obj, one.pieces, friction, DENSITY * one.obj.volume, name=f"neighbour{k}")
     return spec
 
 
@@ -290,18 +327,20 @@ def _excluded(hand: HandModel) -> set[tuple[int, int]]:
     return {(min(a, b), max(a, b)) for a, b in pairs}
 
 
-def add_object(spec: Any, obj: ObjectModel, pieces: ConvexPieces, friction: list[float], mass: float) -> None:
-    """A free body named `object` of a given mass [kg], its frame in the object's centre of mass."""
-    body = spec.worldbody.add_body(name="object", pos=obj.centre_of_mass)
-    body.add_freejoint(name="object")
+def add_object(
+    spec: Any, obj: ObjectModel, pieces: Sequence[Floats], friction: list[float], mass: float, name: str = "object"
+) -> None:
+    """A free body of a given mass [kg], its frame in the object's centre of mass; corners (V, 3) of each piece."""
+    body = spec.worldbody.add_body(name=name, pos=obj.centre_of_mass)
+    body.add_freejoint(name=name)
     # Where nothing is said, MuJoCo takes the place of the body in its parent for the place of the mass in the body.
     body.mass, body.ipos = mass, [0, 0, 0]
     inertia = mass * obj.inertia
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     body.explicitinertial = True
-    for i, corners in enumerate(pieces.vertices):
-        geom = body.add_geom(condim=4, friction=friction, name=f"object{i}")
-        _mesh(spec, geom, corners - obj.centre_of_mass, f"object{i}")
+    for i, corners in enumerate(pieces):
+        geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")
+        _mesh(spec, geom, corners - obj.centre_of_mass, f"{name}-{i}")
 
 
 def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:

@@ -19,7 +19,17 @@ from worker.engines import backend
 
 backend.start()
 
-MODULES: Final = ("kinematics", "surface", "contact", "pieces", "penalties", "optimizers", "projection", "obstacles")
+MODULES: Final = (
+    "kinematics",
+    "surface",
+    "contact",
+    "pieces",
+    "penalties",
+    "optimizers",
+    "projection",
+    "obstacles",
+    "solids",
+)
 _lock = threading.Lock()
 
 

@@ -1,7 +1,7 @@
 """Hands against the obstacles of their scene: distances, penalties, residuals.
 
 The hand stands in by its features: corners of boxes and hulls, spheres and ends of capsules (balls), rims of cylinders.
-Against a half-space they are exact; of larger obstacles than a link no link can pass between its corners.
+Half-spaces need no more and are seen exactly; for solids see `solids`.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Features:
-    """F balls (axis zero) and rims (circles about an axis) fixed to bodies."""
+    """F balls (axis zero) and rims (circles about an axis) fixed to bodies, and E edges of the P pieces."""
 
     body: wp.array(dtype=wp.int32)
     centre: wp.array(dtype=wp.vec3)  # body frame
@@ -21,6 +21,11 @@ class Features:
     radius: wp.array(dtype=wp.float32)
     margin: wp.array(dtype=wp.float32)  # distance to keep [m]; negative: it may sink in
     weight: wp.array(dtype=wp.float32)
+    first: wp.array(dtype=wp.int32)  # (P + 1,) features of a piece
+    first_edge: wp.array(dtype=wp.int32)  # (P + 1,)
+    start: wp.array(dtype=wp.vec3)  # (E,) ends of an edge, body frame
+    end: wp.array(dtype=wp.vec3)
+    thickness: wp.array(dtype=wp.float32)  # (E,) radius about it
 
 
 @wp.struct
@@ -35,13 +40,17 @@ class Feature:
 
 @wp.struct
 class Obstacles:
-    """Convex obstacles of all scenes, one after the other; a scene -1 has none."""
+    """Convex obstacles of all scenes, one after the other, those without end first; a scene -1 has none."""
 
-    first: wp.array(dtype=wp.int32)  # (S + 1,) into planes_of
+    first: wp.array(dtype=wp.int32)  # (S + 1,)
+    first_solid: wp.array(dtype=wp.int32)  # (S,) first that has corners
     first_plane: wp.array(dtype=wp.int32)  # (O + 1,)
     planes: wp.array(dtype=wp.vec4)  # outward unit normal and offset
     centre: wp.array(dtype=wp.vec3)  # (O,) bounding sphere
-    radius: wp.array(dtype=wp.float32)  # (O,) 1e9: without end
+    radius: wp.array(dtype=wp.float32)  # (O,)
+    first_edge: wp.array(dtype=wp.int32)  # (O + 1,)
+    start: wp.array(dtype=wp.vec3)  # ends of an edge
+    end: wp.array(dtype=wp.vec3)
 
 
 @wp.func
@@ -95,16 +104,6 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
     return wp.vec4(n[0], n[1], n[2], d)
 
 
-@wp.func
-def outside_sphere(obstacles: Obstacles, k: wp.int32, f: Feature, reach: wp.float32):
-    """Whether the bounding sphere of obstacle k is farther than `reach` from a feature."""
-    if obstacles.radius[k] > 1.0e8:
-        return False
-    offset = f.centre - obstacles.centre[k]
-    r = obstacles.radius[k] + f.radius + wp.max(reach, 0.0)
-    return wp.dot(offset, offset) > r * r
-
-
 @wp.kernel
 def clear(
     # Data in:
@@ -137,16 +136,14 @@ def penalty(
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, F)."""
+    """Half-spaces: gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, F)."""
     b, i = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
     f = posed(features_in, i, b, body_p_in, body_q_in)
     margin = features_in.margin[i]
     weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
-    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
-        if outside_sphere(obstacles_in, k, f, margin + room_in):
-            continue
+    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
         nd = obstacle_distance(obstacles_in, k, f)
         short = nd[3] - margin - room_in
         if short < 0.0:
@@ -174,15 +171,13 @@ def residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Features nearer to an obstacle than margin + near go to margin + target. Over (B, F)."""
+    """Features nearer to a half-space than margin + near go to margin + target. Over (B, F)."""
     b, i = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
     f = posed(features_in, i, b, body_p_in, body_q_in)
     margin = features_in.margin[i]
-    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
-        if outside_sphere(obstacles_in, k, f, margin + near_in):
-            continue
+    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
         nd = obstacle_distance(obstacles_in, k, f)
         if nd[3] < margin + near_in:
             n = wp.vec3(nd[0], nd[1], nd[2])

@@ -1,0 +1,151 @@
+"""The other objects of a scene: as few convex pieces, and where they stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.errors import MeshError, SceneError
+from service.model.scene_spec import SceneSpec
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import decompose, union_volume
+from worker.scenes.kinds import SUNK, check_free, rest_poses, supports_of
+from worker.scenes.neighbours import drop_together
+from worker.simulation.outer import outer_solid
+from worker.simulation.surroundings import Neighbour, Scenes
+
+Floats = NDArray[np.float64]
+
+#: Convex pieces of a neighbour at most: no hand is put into a neighbour's hollow, so hollows may be filled.
+MOST_PIECES: Final = 8
+
+_made: LRUCache[str, Neighbour] = LRUCache(32)
+
+
+def neighbour_of(obj: ObjectModel) -> Neighbour:
+    """An object as a neighbour: its convex pieces, those joined that fill the least until `MOST_PIECES` are left.
+
+    Raises:
+        MeshError: the object is flat.
+    """
+    if (found := _made.get(obj.content)) is not None:
+        return found
+    try:
+        pieces = decompose(obj).vertices
+    except MeshError:
+        pieces = (obj.hull_vertices,)  # more than the object is no harm in a thing to stay clear of
+    pieces = joined_pieces(pieces)
+    solids = [outer_solid(piece) for piece in pieces]
+    made = Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
+    _made[obj.content] = made
+    return made
+
+
+def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
+    """At most `most` convex pieces: again and again the two become one whose common hull adds the least volume."""
+    left = list(pieces)
+    volume = [union_volume((piece,)) for piece in left]
+
+    def added(a: int, b: int) -> float:
+        return union_volume((np.concatenate([left[a], left[b]]),)) - volume[a] - volume[b]
+
+    cost = {(a, b): added(a, b) for a, b in combinations(range(len(left)), 2)} if len(left) > most else {}
+    alive = set(range(len(left)))
+    while len(alive) > most:
+        a, b = min(cost, key=lambda pair: cost[pair])
+        left.append(np.concatenate([left[a], left[b]]))
+        volume.append(union_volume((left[-1],)))
+        alive -= {a, b}
+        cost = {pair: value for pair, value in cost.items() if not {a, b} & set(pair)}
+        cost |= {(k, len(left) - 1): added(k, len(left) - 1) for k in alive}
+        alive.add(len(left) - 1)
+    return tuple(left[k] for k in sorted(alive))
+
+
+def scenes_of(
+    spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel] = (), *, count: int, seed: int
+) -> tuple[Scenes, dict[str, Floats]]:
+    """The scenes that a user names, `count` of them (with `faces all`, as many as the object has stable faces).
+
+    Args:
+        spec: what stands around the object; not free.
+        obj: the object.
+        others: the objects of `spec.neighbours`, in that order.
+        count: number of scenes S.
+        seed: any non-negative integer.
+
+    Returns:
+        The scenes, and `scene/object_pose` (S, 7), `scene/rest_probability` (S,), `scene/drop_seconds` (S,) and, where
+        there are neighbours, `scene/neighbour_pose` (S, M, 7).
+
+    Raises:
+        SceneError: something stands in something else, or there is no room.
+        MeshError: something never comes to rest, or is flat.
+    """
+    supports = supports_of(spec)
+    given = [one.pose for one in spec.neighbours if one.pose is not None]
+    if not others:
+        poses = rest_poses(spec, obj, count=count, seed=seed)
+        return Scenes(supports, poses["scene/object_pose"]), poses
+    if given:
+        poses = rest_poses(spec, obj, count=count, seed=seed)
+        stand = np.asarray(given, float)
+        poses["scene/neighbour_pose"] = np.tile(stand, (len(poses["scene/object_pose"]), 1, 1))
+    else:
+        poses = drop_together(obj, others, count=count, seed=seed)
+        check_free(obj, poses["scene/object_pose"], supports)
+    beside = tuple(neighbour_of(other) for other in others)
+    for number, other in enumerate(others):
+        check_free(other, poses["scene/neighbour_pose"][:, number], supports)
+    if given:
+        _check_apart([neighbour_of(obj), *beside], _all_poses(poses))
+    return Scenes(supports, poses["scene/object_pose"], beside, poses["scene/neighbour_pose"]), poses
+
+
+def _all_poses(poses: dict[str, Floats]) -> Floats:
+    """(S, 1 + M, 7) of the object and its neighbours."""
+    return np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
+
+
+def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
+    """Refuses scenes in which two things are deeper in each other than rounded poses bring them."""
+    gaps = gaps_between(things, poses)
+    for (a, b), gap in gaps.items():
+        if -gap.min() > SUNK:
+            names = things[a].obj.name, things[b].obj.name
+            raise SceneError(
+                f"{names[0]} and {names[1]} overlap by {-1e3 * gap.min():.1f} mm in scene {int(gap.argmin())}; "
+                "move one of them"
+            )
+
+
+def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0.1) -> dict[tuple[int, int], Floats]:
+    """Signed distance (S,) of each two things in each scene, at most `farthest` [m]; poses (S, T, 7)."""
+    spec: Any = mujoco.MjSpec()
+    first = [0]
+    for number, thing in enumerate(things):
+        body = spec.worldbody.add_body(mocap=True)
+        for k, corners in enumerate(thing.pieces):
+            mesh = spec.add_mesh(name=f"{number}-{k}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+            mesh.uservert = np.ascontiguousarray(corners, np.float32).ravel()
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{number}-{k}")
+        first.append(first[-1] + len(thing.pieces))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    pairs = list(combinations(range(len(things)), 2))
+    gaps = {pair: np.full(len(poses), farthest) for pair in pairs}
+    for number, scene in enumerate(poses):
+        data.mocap_pos[:], data.mocap_quat[:] = scene[:, :3], scene[:, 3:]
+        mujoco.mj_kinematics(model, data)
+        for a, b in pairs:
+            for i in range(first[a], first[a + 1]):
+                for j in range(first[b], first[b + 1]):
+                    gap = mujoco.mj_geomDistance(model, data, i, j, farthest, None)
+                    gaps[a, b][number] = min(gaps[a, b][number], gap)
+    return gaps

@@ -1,0 +1,345 @@
+"""Links of a hand against solid obstacles: boxes, boards, neighbours' convex pieces.
+
+Of two convex bodies that are apart the nearest points lie on a corner and a face or on two edges; of two that meet a
+corner or an edge of one is in the other. So the link's features are looked for in the obstacle, the obstacle's edges in
+the link, and the link's edges in the obstacle.
+Along a straight edge the signed distance from a convex body is a convex function. Its least value is found between two
+tangents that meet below it: where they meet is a lower bound, so that edges which are far enough cost two looks.
+"""
+
+import warp as wp
+
+from worker.simulation.kernels.obstacles import Features, Obstacles, lowest_point, obstacle_distance, posed
+from worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
+from worker.simulation.kernels.projection import Residuals, emit
+
+wp.set_module_options({"enable_backward": False})
+
+#: Looks between the tangents, and how near to their meeting point the value must be [m].
+LOOKS = wp.constant(20)
+EXACT = wp.constant(wp.float32(1.0e-8))
+#: A point this far outside a plane's face counts as on it [m].
+ON_FACE = wp.constant(wp.float32(1.0e-5))
+
+
+@wp.struct
+class Lowest:
+    """The least value of a convex function on an edge."""
+
+    t: wp.float32
+    value: wp.float32
+    gradient: wp.vec3
+
+
+@wp.struct
+class Near:
+    """Where a link is nearest to an obstacle; `direction` is the gradient of the distance as `point` moves with it."""
+
+    distance: wp.float32
+    point: wp.vec3
+    direction: wp.vec3
+
+
+@wp.func
+def meeting(t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32):
+    """Where two tangents of a convex function meet, g0 < 0 < g1; between t0 and t1."""
+    return wp.clamp((f1 - f0 + g0 * t0 - g1 * t1) / (g0 - g1), t0, t1)
+
+
+@wp.func
+def balanced(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
+    """The gradient of the least value on an edge, g0 < 0 < g1 being the slopes beside it: at a bend neither side's own,
+    but the mixture that has no slope along the edge."""
+    share = g1 / (g1 - g0)
+    return share * n0 + (1.0 - share) * n1
+
+
+@wp.func
+def edge_in_piece(pieces: Pieces, piece: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32):
+    """Where on the edge a b (piece frame) the piece is nearest; a value of `limit` or more: it is not nearer."""
+    along = b - a
+    at0 = piece_distance(pieces, piece, a)
+    at1 = piece_distance(pieces, piece, b)
+    n0 = wp.vec3(at0[0], at0[1], at0[2])
+    n1 = wp.vec3(at1[0], at1[1], at1[2])
+    f0 = at0[3]
+    f1 = at1[3]
+    t0 = float(0.0)
+    t1 = float(1.0)
+    out = Lowest()
+    if wp.dot(n0, along) >= 0.0:
+        out.value = f0
+        out.gradient = n0
+        return out
+    if wp.dot(n1, along) <= 0.0:
+        out.t = 1.0
+        out.value = f1
+        out.gradient = n1
+        return out
+    for _look in range(LOOKS):
+        g0 = wp.dot(n0, along)
+        g1 = wp.dot(n1, along)
+        t = meeting(t0, f0, g0, t1, f1, g1)
+        if f0 + g0 * (t - t0) >= wp.min(limit, wp.min(f0, f1) - EXACT):
+            break
+        at = piece_distance(pieces, piece, a + t * along)
+        n = wp.vec3(at[0], at[1], at[2])
+        if wp.dot(n, along) > 0.0:
+            t1 = t
+            f1 = at[3]
+            n1 = n
+        else:
+            t0 = t
+            f0 = at[3]
+            n0 = n
+            if wp.dot(n, along) == 0.0:
+                break
+    out.t = t1
+    out.value = f1
+    if f0 < f1:
+        out.t = t0
+        out.value = f0
+    out.gradient = balanced(n0, wp.dot(n0, along), n1, wp.dot(n1, along))
+    return out
+
+
+@wp.func
+def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
+    """(normal, value) of the plane of obstacle k that x lies farthest out of."""
+    out = wp.vec4(0.0, 0.0, 0.0, -1.0e9)
+    for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
+        plane = obstacles.planes[i]
+        value = plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] - plane[3]
+        if value > out[3]:
+            out = wp.vec4(plane[0], plane[1], plane[2], value)
+    return out
+
+
+@wp.func
+def edge_in_obstacle(obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32):
+    """Where the edge a b lies deepest in obstacle k; a value of `limit` or more: it is not deeper."""
+    along = b - a
+    at0 = plane_over(obstacles, k, a)
+    at1 = plane_over(obstacles, k, b)
+    n0 = wp.vec3(at0[0], at0[1], at0[2])
+    n1 = wp.vec3(at1[0], at1[1], at1[2])
+    f0 = at0[3]
+    f1 = at1[3]
+    t0 = float(0.0)
+    t1 = float(1.0)
+    out = Lowest()
+    if wp.dot(n0, along) >= 0.0:
+        out.value = f0
+        out.gradient = n0
+        return out
+    if wp.dot(n1, along) <= 0.0:
+        out.t = 1.0
+        out.value = f1
+        out.gradient = n1
+        return out
+    for _look in range(LOOKS):
+        g0 = wp.dot(n0, along)
+        g1 = wp.dot(n1, along)
+        t = meeting(t0, f0, g0, t1, f1, g1)
+        if f0 + g0 * (t - t0) >= wp.min(limit, wp.min(f0, f1) - EXACT):
+            break
+        at = plane_over(obstacles, k, a + t * along)
+        n = wp.vec3(at[0], at[1], at[2])
+        if wp.dot(n, along) > 0.0:
+            t1 = t
+            f1 = at[3]
+            n1 = n
+        else:
+            t0 = t
+            f0 = at[3]
+            n0 = n
+            if wp.dot(n, along) == 0.0:
+                break
+    out.t = t1
+    out.value = f1
+    if f0 < f1:
+        out.t = t0
+        out.value = f0
+    out.gradient = balanced(n0, wp.dot(n0, along), n1, wp.dot(n1, along))
+    return out
+
+
+@wp.func
+def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
+    """Whether x lies on obstacle k, or in it."""
+    for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
+        plane = obstacles.planes[i]
+        if wp.dot(wp.vec3(plane[0], plane[1], plane[2]), x) - plane[3] > ON_FACE:
+            return False
+    return True
+
+
+@wp.func
+def apart(
+    features: Features, pieces: Pieces, obstacles: Obstacles, piece: wp.int32, k: wp.int32, b: wp.int32,
+    reach: wp.float32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
+):  # fmt: skip
+    """Whether the bounding spheres of a piece and an obstacle are farther than `reach` from each other."""
+    offset = piece_centre(pieces, piece, b, body_p, body_q) - obstacles.centre[k]
+    r = obstacles.radius[k] + wp.length(pieces.half[piece]) + wp.max(reach, 0.0)
+    return wp.dot(offset, offset) > r * r
+
+
+@wp.func
+def nearest_edge(
+    features: Features, pieces: Pieces, obstacles: Obstacles, piece: wp.int32, k: wp.int32, b: wp.int32,
+    limit: wp.float32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
+):  # fmt: skip
+    """Where an edge of obstacle k is nearest to a piece, or an edge of the piece deepest in the obstacle."""
+    out = Near()
+    out.distance = limit
+    q = piece_rotation(pieces, piece, b, body_q)
+    p = piece_centre(pieces, piece, b, body_p, body_q)
+    for e in range(obstacles.first_edge[k], obstacles.first_edge[k + 1]):
+        start = obstacles.start[e]
+        end = obstacles.end[e]
+        local_start = wp.quat_rotate_inv(q, start - p)
+        local_end = wp.quat_rotate_inv(q, end - p)
+        found = edge_in_piece(pieces, piece, local_start, local_end, out.distance)
+        if found.value < out.distance:
+            out.distance = found.value
+            out.point = start + found.t * (end - start)
+            out.direction = -wp.quat_rotate(q, found.gradient)
+    body = pieces.body[piece]
+    for e in range(features.first_edge[piece], features.first_edge[piece + 1]):
+        start = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.start[e])
+        end = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.end[e])
+        thickness = features.thickness[e]
+        # Apart, the obstacle's edges and the link's features tell the distance: here only what pierces counts.
+        deepest = edge_in_obstacle(obstacles, k, start, end, wp.min(out.distance, 0.0) + thickness)
+        if deepest.value - thickness < wp.min(out.distance, 0.0):
+            out.distance = deepest.value - thickness
+            out.point = start + deepest.t * (end - start)
+            out.direction = deepest.gradient
+    return out
+
+
+@wp.kernel
+def penalty(
+    # Model:
+    features_in: Features,
+    pieces_in: Pieces,
+    obstacles_in: Obstacles,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    scene_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    weight_in: wp.array(dtype=wp.float32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    room_in: wp.float32,
+    # Data out:
+    force_inout: wp.array2d(dtype=wp.vec3),
+    torque_inout: wp.array2d(dtype=wp.vec3),
+    depth_inout: wp.array(dtype=wp.float32),
+):
+    """Gradient of w sum min(d - margin - room, 0)^2 over features, and the nearest edge of each pair. Over (B, P)."""
+    b, piece = wp.tid()
+    if active_in[b] == 0 or scene_in[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
+        return
+    body = pieces_in.body[piece]
+    first = features_in.first[piece]
+    keep = features_in.margin[first] + room_in
+    weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[first]
+    for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+        if apart(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
+            continue
+        for i in range(first, features_in.first[piece + 1]):
+            f = posed(features_in, i, b, body_p_in, body_q_in)
+            nd = obstacle_distance(obstacles_in, k, f)
+            short = nd[3] - keep
+            if short < 0.0:
+                n = wp.vec3(nd[0], nd[1], nd[2])
+                force = (weight * short) * n
+                wp.atomic_add(force_inout, b, body, force)
+                wp.atomic_add(torque_inout, b, body, wp.cross(lowest_point(f, n), force))
+                wp.atomic_max(depth_inout, b, -short)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
+        short = near.distance - keep
+        if short < 0.0:
+            force = (weight * short) * near.direction
+            wp.atomic_add(force_inout, b, body, force)
+            wp.atomic_add(torque_inout, b, body, wp.cross(near.point, force))
+            wp.atomic_max(depth_inout, b, -short)
+
+
+@wp.kernel
+def residuals(
+    # Model:
+    features_in: Features,
+    pieces_in: Pieces,
+    obstacles_in: Obstacles,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    scene_in: wp.array(dtype=wp.int32),
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    near_in: wp.float32,
+    target_in: wp.float32,
+    # Out:
+    residuals_out: Residuals,
+):
+    """What `penalty` sees nearer than margin + near goes to margin + target. Over (B, P)."""
+    b, piece = wp.tid()
+    if active_in[b] == 0 or scene_in[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
+        return
+    body = pieces_in.body[piece]
+    first = features_in.first[piece]
+    keep = features_in.margin[first] + near_in
+    target = features_in.margin[first] + target_in
+    for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+        if apart(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
+            continue
+        for i in range(first, features_in.first[piece + 1]):
+            f = posed(features_in, i, b, body_p_in, body_q_in)
+            nd = obstacle_distance(obstacles_in, k, f)
+            if nd[3] < keep:
+                n = wp.vec3(nd[0], nd[1], nd[2])
+                emit(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
+        if near.distance < keep:
+            emit(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
+
+
+@wp.kernel
+def distances(
+    # Model:
+    features_in: Features,
+    pieces_in: Pieces,
+    obstacles_in: Obstacles,
+    # Data in:
+    body_p_in: wp.array2d(dtype=wp.vec3),
+    body_q_in: wp.array2d(dtype=wp.quat),
+    # In:
+    reach_in: wp.float32,
+    # Out:
+    distance_inout: wp.array2d(dtype=wp.float32),
+):
+    """Least distance (B, L) of each body from the solids of scene 0; what is farther than `reach` counts as that.
+
+    A feature over no face of an obstacle is farther from it than one of the obstacle's edges is from the link. Over
+    (B, P).
+    """
+    b, piece = wp.tid()
+    body = pieces_in.body[piece]
+    least = reach_in
+    for k in range(obstacles_in.first_solid[0], obstacles_in.first[1]):
+        if apart(features_in, pieces_in, obstacles_in, piece, k, b, least, body_p_in, body_q_in):
+            continue
+        for i in range(features_in.first[piece], features_in.first[piece + 1]):
+            f = posed(features_in, i, b, body_p_in, body_q_in)
+            nd = obstacle_distance(obstacles_in, k, f)
+            if nd[3] < least:
+                n = wp.vec3(nd[0], nd[1], nd[2])
+                if over_face(obstacles_in, k, lowest_point(f, n) - nd[3] * n):
+                    least = nd[3]
+        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, least, body_p_in, body_q_in)
+        least = wp.min(least, near.distance)
+    wp.atomic_min(distance_inout, b, body, least)
