@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from service.model.errors import MeshError, SceneError
 from service.model.scene_spec import SceneSpec
+from worker.objects.convex import union_volume
 from worker.objects.model import ObjectModel
-from worker.quality.referee.decomposition import decompose, union_volume
+from worker.quality.referee.decomposition import decompose
 from worker.scenes.kinds import SUNK, check_free, rest_poses, supports_of
 from worker.scenes.neighbours import drop_together
 from worker.simulation.outer import outer_solid
