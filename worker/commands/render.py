@@ -14,6 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.errors import InputError
+from service.model.scene_kinds import supports_in
+from service.model.transforms import compose
+from service.readers.ways import scene_spec_of
+from service.store import standing
 from service.store.shards import Shard, read_shard, write_shard
 from worker.commands.grasp_sheet import GraspSheet
 from worker.engines.devices import Device
@@ -23,8 +27,9 @@ from worker.rendering.camera_file import SAMPLED, read_cameras
 from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
 from worker.rendering.hands import DrawnHand
-from worker.rendering.pages.sheets import best, best_kept, views_page
+from worker.rendering.pages.sheets import best, best_in_scenes, best_kept, views_page
 from worker.rendering.pages.typography import with_palette
+from worker.rendering.standing import TABLE
 from worker.rendering.views import Extras
 from worker.rendering.views import render as render_views
 from worker.run import Run
@@ -38,7 +43,7 @@ _Object = Annotated[str | None, typer.Option(help="The object's file; default: f
 @app.command(epilog="graspd render scenes.h5 --views 3 --stereo -o views.h5 --page views.png")
 @reporting_errors
 def render(
-    scenes: Annotated[Path, typer.Argument(help="A scene shard, as `graspd scene` writes it.")],
+    scenes: Annotated[Path, typer.Argument(help="A scene shard, or a base shard of grasps in scenes.")],
     views: Annotated[int, typer.Option(min=1, max=4096, help="Camera placements per scene.")] = 3,
     stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
     baseline: Annotated[float, typer.Option(help="Distance of the eyes [m].")] = BASELINE_M,
@@ -66,17 +71,19 @@ def render(
 ) -> None:
     """Take pictures of scenes: colour, depth, segmentation, boxes, and what `--channels` asks for."""
     started = perf_counter()
-    scene = read_shard(scenes, kind="scene")
+    scene = _scenes(scenes)
     obj = object_of_shard(scene, object)
     number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
     used = Device(device).resolve()
     given = read_cameras(cameras) if cameras is not None else SAMPLED
     size = (width or given.width or 320, height or given.height or 240)
+    spec = scene_spec_of(scene)
     extras = Extras(
         channels=parse_channels(channels.split(",")),
         cameras=given,
         neighbours=neighbours_of_shard(scene, with_ or []),
-        drawn=None if with_hand is None else _drawn(scene, with_hand, hand),
+        drawn=_drawn_in(scene, hand) if scene.kind == "base" else _drawn(scene, with_hand, hand),
+        supports=TABLE if spec is None else supports_in(spec),
     )
     with _progress(json) as bar:
         task = bar.add_task("rendering", total=None)
@@ -87,7 +94,7 @@ def render(
         )  # fmt: skip
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
-    kept = {key: scene.attributes[key] for key in inherited if key in scene.attributes}
+    kept = {key: scene.attributes[key] for key in (*inherited, "scene") if key in scene.attributes}
     output.write_bytes(
         write_shard("views", result, {**kept, "seed": number, "device": used, "seconds": round(seconds, 4)})
     )
@@ -140,8 +147,34 @@ def pictures(
         typer.echo(f"{output}: the best {len(rows)} of {int(chosen.sum())} {word}")
 
 
-def _drawn(scene: Shard, base_file: Path, hand: str | None) -> DrawnHand:
+def _scenes(path: Path) -> Shard:
+    """A scene shard, or a base shard whose grasps were planned in scenes."""
+    shard = read_shard(path)
+    if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
+        raise InputError(
+            f"{path} has grasps around a free object: a scene shard is needed here; make one: graspd scene"
+        )
+    if shard.kind == "views":
+        raise InputError(f"{path} is a views shard; a scene shard is needed here")
+    return shard
+
+
+def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
+    """The best valid grasp of each scene that grasps were planned in; where nobody judged, the best sound one."""
+    judged = standing.valid(base.arrays).any()
+    rows = best_in_scenes(base.arrays, standing.chosen(base.arrays, unjudged=not judged))
+    if not len(base["grasp/hand_pose"]):
+        return None
+    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    return DrawnHand(
+        hand_of_shard(base, hand), rows, compose(np.asarray(base["scene/object_pose"], float), poses), joints
+    )
+
+
+def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
     """The best grasp that each scene kept, by epsilon, for `--with-hand`."""
+    if base_file is None:
+        return None
     base = read_shard(base_file, kind="base")
     model = hand_of_shard(scene, hand)
     hand_of_shard(base, hand)

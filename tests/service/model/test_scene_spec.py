@@ -110,3 +110,9 @@ def test_a_neighbours_mesh_is_found_beside_the_scene_file(tmp_path: Path) -> Non
     path = tmp_path / "scene.json"
     path.write_text(json.dumps({**TABLE, "neighbours": [{"object": "cup.stl"}, {"object": "mug"}]}))
     assert [one.object for one in parse_scene(str(path)).neighbours] == [str(tmp_path / "cup.stl"), "mug"]
+
+
+def test_the_example_scenes_are_scenes():
+    folder = Path(__file__).parents[3] / "examples" / "scenes"
+    found = [parse_scene(str(path)) for path in sorted(folder.glob("*.yaml"))]
+    assert found and all(spec.kind == "file" for spec in found)

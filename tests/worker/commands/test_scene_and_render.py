@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
+from service.model.scene_spec import SceneSpec
 from service.store.shards import json_attribute, read_shard, write_shard
 from worker.commands import grasp_sheet
 from worker.commands.exchange import app as exchange
@@ -98,6 +99,49 @@ def test_pictures_draws_the_best_first(base):
     assert last_line(result)["rows"] == [2, 1]
     with Image.open(output) as image:
         assert image.format == "PNG"
+
+
+@pytest.fixture(scope="module")
+def in_bin(base) -> Path:
+    """The same grasps as if they had been planned in a bin, in one scene, with their way."""
+    shard = read_shard(base)
+    pose = np.asarray(shard["grasp/hand_pose"])
+    arrays = dict(shard.arrays) | {
+        "scene/object_pose": np.array([[0, 0, 0.04, 1.0, 0, 0, 0]]),
+        "scene/rest_probability": np.ones(1),
+        "grasp/scene_index": np.zeros(GRASPS, np.int32),
+        "grasp/approach": np.repeat(pose[:, None], 2, axis=1),
+        "grasp/approach_joint_positions": np.asarray(shard["grasp/joint_positions"]),
+        "grasp/lift": pose,
+    }
+    spec = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
+    path = base.with_name("bin.h5")
+    path.write_bytes(write_shard("base", arrays, shard.attributes | {"scene": spec}))
+    return path
+
+
+def test_render_shows_the_supports_and_the_best_grasp_of_grasps_in_scenes(in_bin):
+    output = in_bin.with_name("bin_views.h5")
+    arguments = ["render", str(in_bin), "--views", "2", "--width", "48", "--height", "36", "--device", "cpu"]
+    result = CliRunner().invoke(rendering, [*arguments, "-o", str(output)])
+    assert result.exit_code == 0, result.output
+    views = read_shard(output, kind="views")
+    # Walls all around: less of the picture is background than on a table, which ends.
+    assert (views["image/segmentation"] == 0).mean() < 0.2
+    assert views["camera/hand_grasp"].tolist() == [2, 2]
+    assert (views["image/rgb"] != views["image/rgb_hand"]).any()
+    assert json.loads(str(views.attributes["scene"]))["kind"] == "bin"
+
+
+def test_pictures_of_grasps_in_scenes_show_walls_and_the_whole_way(in_bin):
+    for more, columns in ([], 1), (["--way"], 4), (["--three-sides", "--palette"], 3):
+        output = in_bin.with_name("bin.png")
+        arguments = ["pictures", str(in_bin), "-n", "1", "--size", "48", "--device", "cpu", "-o", str(output), *more]
+        result = CliRunner().invoke(rendering, arguments)
+        assert result.exit_code == 0, result.output
+        with Image.open(output) as image:
+            assert image.width > columns * 48
+            assert (image.mode == "P") == ("--palette" in more)
 
 
 def test_pictures_of_a_way_show_each_posture_of_a_free_grasp(base):
