@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from json import dumps
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 import typer
@@ -24,8 +25,10 @@ from service.store.asset_options import (
     hand_options,
 )
 from service.store.asset_summary import say_check
-from worker.hands.check import check_hand
-from worker.hands.load import files_from_path, hand_from_path
+from worker.hands.check import check_hand, described
+from worker.hands.load import files_from_path, hand_from_path, main_file
+from worker.hands.model import HandModel
+from worker.hands.options import parse_options
 
 app = typer.Typer(add_completion=False)
 
@@ -47,7 +50,13 @@ def check(
     fix: FixOption = None,
     drop: DropOption = None,
     picture: Annotated[
-        Path | None, typer.Option(help="Draw the hand open, on approach and closing, with its palm's arrow: a PNG.")
+        Path | None, typer.Option(help="Draw the hand open, on approach, closing, and from three sides: a PNG.")
+    ] = None,
+    collision: Annotated[
+        bool, typer.Option("--collision", help="Draw collision shapes where the hand has visual meshes.")
+    ] = False,
+    write: Annotated[
+        Path | None, typer.Option(help="Write all that was said and guessed into a file: asset.json, to be corrected.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -58,15 +67,36 @@ def check(
     )  # fmt: skip
     report = report_hand(file, options)
     if picture and report["verdict"] != "refuse":
-        from worker.rendering.pages.portraits import hand_portrait, write_png
-
-        write_png(hand_portrait(hand_from_path(file, options)), picture)
+        _draw(hand_from_path(file, options), picture, collision=collision)
+    if write and report["verdict"] != "refuse":
+        _write(file, options, report, write)
     if json:
         emit(report)
     else:
         say_check(AssetKind.HAND, report)
     if report["verdict"] == "refuse":
         raise typer.Exit(InputError.exit_code)
+
+
+def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
+    from worker.rendering.hands import without_visuals
+    from worker.rendering.pages.portraits import above, hand_portrait, hand_sides, write_png
+
+    shown = without_visuals(hand) if collision else hand
+    write_png(above(hand_portrait(shown), hand_sides(hand)), picture)
+
+
+def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: Path) -> None:
+    """An asset.json that says what files, options and guesses say, so that nothing is left to guess."""
+    _, files, stated = files_from_path(file)
+    settings = parse_options(files, {**stated, **options})
+    said = settings.model_dump(mode="json", exclude_unset=True)
+    said["file"] = PurePosixPath(main_file(files, settings)).name
+    text = dumps({**said, **described(report["facts"])}, indent=2)
+    try:
+        target.write_text(text + "\n")
+    except OSError as error:
+        raise InputError(f"{target} cannot be written: {error.strerror}") from None
 
 
 def report_hand(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -97,6 +97,18 @@ def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
     }
 
 
+def described(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of an `asset.json` that say what was found or guessed: root, palm, pre-shape, closing, fingertips."""
+    root = facts["root"]
+    return {
+        "root": root,
+        "palm": {"link": root, "centre": facts["palm_centre"], "approach": facts["palm_approach"]},
+        "preshape": facts["preshape"],
+        "closing": facts["closing"],
+        "fingertips": facts["fingertips"],
+    }
+
+
 def _rounded(values: Any) -> list[float]:
     return [round(float(value), 6) for value in values]
 

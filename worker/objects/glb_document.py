@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-_FLOAT, _BYTE, _U32 = 5126, 5120, 5125
+_FLOAT, _BYTE, _UBYTE, _U32 = 5126, 5120, 5121, 5125
 _POINTS: Final = 0
 _ARRAY, _ELEMENTS = 34962, 34963
 
@@ -31,18 +31,31 @@ class Document:
         faces: NDArray[Any],
         normals: NDArray[Any],
         colour: tuple[float, float, float] | None = None,
+        face_colours: NDArray[Any] | None = None,
     ) -> dict[str, Any]:
-        """A primitive of vertices (V, 3), faces (F, 3), unit normals per face corner (F, 3, 3) and a linear colour."""
+        """A primitive of vertices (V, 3), faces (F, 3) and unit normals per face corner (F, 3, 3).
+
+        Colours are linear RGB: one of the whole, or one of each face (F, 3).
+        """
         # A vertex on a crease becomes as many as it has normals; 127 steps a half axis are under half a degree.
         small = np.round(127 * normals.reshape(-1, 3)).astype(np.int8)
         corners = np.concatenate([faces.reshape(-1, 1), small], axis=1)
+        if face_colours is not None:
+            shades = np.round(255 * np.repeat(face_colours, 3, axis=0)).astype(np.int64)
+            corners = np.concatenate([corners, shades], axis=1)
         unique, index = np.unique(corners, axis=0, return_inverse=True)
         padded = np.zeros((len(unique), 4), np.int8)
-        padded[:, :3] = unique[:, 1:]
+        padded[:, :3] = unique[:, 1:4]
         attributes = {
             "POSITION": self.vectors(vertices[unique[:, 0]]),
             "NORMAL": self._accessor(padded, _BYTE, "VEC3", _ARRAY, {"byteStride": 4}, {"normalized": True}),
         }
+        if face_colours is not None:
+            tinted = np.zeros((len(unique), 4), np.uint8)
+            tinted[:, :3] = unique[:, 4:]
+            attributes["COLOR_0"] = self._accessor(
+                tinted, _UBYTE, "VEC3", _ARRAY, {"byteStride": 4}, {"normalized": True}
+            )
         indices = self._accessor(index.reshape(-1).astype(np.uint32), _U32, "SCALAR", _ELEMENTS, {}, {})
         primitive: dict[str, Any] = {"attributes": attributes, "indices": indices}
         return primitive if colour is None else primitive | {"material": self._material(colour)}

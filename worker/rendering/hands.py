@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
+from worker.hands.robot import Ints
+from worker.hands.visuals import NO_VISUALS, VisualMesh
 from worker.objects.normals import corner_normals
-from worker.rendering.palette import hexadecimal
+from worker.rendering.palette import hexadecimal, linear
 from worker.rendering.scenery import Look, Solid
 
 _HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
@@ -40,29 +45,83 @@ class DrawnHand:
         return bodies[:, drawn_bodies(self.hand)]
 
 
+@dataclass(frozen=True)
+class Part:
+    """A solid of one look that moves with a body."""
+
+    body: int
+    solid: Solid
+    look: Look
+
+
+def hand_parts(hand: HandModel) -> tuple[Part, ...]:
+    """What is drawn of a hand: its visual meshes in their colours; of bodies without any, the collision pieces.
+
+    Where no visual element states a colour, palm, fingers and fingertips have looks of their own.
+    """
+    with _lock:
+        if hand.content not in _parts:
+            _parts[hand.content] = tuple(_drawn(hand))
+        return _parts[hand.content]
+
+
+def without_visuals(hand: HandModel) -> HandModel:
+    """The same hand, drawn as the engine sees it."""
+    return replace(hand, visuals=NO_VISUALS)
+
+
 def drawn_bodies(hand: HandModel) -> list[int]:
-    """Bodies that have a shape."""
-    return sorted({piece.body for piece in hand.pieces})
+    """The body of each drawn solid; a body of several colours comes several times."""
+    return [part.body for part in hand_parts(hand)]
 
 
 def hand_solids(hand: HandModel) -> list[Solid]:
-    """One mesh per body that has pieces, in the body frame."""
-    return [_merge(hand, body) for body in drawn_bodies(hand)]
+    """The drawn meshes, each in the frame of its body."""
+    return [part.solid for part in hand_parts(hand)]
 
 
-def look_of(hand: HandModel, body: int) -> Look:
-    """Material of a body: palm, finger or fingertip."""
+def hand_looks(hand: HandModel) -> list[Look]:
+    """The material of each drawn solid."""
+    return [part.look for part in hand_parts(hand)]
+
+
+_parts: LRUCache[str, tuple[Part, ...]] = LRUCache(16)
+_lock = threading.Lock()
+
+
+def _drawn(hand: HandModel) -> Iterator[Part]:
+    seen = {mesh.body for mesh in hand.visuals.meshes}
+    for body in range(hand.bodies):
+        if body not in seen:
+            yield from _pieces(hand, body)
+            continue
+        of_colour: dict[tuple[float, float, float] | None, list[VisualMesh]] = {}
+        for mesh in hand.visuals.meshes:
+            if mesh.body == body:
+                of_colour.setdefault(mesh.colour, []).append(mesh)
+        for colour, meshes in of_colour.items():
+            look = _own_look(hand, body) if colour is None else Look(linear(*colour), roughness=0.45)
+            yield Part(body, _merge([(m.vertices, m.faces) for m in meshes]), look)
+
+
+def _pieces(hand: HandModel, body: int) -> Iterator[Part]:
+    pieces = [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]
+    if pieces:
+        yield Part(body, _merge(pieces), _own_look(hand, body))
+
+
+def _own_look(hand: HandModel, body: int) -> Look:
+    """Material of a body without a colour: palm, finger or fingertip."""
     if body in hand.fingertips:
         return _TIP
     return _PALM if body == 0 else _HAND
 
 
-def _merge(hand: HandModel, body: int) -> Solid:
+def _merge(meshes: list[tuple[Floats, Ints]]) -> Solid:
     vertices, faces, normals, count = [], [], [], 0
-    for piece in hand.pieces:
-        if piece.body == body:
-            vertices.append(piece.vertices)
-            faces.append(piece.faces + count)
-            normals.append(corner_normals(piece.vertices, piece.faces))
-            count += len(piece.vertices)
+    for points, triangles in meshes:
+        vertices.append(points)
+        faces.append(triangles + count)
+        normals.append(corner_normals(points, triangles))
+        count += len(points)
     return Solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))

@@ -15,7 +15,7 @@ from service.model.transforms import apply
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.camera_file import SAMPLED, GivenCameras
 from worker.rendering.cameras import intrinsics, narrow_field, sample_hemisphere, stereo_pair
-from worker.rendering.hands import DrawnHand, drawn_bodies, hand_solids, look_of
+from worker.rendering.hands import DrawnHand, hand_looks, hand_solids
 from worker.rendering.palette import lamp, object_look, table_look
 from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
 from worker.rendering.standing import TABLE, Supports, seen_share, slab_poses, slabs
@@ -121,7 +121,7 @@ class Setting:
         """The same pictures with a hand in them."""
         key = (*self._key(), drawn.hand.content, len(self._poses), run.device)
         stage = _kept(key, lambda: [*self._solids(), *hand_solids(drawn.hand)], len(self._poses), run.device)
-        shown = [look_of(drawn.hand, body) for body in drawn_bodies(drawn.hand)]
+        shown = hand_looks(drawn.hand)
         stage.place(
             np.concatenate([self._poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
         )

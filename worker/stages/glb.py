@@ -12,12 +12,18 @@ import numpy as np
 
 from worker.hands.model import HandModel, JointType
 from worker.hands.surface import sample_surface
+from worker.hands.visuals import VisualMesh, lighter
 from worker.objects.glb_document import Document, plain
 from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals
+from worker.rendering.palette import linear
 
 #: Points on the hand from which a viewer measures its distance to the object.
 SURFACE_POINTS: Final = 3000
+#: Triangles of a hand's visual meshes together: a browser draws them at once.
+MAX_FACES: Final = 60_000
+#: sRGB of parts without a colour beside parts with one.
+_GREY: Final = (0.45, 0.5, 0.55)
 
 
 def hand_glb(hand: HandModel) -> bytes:
@@ -25,6 +31,7 @@ def hand_glb(hand: HandModel) -> bytes:
     document = Document()
     points = sample_surface(hand, SURFACE_POINTS)
     nodes: list[dict[str, Any]] = []
+    visuals = _light_visuals(hand)
     joint_of_body = dict(zip(hand.joint_body.tolist(), hand.joint_names, strict=True))
     for body in range(hand.bodies):
         node: dict[str, Any] = {"name": hand.body_names[body], "extras": {"fingertip": body in hand.fingertips}}
@@ -33,7 +40,7 @@ def hand_glb(hand: HandModel) -> bytes:
             node["rotation"] = plain(np.roll(hand.origin[body, 3:], -1))  # glTF: x y z w
             kind = "prismatic" if hand.joint_type[body] == JointType.PRISMATIC else "revolute"
             node["extras"] |= {"joint": joint_of_body[body], "type": kind, "axis": plain(hand.axis[body])}
-        primitives = _body_primitives(document, hand, body)
+        primitives = _body_primitives(document, hand, body, visuals)
         if (on_body := points.position[points.body == body]).size:
             primitives.append(document.points(on_body))
         if primitives:
@@ -54,14 +61,30 @@ def object_glb(obj: ObjectModel) -> bytes:
     return document.bytes([{"name": obj.name, "mesh": document.mesh([primitive])}], extras)
 
 
-def _body_primitives(document: Document, hand: HandModel, body: int) -> list[dict[str, Any]]:
-    vertices, faces, normals, count = [], [], [], 0
-    for piece in hand.pieces:
-        if piece.body == body:
-            vertices.append(piece.vertices)
-            faces.append(piece.faces + count)
-            normals.append(corner_normals(piece.vertices, piece.faces))
-            count += len(piece.vertices)
-    if not vertices:
+def _body_primitives(
+    document: Document, hand: HandModel, body: int, visuals: tuple[VisualMesh, ...]
+) -> list[dict[str, Any]]:
+    """The visual meshes in their colours; of a body without any, its pieces, which viewers colour themselves."""
+    meshes = [(mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body]
+    meshes = meshes or [(piece.vertices, piece.faces, None) for piece in hand.pieces if piece.body == body]
+    if not meshes:
         return []
-    return [document.triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
+    colours = None
+    if any(colour for _, _, colour in meshes):
+        colours = np.concatenate([np.tile(linear(*(colour or _GREY)), (len(faces), 1)) for _, faces, colour in meshes])
+    return [
+        document.triangles(
+            np.concatenate([vertices for vertices, _, _ in meshes]),
+            np.concatenate([faces + start for (_, faces, _), start in zip(meshes, starts, strict=False)]),
+            np.concatenate([corner_normals(vertices, faces) for vertices, faces, _ in meshes]),
+            face_colours=colours,
+        )
+    ]
+
+
+def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
+    """The visual meshes, with `MAX_FACES` triangles together at most."""
+    meshes = hand.visuals.meshes
+    excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
+    return meshes if excess <= 1 else tuple(lighter(mesh, excess) for mesh in meshes)

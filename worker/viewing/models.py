@@ -14,7 +14,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.probe import Probe, probe_of
-from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from worker.scenes.neighbours import Neighbours
 
 #: Points of the hand whose distance from the object is shown, where it is less than this [m].
@@ -49,7 +49,7 @@ class Models:
 
     def _body(self, number: int, body: int) -> Any:
         solid = hand_solids(self._hand)[number]
-        colour = tuple(round(255 * _srgb(part)) for part in look_of(self._hand, body).base)
+        colour = tuple(round(255 * _srgb(part)) for part in hand_looks(self._hand)[number].base)
         return self._scene.add_mesh_simple(
             f"/grasp/hand/{number}", solid.vertices, solid.faces, color=colour, flat_shading=True
         )

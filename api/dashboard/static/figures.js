@@ -16,7 +16,8 @@ function solid(geometry, look) {
 /** A hand: `pose` moves it; `group` is what to draw. */
 export class Hand {
   constructor(model) {
-    const looks = { palm: material(COLOURS.palm), finger: material(COLOURS.finger), tip: material(COLOURS.tip) };
+    const looks = { palm: material(COLOURS.palm), finger: material(COLOURS.finger), tip: material(COLOURS.tip), own: material(0xffffff) };
+    looks.own.vertexColors = true;
     this.looks = Object.values(looks);
     this.extras = model.extras;
     this.joints = new Map();
@@ -26,7 +27,7 @@ export class Hand {
       group.position.fromArray(node.translation);
       group.quaternion.copy(rest);
       const look = index === 0 ? looks.palm : node.extras.fingertip ? looks.tip : looks.finger;
-      if (node.solid) group.add(solid(node.solid, look));
+      if (node.solid) group.add(solid(node.solid, node.solid.getAttribute("color") ? looks.own : look));
       if (node.extras.joint) {
         const at = new Vector3(...node.translation);
         this.joints.set(node.extras.joint, { group, rest, at, axis: new Vector3(...node.extras.axis), slides: node.extras.type === "prismatic" });

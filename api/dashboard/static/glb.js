@@ -37,6 +37,7 @@ export function readGlb(buffer) {
       made.solid = new BufferGeometry();
       made.solid.setAttribute("position", position);
       made.solid.setAttribute("normal", attribute(primitive.attributes.NORMAL));
+      if (primitive.attributes.COLOR_0 !== undefined) made.solid.setAttribute("color", attribute(primitive.attributes.COLOR_0));
       made.solid.setIndex(attribute(primitive.indices));
     }
     return made;

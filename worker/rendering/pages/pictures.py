@@ -13,7 +13,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import Cameras, intrinsics, look_at
-from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from worker.rendering.kernels import CATCHER
 from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
@@ -111,7 +111,7 @@ def _shoot(
     floor[:, 2] = points[..., 2].min(axis=1) - 0.01 - 0.5 * FLOOR_SIZE[2]
     shown = drawn_bodies(hand)
     poses = np.concatenate([floor[:, None], np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, shown]], axis=1)
-    stage.place(poses, [[FLOOR, OBJECT_LOOK, *(look_of(hand, body) for body in shown)]] * worlds)
+    stage.place(poses, [[FLOOR, OBJECT_LOOK, *hand_looks(hand)]] * worlds)
     k = intrinsics(width, height, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:

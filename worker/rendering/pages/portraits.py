@@ -20,7 +20,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals
 from worker.objects.solid import from_manifold
 from worker.rendering.cameras import intrinsics
-from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
 from worker.rendering.pages import typography
 from worker.rendering.pages.pictures import (
     FIELD_OF_VIEW,
@@ -42,6 +42,17 @@ _CAPTION: Final = 30
 #: Share of the way from open to closed at which a hand is shown closing.
 _CLOSING_SHARE: Final = 0.6
 _ARROW: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
+_CLOSING: Final = Look(hexadecimal("#2fa7a0"), roughness=0.5)
+#: Axes x, y, z of the palm's frame.
+_AXES: Final = tuple(Look(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
+_FRAME_SHARE: Final = 0.25
+_CLOSING_ARROW_SHARE: Final = 0.22
+#: Share of the housing in a picture through which one looks.
+_OPACITY: Final = 0.35
+#: Where what is not drawn waits [m].
+_AWAY_M: Final = -50.0
+#: Sides from which a hand is looked at, by the camera's azimuth [rad].
+_SIDES: Final = {"from the right": 0.0, "from behind": np.radians(-90.0), "from the front": np.radians(90.0)}
 #: Length of the arrow over the largest extent of the hand.
 _ARROW_SHARE: Final = 0.4
 #: Toward the palm from the side on which the approach points right [rad].
@@ -62,9 +73,59 @@ def hand_portrait(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     palm = compose(upright, np.concatenate([hand.palm.centre, _quat_of_z(hand.palm.approach)]))
     points = np.concatenate([*(c.reshape(-1, 3) for c in corners), apply(palm, arrow.vertices)])
     poses = np.concatenate([bodies[:, shown], np.tile(palm, (len(named), 1, 1))], axis=1)
-    looks = [*(look_of(hand, body) for body in shown), _ARROW]
+    looks = [*hand_looks(hand), _ARROW]
     solids = [*hand_solids(hand), arrow]
     return _row(_shoot(solids, poses, looks, points, [_HAND_AZIMUTH] * len(named), device), list(named))
+
+
+def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
+    """The hand as the engine sees it, about to close, from three sides; the palm's body is half transparent.
+
+    Three thin arrows are the palm's frame (x red, y green, z blue: the approach), the orange one is the approach, and
+    teal ones show where each fingertip goes as the hand closes.
+    """
+    bare = without_visuals(hand)
+    upright = _upright(bare)
+    closer = np.clip(bare.preshape + 0.1 * bare.closing * bare.span, bare.lower, bare.upper)
+    bodies, after = np.array(body_poses(bare, np.tile(upright, (2, 1)), bare.expand(np.stack([bare.preshape, closer]))))
+    corners: dict[int, list[Floats]] = {body: [] for body in range(bare.bodies)}
+    for piece in bare.pieces:
+        corners[piece.body].append(piece.vertices)
+    shaped = {body: np.concatenate(parts) for body, parts in corners.items() if parts}
+    points = np.concatenate([apply(bodies[body], vertices) for body, vertices in shaped.items()])
+    extent = float(np.ptp(points, axis=0).max())
+    palm = compose(upright, np.concatenate([bare.palm.centre, _quat_of_z(bare.palm.approach)]))
+    marks = [(_arrow(_ARROW_SHARE * extent), _ARROW, palm)]
+    for axis, look in zip(np.eye(3), _AXES, strict=True):
+        frame = np.concatenate([np.zeros(3), _quat_of_z(axis)])
+        marks.append((_arrow(_FRAME_SHARE * extent), look, compose(palm, frame)))
+    for tip in bare.fingertips:
+        centre = shaped[tip].mean(axis=0) if tip in shaped else np.zeros(3)
+        start, end = apply(bodies[tip], centre), apply(after[tip], centre)
+        if np.linalg.norm(end - start) > 1e-6:
+            way = np.concatenate([start, _quat_of_z((end - start) / np.linalg.norm(end - start))])
+            marks.append((_arrow(_CLOSING_ARROW_SHARE * extent), _CLOSING, way))
+    poses = np.stack([*bodies[drawn_bodies(bare)], *(pose for _, _, pose in marks)])
+    solids = [*hand_solids(bare), *(solid for solid, _, _ in marks)]
+    looks = [*hand_looks(bare), *(look for _, look, _ in marks)]
+    ends = [apply(pose, solid.vertices) for solid, _, pose in marks]
+    seen = np.concatenate([points, *ends])
+    without = poses.copy()
+    without[np.array([body == 0 for body in drawn_bodies(bare)] + [False] * len(marks)), 2] = _AWAY_M
+    whole, open_ = (
+        _shoot(solids, np.tile(row, (len(_SIDES), 1, 1)), looks, seen, list(_SIDES.values()), device).astype(float)
+        for row in (poses, without)
+    )
+    blended = (_OPACITY * whole + (1 - _OPACITY) * open_).round().astype(np.uint8)
+    return _page(blended, list(_SIDES))
+
+
+def above(first: Image.Image, second: Image.Image) -> Image.Image:
+    """Two pictures, one over the other."""
+    page = Image.new("RGB", (max(first.width, second.width), first.height + second.height), typography.PAPER)
+    page.paste(first.convert("RGB"), (0, 0))
+    page.paste(second.convert("RGB"), (0, first.height))
+    return page
 
 
 def object_portrait(obj: ObjectModel, *, device: str = "cpu") -> Image.Image:
@@ -104,14 +165,18 @@ def _shoot(
 
 
 def _row(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
-    """Pictures side by side with a word under each."""
+    """Pictures side by side with a word under each, in few colours."""
+    return _page(pictures, captions).quantize(192, dither=Image.Dither.NONE)
+
+
+def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
     width, height = SIZE
     page = Image.new("RGB", (width * len(pictures), height + _CAPTION), typography.PAPER)
     draw = ImageDraw.Draw(page)
     for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
         page.paste(Image.fromarray(picture), (number * width, 0))
         typography.text(draw, (number * width + 12, height + 21), caption, 15, typography.INK)
-    return page.quantize(192, dither=Image.Dither.NONE)
+    return page
 
 
 def _upright(hand: HandModel) -> Floats:

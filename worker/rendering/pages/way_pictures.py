@@ -16,7 +16,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import intrinsics, look_at
-from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from worker.rendering.pages.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
@@ -118,7 +118,7 @@ class _Stage:
         objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (obj, *self.others)]
         self.tracer = Tracer([*self.boxes, *objects, *hand_solids(hand)], frames, run.device)
         planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [FLOOR]
-        bodies = [look_of(hand, body) for body in drawn_bodies(hand)]
+        bodies = hand_looks(hand)
         self.looks = [*planes, OBJECT_LOOK, *(_BESIDE for _ in self.others), *bodies]
 
     def shoot(

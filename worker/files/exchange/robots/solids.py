@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 
 from worker.files.exchange.imported import plain_name
-from worker.hands.model import Floats
+from worker.hands.model import Floats, HandModel
 from worker.hands.primitives import hull
 from worker.hands.robot import Ints
 from worker.objects.normals import corner_normals
-from worker.rendering.hands import drawn_bodies, hand_solids, look_of
+from worker.rendering.hands import drawn_bodies, hand_parts
 from worker.robots.execution import Executions
 from worker.simulation.surroundings import Obstacle
 
@@ -42,8 +42,15 @@ def hand_meshes(found: Executions) -> list[Solid]:
     """One for each body of the hand that is seen, in the body's frame."""
     hand = found.hand
     return [
-        Solid(hand.body_names[body], solid.vertices, solid.faces, solid.corner_normals, look_of(hand, body).base, body)
-        for body, solid in zip(drawn_bodies(hand), hand_solids(hand), strict=True)
+        Solid(
+            _name_of(hand, number),
+            part.solid.vertices,
+            part.solid.faces,
+            part.solid.corner_normals,
+            part.look.base,
+            part.body,
+        )
+        for number, part in enumerate(hand_parts(hand))
     ]
 
 
@@ -77,3 +84,10 @@ def _corners(support: Obstacle, middle: Floats) -> Floats:
     ends = [(a, b, c) for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-1, 0)]
     beside = np.cross(normal, across)
     return np.array([foot + width * (a * across + b * beside) + thickness * c * normal for a, b, c in ends])
+
+
+def _name_of(hand: HandModel, number: int) -> str:
+    """A body's name; its second solid and those after it are numbered."""
+    bodies = drawn_bodies(hand)
+    before = bodies[:number].count(bodies[number])
+    return hand.body_names[bodies[number]] + (f"_{before + 1}" if before else "")

@@ -1,0 +1,94 @@
+"""A hand is drawn as it looks where it says so: visual meshes in their colours; collision shapes where it does not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from graspd.cli import build
+from tests.worker.hands.urdfs import joint, link, robot
+from worker.hands.load import hand_from_path, load_hand
+from worker.hands.model import HandModel
+from worker.rendering.hands import drawn_bodies, hand_parts, without_visuals
+from worker.stages.glb import hand_glb
+
+BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
+SEEN = (
+    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
+    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
+    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+)
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
+    urdf = robot(blue, link("palm", BOX + SEEN), link("a", BOX), joint("j", "palm", "a"))
+    part = bytes(trimesh.creation.icosphere(1, 0.01).export(file_type="stl"))
+    return load_hand({"h.urdf": urdf, "part.stl": part}, name="h", digest="0" * 32)
+
+
+def test_visual_meshes_have_their_colours_and_missing_ones_are_left_out(hand: HandModel) -> None:
+    palm = [part for part in hand_parts(hand) if part.body == 0]
+    assert sorted((part.look.base, len(part.solid.faces)) for part in palm) == [((0, 0, 1), 80), ((1, 0, 0), 12)]
+
+
+def test_a_body_without_visuals_is_drawn_by_its_collision_shapes(hand: HandModel) -> None:
+    (finger,) = [part for part in hand_parts(hand) if part.body == 1]
+    assert np.ptp(finger.solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+
+
+def test_collision_shapes_are_drawn_on_a_toggle(hand: HandModel) -> None:
+    bare = without_visuals(hand)
+    assert drawn_bodies(bare) == [0, 1] and drawn_bodies(hand) == [0, 0, 1]
+    assert np.ptp(hand_parts(bare)[0].solid.vertices, axis=0) == pytest.approx([0.02, 0.02, 0.04])
+
+
+def test_looks_change_nothing_that_is_computed(hand: HandModel) -> None:
+    bare = without_visuals(hand)
+    assert bare.pieces is hand.pieces and bare.content != hand.content
+
+
+def test_a_model_for_viewers_has_the_colours(hand: HandModel) -> None:
+    scene = trimesh.load(trimesh.util.wrap_as_stream(hand_glb(hand)), file_type="glb")
+    colours = {
+        tuple(colour) for mesh in scene.geometry.values() if len(getattr(mesh, "faces", ()))
+        for colour in np.unique(mesh.visual.vertex_colors[:, :3], axis=0).tolist()
+    }  # fmt: skip
+    assert {(255, 0, 0), (0, 0, 255)} <= colours
+
+
+def test_what_check_writes_leaves_nothing_to_guess(tmp_path: Path) -> None:
+    fingers = [link("a", BOX), link("b", BOX)]
+    joints = [
+        joint("ja", "palm", "a", origin="0.02 0 0.02", axis="0 -1 0"),
+        joint("jb", "palm", "b", origin="-0.02 0 0.02"),
+    ]
+    urdf = tmp_path / "claw.urdf"
+    urdf.write_bytes(robot(link("palm", BOX), *fingers, *joints))
+    said = ["--palm", "palm", "--approach", "0,0,1", "--pre-shape", "ja=0.2", "--closing", "ja=-1", "--fingertips", "a"]
+    target = tmp_path / "asset.json"
+    told = CliRunner().invoke(build(), ["hands", "check", str(urdf), *said, "--write", str(target), "--json"])
+    facts = json.loads(told.stdout.splitlines()[-1])["facts"]
+    assert json.loads(target.read_text())["file"] == "claw.urdf"
+    hand = hand_from_path(urdf)
+    assert hand.closing.tolist() == [-1, 1] and hand.preshape[0] == pytest.approx(0.2)
+    assert [hand.body_names[tip] for tip in hand.fingertips] == ["a"]
+    again = CliRunner().invoke(build(), ["hands", "check", str(urdf), "--json"])
+    found = json.loads(again.stdout.splitlines()[-1])["facts"]
+    assert {
+        key: found[key] for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root")
+    } == {key: facts[key] for key in ("palm_centre", "palm_approach", "closing", "preshape", "fingertips", "root")}
+    assert "palm" not in found["guessed"] and "closing" not in found["guessed"]
+
+
+@pytest.mark.parametrize("said", [("--closing", "ja=2"), ("--closing", "ja"), ("--xacro", "x")])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: tuple[str, str]) -> None:
+    told = CliRunner().invoke(build(), ["hands", "check", "allegro", *said])
+    assert told.exit_code == 2 and said[0] in told.stderr
