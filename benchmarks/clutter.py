@@ -1,0 +1,101 @@
+"""Certified grasps of a target among neighbours on a table, per scene, within a time.
+
+usage: python -m benchmarks.clutter DATA_DIR [--hand allegro] [--targets 025_mug ...] [--scenes 2] [--neighbours 6]
+           [--seconds 60] [--json OUT]                            DATA_DIR holds hands/ and objects/
+
+Neighbours are drawn from the other objects and dropped with the target. The time runs from the first grasp planned to
+the verdict of the last one; kernels, convex pieces and drops are made before. A second is two of processor time, for
+the two cores of a small machine: other programs change the figures little. The gap is that to the nearest neighbour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cells import HANDS
+from service.model.domain import BATCH_SIZE, FIDELITIES, JobOptions
+from service.model.scene_spec import SceneSpec
+from worker.certified import certified_grasps
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import object_from_path
+from worker.run import Run
+from worker.scenes.beside import gaps_between, neighbour_of, scenes_of
+
+#: Not a seed that any setting was chosen with.
+SEED = 505
+CORES = 2
+FIDELITY = FIDELITIES["standard"]
+TITLES = ("target", "scene", "neighbours", "gap, mm", "certified", "tried", "clear", "lift", "seconds")
+
+
+def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: int, seconds: float) -> dict[str, Any]:
+    """The numbers of one scene."""
+    spec = SceneSpec(kind="table", neighbours=tuple({"object": other.name} for other in others))  # type: ignore[arg-type]
+    scenes, poses = scenes_of(spec, obj, others, count=scene + 1, seed=SEED)
+    things = [neighbour_of(obj), *scenes.neighbours]
+    together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)[-1:]
+    gap = min(float(found[0]) for pair, found in gaps_between(things, together, 0.5).items() if pair[0] == 0)
+    here = replace(scenes, object_pose=scenes.object_pose[-1:], neighbour_pose=scenes.neighbour_pose[-1:])
+    request = JobOptions(grasps=BATCH_SIZE, want="raw", seed=SEED, fidelity=FIDELITY, audits=0)
+    found = {"certified": 0, "tried": 0, "clear": 0.0, "lift": 0.0}
+    certified_grasps(hand, obj, request, count=2, batch=1 << 19, scenes=here, run=Run())  # kernels, pieces
+    began, batch = time.process_time(), 0
+    while (spent := (time.process_time() - began) / CORES) < seconds:
+        made = certified_grasps(hand, obj, request, count=BATCH_SIZE, batch=batch, scenes=here, run=Run())
+        if (time.process_time() - began) / CORES > seconds and batch:
+            break  # its verdicts came too late
+        found["certified"] += int(made.columns["quality/valid"].sum())
+        found["tried"] += made.planned
+        found["clear"] += made.shares["clear_share"] * made.planned
+        found["lift"] += made.shares["lift_share"] * made.planned
+        batch += 1
+    tried = max(1, found["tried"])
+    return {
+        **found, "clear": found["clear"] / tried, "lift": found["lift"] / tried, "gap": 1e3 * gap,
+        "seconds": min(spent, seconds),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--hand", default="allegro", choices=list(HANDS))
+    parser.add_argument("--targets", nargs="+", default=["025_mug", "006_mustard_bottle", "077_rubiks_cube"])
+    parser.add_argument("--scenes", type=int, default=2)
+    parser.add_argument("--neighbours", type=int, default=6)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", type=Path)
+    said = parser.parse_args()
+    hand = hand_from_path(said.data / "hands" / HANDS[said.hand])
+    meshes = {path.parent.name: path for path in sorted((said.data / "objects").glob("*/clean.stl"))}
+    rows = []
+    sys.stdout.write("| " + " | ".join(TITLES) + " |\n| --- |" + " --: |" * (len(TITLES) - 1) + "\n")
+    for target in said.targets:
+        obj = object_from_path(meshes[target], face_error_m=FIDELITY.face_error_m)
+        for scene in range(said.scenes):
+            rest = [name for name in meshes if name != target]
+            names = np.random.default_rng([SEED, scene]).choice(rest, said.neighbours, replace=False)
+            others = [object_from_path(meshes[name], face_error_m=FIDELITY.face_error_m) for name in names]
+            row = {"target": target, "scene": scene, **study(hand, obj, others, scene, said.seconds)}
+            rows.append(row)
+            sys.stdout.write(
+                f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['certified']} | {row['tried']} | "
+                f"{row['clear']:.2f} | {row['lift']:.2f} | {row['seconds']:.0f} |\n"
+            )
+            sys.stdout.flush()
+    if said.json:
+        said.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
