@@ -1,11 +1,12 @@
 """Grasps planned in scenes against grasps planned around free objects and filtered, per hand and object.
 
-usage: python benchmarks/scene_grasps.py DATA_DIR --work W [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
-           [--json OUT]                                         DATA_DIR holds hands/ and objects/
+usage: python -m benchmarks.scene_grasps DATA_DIR --work W [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
+           [--per-face 0] [--json OUT] [--page OUT.md]          DATA_DIR holds hands/ and objects/
 
 Scenes: each stable resting face of the object that at least 3 % of drops end on, on a table. Both ways get the same
-number of raw grasps in the same scenes, judged alike. A second is one of CPU time of one thread: other programs on the
-machine change the ratios little. What a pair has found lies under W: a run that was stopped goes on.
+number of raw grasps in the same scenes, judged alike: `--grasps` a pair, or `--per-face` for each face if that is more.
+A second is one of CPU time of one thread: other programs on the machine change the ratios little. What a pair has found
+lies under W: a run that was stopped goes on, and several may run beside one another with other hands.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ import numpy as np
 from benchmarks.cells import HANDS
 from service.model.domain import FIDELITIES
 from service.model.scene_spec import SceneSpec
+from service.model.version import PACKAGE_VERSION
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import Run, Wanted, synthesize
+from worker.planners.fast_graspd.across import Openings
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.lifting import judge_lifts
@@ -37,23 +41,32 @@ from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 
+COMMAND = (
+    "python -m benchmarks.scene_grasps DATA --work W --grasps 16 --per-face 2 "
+    "--page docs/results/scenes-grasps.md --json docs/results/scenes-grasps.json"
+)
 #: Not a seed that any setting was chosen with.
 SEED = 404
 FIDELITY = FIDELITIES["standard"]
 TITLES = {
-    "object": "object", "faces": "faces", "clear_contact": "clear at contact", "clear_way": "clear on the way",
-    "pushes": "six pushes", "letter": "lift by the letter, clear", "lift": "lift", "hard": "lift, half friction",
-    "faces_held": "faces with one", "filter_lift": "free, filtered: lift", "price": "CPU over free",
+    "object": "object", "count": "grasps", "faces": "faces", "clear_contact": "clear at contact",
+    "clear_way": "clear on the way", "pushes_of_clear": "of these six pushes", "letter": "letter, clear",
+    "lift": "lift", "hard": "lift, half friction", "faces_held": "faces with one", "reach": "faces in reach",
+    "reach_held": "of these with one", "filter_lift": "free, filtered: lift", "price": "CPU over free",
     "gain": "valid/s over filtered", "of_free": "valid/s over free valid/s",
 }  # fmt: skip
 
 
-def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, count: int) -> dict[str, Any]:
+def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, least: int, per_face: int) -> dict[str, Any]:
     """The numbers of one pair; shares are of all raw grasps."""
     spec = SceneSpec(kind="table", faces="all")
     poses = rest_poses(spec, obj, count=1, seed=SEED)["scene/object_pose"]
+    count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
     wanted, run = Wanted(count, FIDELITY, SEED), Run(threads=1)
+    # What a pair is made ready with once is none of a grasp's cost, on either side.
+    for where in (placed.take(slice(0, 1)), None):
+        synthesize(hand, obj, Wanted(1, FIDELITY, SEED, placed=where), run)
     planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed), run))
     free, free_seconds = _timed(lambda: synthesize(hand, obj, wanted, run))
     found = _judged(hand, obj, planned, placed, pieces)
@@ -62,10 +75,17 @@ def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, count: int) -
     rate, free_rate = found["lift"] / seconds, filtered["lift"] / free_seconds
     held = np.asarray(found.pop("rows"))
     filtered.pop("rows")
+    faces = np.array([held[placed.index == s].any() for s in range(len(poses))])
+    known = oppositions_of(hand)
+    reach = np.array([Openings.of(known, obj, scene).within_reach for scene in placed.scenes])
     return {
         **found,
+        "count": count,
         "faces": len(poses),
-        "faces_held": float(np.mean([held[placed.index == s].any() for s in range(len(poses))])),
+        "faces_held": float(faces.mean()),
+        "reach": int(reach.sum()),
+        "reach_held": float(faces[reach].mean()) if reach.any() else None,
+        "pushes_of_clear": found["pushes"] / found["clear_way"] if found["clear_way"] else None,
         "filter_lift": filtered["lift"],
         "seconds": seconds / count,
         "free_seconds": free_seconds / count,
@@ -107,14 +127,32 @@ def _cell(value: Any) -> str:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The pairs of one hand as Markdown, their means last; ratios as medians."""
-    whole: dict[str, Any] = {"object": "mean; ratios: median", "faces": sum(row["faces"] for row in rows)}
-    for name in list(TITLES)[2:]:
+    counts = ("count", "faces", "reach")
+    whole: dict[str, Any] = {"object": "mean; ratios: median", **{n: sum(row[n] for row in rows) for n in counts}}
+    for name in [name for name in TITLES if name not in ("object", *counts)]:
         known = [row[name] for row in rows if row[name] is not None]
         middle = np.median if name in ("price", "gain", "of_free") else np.mean
         whole[name] = float(middle(known)) if known else None
     lines = ["| " + " | ".join(TITLES.values()) + " |", "| --- |" + " --: |" * (len(TITLES) - 1)]
     lines += ["| " + " | ".join(_cell(row[name]) for name in TITLES) + " |" for row in [*rows, whole]]
     return "\n".join(lines)
+
+
+def page(results: dict[str, list[dict[str, Any]]]) -> str:
+    """The tables of all hands as a page of the docs."""
+    lines = [
+        "# Grasps planned in scenes", "",
+        f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, {FIDELITY.name} fidelity, seed {SEED}; a table, each "
+        "stable resting face that at least 3 % of drops end on. Shares are of all raw grasps unless it says otherwise; "
+        "seconds are CPU time of planning. A face is in reach if two points of the object that look away from each "
+        "other lie 4 mm clear of the table and no farther apart than the hand's opposed fingers open.",
+    ]  # fmt: skip
+    for name, rows in results.items():
+        lines += ["", f"## {name}", "", table(rows)]
+    every = [row for rows in results.values() for row in rows]
+    return "\n".join(
+        [*lines, "", "## All pairs", "", *table(every).splitlines()[:2], table(every).splitlines()[-1], ""]
+    )
 
 
 def main() -> None:
@@ -124,7 +162,9 @@ def main() -> None:
     parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
     parser.add_argument("--objects", nargs="+")
     parser.add_argument("--grasps", type=int, default=32)
+    parser.add_argument("--per-face", type=int, default=0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--page", type=Path)
     said = parser.parse_args()
     results: dict[str, list[dict[str, Any]]] = {}
     for name in said.hands:
@@ -133,16 +173,18 @@ def main() -> None:
         for mesh in sorted((said.data / "objects").glob("*/clean.stl")):
             if said.objects and mesh.parent.name not in said.objects:
                 continue
-            kept = said.work / f"{name}-{mesh.parent.name}-{said.grasps}.json"
+            kept = said.work / f"{name}-{mesh.parent.name}-{said.grasps}-{said.per_face}.json"
             if not kept.exists():
                 obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
-                found = study(hand, obj, decompose(obj, cache=said.work / "pieces"), said.grasps)
+                found = study(hand, obj, decompose(obj, cache=said.work / "pieces"), said.grasps, said.per_face)
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 kept.write_text(json.dumps(found))
             rows.append({"object": mesh.parent.name, **json.loads(kept.read_text())})
             sys.stderr.write(f"{name} {mesh.parent.name}: lift {rows[-1]['lift']:.2f}\n")
         sys.stdout.write(f"\n{name}\n\n{table(rows)}\n")
         sys.stdout.flush()
+    if said.page:
+        said.page.write_text(page(results))
     if said.json:
         said.json.write_text(json.dumps(results, indent=1))
 

@@ -13,7 +13,7 @@ from service.model.scene_spec import Box, SceneSpec
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import lay_flat, resting_faces
-from worker.scenes.simulate import drop, rest_probability
+from worker.scenes.simulate import drop, reference_share, rest_probability
 from worker.simulation.surroundings import Obstacle
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     """One scene for each face that holds the object and that at least `LEAST_PROBABILITY` of drops end on."""
     faces = resting_faces(obj)
     stable = faces.stable
-    share = rest_probability(obj, stable.tolist())
+    share = reference_share(obj, stable.tolist())
     kept = stable[share >= LEAST_PROBABILITY]
     if not len(kept):
         kept = stable[[int(np.argmax(share))]]

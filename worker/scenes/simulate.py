@@ -107,10 +107,15 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
 
 def rest_probability(obj: ObjectModel, faces: Sequence[int]) -> Floats:
     """(S,) share of `REFERENCE_DROPS` drops of the object alone, and the scene's own, that rest on each face."""
+    return (reference_share(obj, faces) * REFERENCE_DROPS + 1.0) / (REFERENCE_DROPS + 1.0)
+
+
+def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
+    """(S,) share of `REFERENCE_DROPS` drops of the object alone that rest on each face."""
     if not faces:
         return np.zeros(0)
     known, reference = resting_faces(obj), np.array(_reference_faces(_ByContent(obj)))
-    return np.array([same_face(known, face, reference).sum() + 1.0 for face in faces]) / (REFERENCE_DROPS + 1.0)
+    return np.array([same_face(known, face, reference).sum() for face in faces]) / REFERENCE_DROPS
 
 
 class _ByContent:
