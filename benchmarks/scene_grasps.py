@@ -90,7 +90,8 @@ def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, least: int, p
         "seconds": seconds / count,
         "free_seconds": free_seconds / count,
         "price": seconds / free_seconds,
-        "gain": rate / free_rate if free_rate else None,
+        "gain": rate / free_rate if free_rate else rate * count * free_seconds,
+        "gain_at_least": not free_rate,
         "of_free": rate / (free_held / free_seconds) if free_held else None,
     }
 
@@ -134,7 +135,11 @@ def table(rows: list[dict[str, Any]]) -> str:
         middle = np.median if name in ("price", "gain", "of_free") else np.mean
         whole[name] = float(middle(known)) if known else None
     lines = ["| " + " | ".join(TITLES.values()) + " |", "| --- |" + " --: |" * (len(TITLES) - 1)]
-    lines += ["| " + " | ".join(_cell(row[name]) for name in TITLES) + " |" for row in [*rows, whole]]
+    for row in [*rows, whole]:
+        cells = {name: _cell(row[name]) for name in TITLES}
+        if row.get("gain_at_least") and row["gain"]:
+            cells["gain"] = "> " + cells["gain"]
+        lines.append("| " + " | ".join(cells.values()) + " |")
     return "\n".join(lines)
 
 
@@ -145,11 +150,20 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
         f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, {FIDELITY.name} fidelity, seed {SEED}; a table, each "
         "stable resting face that at least 3 % of drops end on. Shares are of all raw grasps unless it says otherwise; "
         "seconds are CPU time of planning. A face is in reach if two points of the object that look away from each "
-        "other lie 4 mm clear of the table and no farther apart than the hand's opposed fingers open.",
+        "other lie 4 mm clear of the table, less than 30 degrees from level, and no farther apart than the hand's "
+        "opposed fingers open. Where no filtered grasp lifts, the gain is counted as if one had: it is more.",
     ]  # fmt: skip
     for name, rows in results.items():
         lines += ["", f"## {name}", "", table(rows)]
     every = [row for rows in results.values() for row in rows]
+    raw = sum(row["count"] for row in every)
+    lifted, filtered = (round(sum(row[name] * row["count"] for row in every)) for name in ("lift", "filter_lift"))
+    seconds, free_seconds = (sum(row[name] * row["count"] for row in every) for name in ("seconds", "free_seconds"))
+    lines += [
+        "", f"Planned in their scenes {lifted} of {raw} grasps lift, {lifted / seconds:.2f} a second; planned free and "
+        f"filtered {filtered}, {filtered / free_seconds:.3f} a second: "
+        f"{lifted / seconds * free_seconds / max(filtered, 1):.0f} times as many.",
+    ]  # fmt: skip
     return "\n".join(
         [*lines, "", "## All pairs", "", *table(every).splitlines()[:2], table(every).splitlines()[-1], ""]
     )

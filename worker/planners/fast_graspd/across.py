@@ -108,8 +108,8 @@ class Openings:
     sums: Floats
     """(P,) cumulative chance; empty: there is nothing."""
     within_reach: bool
-    """Whether a pair lies clear of the obstacles and is no wider than the hand opens: the geometric condition for any
-    grasp between opposed fingers."""
+    """Whether a pair lies nearly level, clear of the obstacles, and is no wider than the hand opens: the geometric
+    condition for a grasp between opposed fingers from above or from the side."""
 
     @classmethod
     def of(cls, known: Oppositions, obj: ObjectModel, scene: Surroundings) -> Openings:
@@ -125,9 +125,9 @@ class Openings:
             for end in pairs.ends():
                 room = np.minimum(room, obstacle.distance(end))
         easy = room >= MARGIN_M
-        chance *= np.where(np.abs(pairs.axis @ scene.up) < STEEP, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM)
-        chance *= fits
-        return cls(pairs, np.cumsum(chance) / chance.sum(), bool((fits & easy).any()))
+        level = np.abs(pairs.axis @ scene.up) < STEEP
+        chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
+        return cls(pairs, np.cumsum(chance) / chance.sum(), bool((fits & easy & level).any()))
 
 
 def across(
