@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.modelling import drops, motion, pictures, shape
+from benchmarks.modelling import drops, motion, pictures, scenes, shape
 from benchmarks.modelling.common import Subject, hand_of, object_of
 from benchmarks.modelling.tables import tables
 
@@ -24,7 +24,7 @@ SHAPED = ("025_mug", "011_banana")
 PICTURED = "025_mug"
 BUILT_IN = ("mug", "bottle", "block")
 #: The studies, and grasps of each object (drops of each, for `drops`): as many as a few minutes of one core allow.
-STUDIES = {"motion": 32, "shape": 24, "drops": 32, "pictures": 0}
+STUDIES = {"motion": 32, "shape": 24, "drops": 32, "pictures": 0, "scenes": 24}
 
 
 def studies(data: Path | None, count: dict[str, int]) -> dict[str, Callable[[], dict[str, Any]]]:
@@ -39,6 +39,7 @@ def studies(data: Path | None, count: dict[str, int]) -> dict[str, Callable[[], 
         "shape": lambda: shape.study(data, shaped, count["shape"]),
         "drops": lambda: drops.study(subjects, lambda: [object_of(data, name) for name in dropped], count["drops"]),
         "pictures": lambda: pictures.study(data, PICTURED if data else BUILT_IN[0]),
+        "scenes": lambda: scenes.study(subjects, count["scenes"]),
     }
 
 

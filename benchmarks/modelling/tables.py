@@ -31,6 +31,11 @@ def tables(found: dict[str, Any]) -> dict[str, str]:
             "object|pieces|same face from the same release|face shares apart|of two seeds|cost",
             map(_drop, found["drops"]["drops"]),
         )
+    if "scenes" in found:
+        out["scenes"] = _table(
+            "model|comes out|same verdict (95 %)|only here / only by the lift test|cost",
+            map(_lift, found["scenes"]["variants"]),
+        )
     if "pictures" in found:
         out["pictures"] = _table(
             "picture|cost|colour off, of 255|labels changed|depth off mm", map(_rays, found["pictures"]["rays"])
@@ -57,6 +62,10 @@ def _engine(row: Row) -> list[str]:
         f"{row['only_here']} / {row['only_certificate']}",
         f"{row['cost_ratio']:.2f}",
     ]
+
+
+def _lift(row: Row) -> list[str]:
+    return _engine({**row, "only_certificate": row["only_lift"]})
 
 
 def _predictor(row: Row) -> list[str]:

@@ -1,0 +1,176 @@
+"""How much of a scene must be modelled to say whether a grasp comes out of it.
+
+Reference is the lift test: a rigid table with friction, the way in, closing, lift and hold. Everything is asked of the
+same grasps, planned on a table, that come in clear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from benchmarks.modelling.common import PLAIN, SEED, Bools, Row, Subject, cpu, share
+from service.model.scene_spec import SceneSpec
+from worker.grasps import GraspSet
+from worker.planners import synthesize
+from worker.planners.port import Wanted
+from worker.quality.referee.lift import Lift
+from worker.quality.referee.model import MujocoOptions, Scene, build
+from worker.quality.referee.protocol import Outcome, Trial
+from worker.run import Run
+from worker.scenes.clearance import MARGIN_M
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.scenes.way import Way, plan_way
+from worker.simulation.surroundings import Obstacle, Placed, Scenes
+
+#: A table of 1.2 x 0.9 m, 30 mm thick.
+SLAB = Obstacle.box([0, 0, -0.015, 1, 0, 0, 0], [1.2, 0.9, 0.03])
+SOFT_M = 5e-3
+
+
+@dataclass
+class OnTable:
+    """Grasps of a subject's hand on its object, planned on a table."""
+
+    subject: Subject
+
+    @cached_property
+    def scenes(self) -> Scenes:
+        spec = SceneSpec(kind="table", faces="all")
+        return Scenes(supports_of(spec), rest_poses(spec, self.subject.obj, count=1, seed=SEED)["scene/object_pose"])
+
+    @cached_property
+    def placed(self) -> Placed:
+        return self.scenes.placed(np.arange(self.subject.count) % len(self.scenes.object_pose))
+
+    def planned(self, placed: Placed) -> GraspSet:
+        wanted = Wanted(self.subject.count, PLAIN, SEED, placed=placed)
+        return synthesize(self.subject.hand, self.subject.obj, wanted, Run(threads=1))
+
+    @cached_property
+    def grasps(self) -> GraspSet:
+        return self.planned(self.placed)
+
+    @cached_property
+    def way(self) -> Way:
+        return plan_way(self.subject.hand, self.subject.obj, self.grasps, self.placed)
+
+    @cached_property
+    def clear(self) -> tuple[GraspSet, Placed]:
+        """The grasps that come in clear, with their ways, and their scenes."""
+        way, rows = self.way, np.flatnonzero(self.way.clear)
+        ready = replace(self.grasps, approach=way.approach, coming=way.open, lift=way.lift)
+        return ready.take(rows), self.placed.take(rows)
+
+
+def _supports(scene: Scene, friction: float | None = None, width_m: float | None = None) -> None:
+    """The supports' word counts alone: on friction, or on the depth at which they are hard."""
+    rows = scene.support_geoms
+    scene.model.geom_priority[rows] = 1
+    if friction is not None:
+        scene.model.geom_friction[rows] = friction
+    if width_m is not None:
+        scene.model.geom_solimp[rows] = (0.05, 0.95, width_m, 0.5, 2.0)
+
+
+def _no_hold(test: Lift, grasps: GraspSet, row: int) -> bool:
+    test._begin(grasps, row)
+    if not test._close(grasps, row, give_up=True):
+        return False
+    test._rise(grasps, row)
+    return test._judge(Trial()) is Outcome.HELD
+
+
+def variants() -> dict[str, tuple[Callable[[Scene], None], Callable[[Lift, GraspSet, int], bool]]]:
+    """What is done to the compiled scene, and how a grasp is judged in it."""
+
+    def lift(test: Lift, grasps: GraspSet, row: int) -> bool:
+        return test.lift(grasps, row).success
+
+    def letter(test: Lift, grasps: GraspSet, row: int) -> bool:
+        return test.letter(grasps, row).success
+
+    def same(scene: Scene) -> None:
+        return None
+
+    return {
+        "lift": (same, lift),
+        "a table without friction": (lambda scene: _supports(scene, friction=1e-6), lift),
+        "a table that gives 5 mm": (lambda scene: _supports(scene, width_m=SOFT_M), lift),
+        "no hold of 2 s": (same, _no_hold),
+        "by the letter: no way in, no hold": (same, letter),
+    }
+
+
+def judged(tables: list[OnTable]) -> list[Row]:
+    """Each variant's rate, agreement with the lift test, cost over the lift test's."""
+    rows: list[Row] = []
+    reference: Bools | None = None
+    spent = 0.0
+    for name, (change, ask) in variants().items():
+        held: list[bool] = []
+        with cpu() as clock:
+            for one in tables:
+                grasps, placed = one.clear
+                scene = build(
+                    one.subject.hand, one.subject.obj, one.subject.pieces, MujocoOptions(), placed.supports
+                )  # fmt: skip
+                change(scene)
+                test = Lift(scene, placed)
+                held += [ask(test, grasps, row) for row in range(len(grasps))]
+        now = np.array(held, bool)
+        if reference is None:
+            reference, spent = now, clock.seconds
+        rows.append(
+            {
+                "model": name,
+                "held": share(int(now.sum()), len(now)),
+                "agreement": share(int((now == reference).sum()), len(now)),
+                "only_here": int((now & ~reference).sum()),
+                "only_lift": int((~now & reference).sum()),
+                "cost_ratio": clock.seconds / spent,
+            }
+        )
+    return rows
+
+
+def straight(tables: list[OnTable]) -> Row:
+    """Grasps that only a bent way could save: clear at contact, closing and lifting, but not on any straight one."""
+    lost = [
+        (np.minimum(np.minimum(one.way.contact, one.way.closing), one.way.lifting) >= MARGIN_M) & ~one.way.clear
+        for one in tables
+    ]
+    every = np.concatenate(lost)
+    return share(int(every.sum()), len(every))
+
+
+def slabs(tables: list[OnTable]) -> Row:
+    """Planning on a half-space against planning on a slab of six planes."""
+    half, slab = 0.0, 0.0
+    clear = []
+    for one in tables:
+        on_slab = Placed((SLAB,), one.placed.object_pose, one.placed.index)
+        with cpu() as clock:
+            one.planned(one.placed)
+        half += clock.seconds
+        with cpu() as clock:
+            found = one.planned(on_slab)
+        slab += clock.seconds
+        clear.append(plan_way(one.subject.hand, one.subject.obj, found, one.placed).clear)
+    now = np.concatenate(clear)
+    return {
+        "cost_ratio": slab / half,
+        "clear": share(int(now.sum()), len(now)),
+        "clear_half_space": share(int(sum(one.way.clear.sum() for one in tables)), len(now)),
+    }
+
+
+def study(subjects: list[Subject], count: int) -> dict[str, Any]:
+    """Everything about scenes, of `count` grasps of each object."""
+    tables = [OnTable(replace(subject, count=count)) for subject in subjects]
+    rows = judged(tables)
+    return {"variants": rows, "straight_only": straight(tables), "slab": slabs(tables)}
