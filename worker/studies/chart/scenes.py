@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,15 +47,26 @@ FILTERED: Final = "free, filtered"
 SHARES: Final = ("clear", "lift", "lift_hard")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Place:
-    """An object in its scenes."""
+    """An object in its scenes, which are made when the first setting that is not kept is tried."""
 
     thing: Thing
-    true: ObjectModel
-    """As the judge sees it: the same for all settings."""
-    pieces: ConvexPieces
-    scenes: Scenes
+    spec: SceneSpec
+
+    @cached_property
+    def true(self) -> ObjectModel:
+        """As the judge sees it: the same for all settings."""
+        return self.thing.load(TRUE_ERROR_M)
+
+    @cached_property
+    def pieces(self) -> ConvexPieces:
+        return decompose(self.true)
+
+    @cached_property
+    def scenes(self) -> Scenes:
+        poses = rest_poses(self.spec, self.true, count=4, seed=SEED)["scene/object_pose"]
+        return Scenes(supports_of(self.spec), poses)
 
 
 def scene_chart(
@@ -77,10 +89,10 @@ def scene_chart(
     """
     runs: list[Row] = []
     for thing in things:
-        place = _place(thing, spec)
+        place = Place(thing, spec)
         for hand in hands:
             for setting, way in _ways(settings):
-                runs.append(_kept(setting, way, hand, place, spec, work))
+                runs.append(_kept(setting, way, hand, place, work))
                 say(_line(runs[-1]))
             keep(_result(runs, settings, spec))
     return _result(runs, settings, spec)
@@ -95,13 +107,7 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
     return found
 
 
-def _place(thing: Thing, spec: SceneSpec) -> Place:
-    true = thing.load(TRUE_ERROR_M)
-    poses = rest_poses(spec, true, count=4, seed=SEED)["scene/object_pose"]
-    return Place(thing, true, decompose(true), Scenes(supports_of(spec), poses))
-
-
-def _kept(setting: Setting, way: str, hand: HandModel, place: Place, spec: SceneSpec, work: Path | None) -> Row:
+def _kept(setting: Setting, way: str, hand: HandModel, place: Place, work: Path | None) -> Row:
     """What the setting finds on the pair, from its file where it was found before."""
     said = {
         "way": way, "method": setting.method, "fidelity": setting.fidelity, "hand": hand.name,
@@ -109,7 +115,8 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: Place, spec: Scene
     }  # fmt: skip
     if work is None:
         return said | _tried(setting, way, hand, place)
-    terms = [said, setting.knobs.model_dump(mode="json"), spec.model_dump(mode="json"), hand.digest, place.true.digest]
+    told = place.spec.model_dump(mode="json")
+    terms = [said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
     # What is found follows from the code of planners too: another revision begins anew.
     file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize']])}.json"
     if not file.is_file():

@@ -65,7 +65,7 @@ _TEST: Final = "tests/worker/studies/test_stability_scenes.py::"
 
 def height_map(
     hands: Sequence[HandModel], *, heights: Sequence[float] = HEIGHTS_MM, sides: Sequence[float] = SIDES_MM,
-    fidelity: str = "draft", count: int = 12, run: Run = ALONE, say: Say = lambda line: None,
+    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
 ) -> StabilityMap:  # fmt: skip
     """Boxes from a plate to a tower on a table."""
     cells = [
@@ -83,7 +83,7 @@ def height_map(
 
 def wall_map(
     hands: Sequence[HandModel], *, gaps: Sequence[float] = GAPS_MM, walls: Sequence[str] = tuple(WALLS),
-    fidelity: str = "draft", count: int = 12, run: Run = ALONE, say: Say = lambda line: None,
+    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
 ) -> StabilityMap:  # fmt: skip
     """A box with walls at a distance from its sides."""
     cells = [
@@ -102,7 +102,7 @@ def wall_map(
 
 def neighbour_map(
     hands: Sequence[HandModel], *, gaps: Sequence[float] = GAPS_MM, around: Sequence[str] = tuple(NEIGHBOURS),
-    fidelity: str = "draft", count: int = 12, run: Run = ALONE, say: Say = lambda line: None,
+    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
 ) -> StabilityMap:  # fmt: skip
     """A box among boxes as large as itself."""
     cells = [
@@ -123,7 +123,7 @@ def neighbour_map(
 
 def size_map(
     hands: Sequence[HandModel], *, ratios: Sequence[float] = RATIOS, kinds: Sequence[str] = KINDS,
-    fidelity: str = "draft", count: int = 12, run: Run = ALONE, say: Say = lambda line: None,
+    fidelity: str = "draft", count: int = 8, run: Run = ALONE, say: Say = lambda line: None,
 ) -> StabilityMap:  # fmt: skip
     """Cubes from a crumb to as large as the hand, afloat and in scenes."""
     cells = []

@@ -28,7 +28,7 @@ def run(
 
     hands = [model] if quick else [model, *(hand_from_path(name) for name in OTHER_HANDS if name != model.name)]
     gaps = (5, 80) if quick else scenes.GAPS_MM
-    place: dict[str, Any] = {"count": 2 if quick else 12, "run": work, "say": say}
+    place: dict[str, Any] = {"count": 2 if quick else 8, "run": work, "say": say}
     lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
     studies: dict[str, Callable[[], StabilityMap]] = {
         "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
