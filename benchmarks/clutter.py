@@ -1,6 +1,6 @@
 """Certified grasps of a target among neighbours on a table, per scene, within a time.
 
-usage: python -m benchmarks.clutter DATA_DIR [--hand allegro] [--targets 025_mug ...] [--scenes 2] [--neighbours 6]
+usage: python -m benchmarks.clutter DATA_DIR [--hand allegro] [--targets 025_mug ...] [--scenes 2] [--neighbours 4]
            [--seconds 60] [--json OUT]                            DATA_DIR holds hands/ and objects/
 
 Neighbours are drawn from the other objects and dropped with the target. The time runs from the first grasp planned to
@@ -22,6 +22,7 @@ import numpy as np
 
 from benchmarks.cells import HANDS
 from service.model.domain import BATCH_SIZE, FIDELITIES, JobOptions
+from service.model.errors import MeshError
 from service.model.scene_spec import SceneSpec
 from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path
@@ -66,13 +67,27 @@ def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: i
     }  # fmt: skip
 
 
+def crowd(
+    hand: HandModel, obj: ObjectModel, meshes: dict[str, Path], scene: int, said: argparse.Namespace
+) -> tuple[list[ObjectModel], dict[str, Any]]:
+    """The neighbours of a scene and its numbers; neighbours that do not come to rest apart are drawn anew."""
+    rng = np.random.default_rng([SEED, scene])
+    while True:
+        names = rng.choice(sorted(meshes), said.neighbours, replace=False)
+        others = [object_from_path(meshes[name], face_error_m=FIDELITY.face_error_m) for name in names]
+        try:
+            return others, study(hand, obj, others, scene, said.seconds)
+        except MeshError as error:
+            sys.stderr.write(f"{error}\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--hand", default="allegro", choices=list(HANDS))
     parser.add_argument("--targets", nargs="+", default=["025_mug", "006_mustard_bottle", "077_rubiks_cube"])
     parser.add_argument("--scenes", type=int, default=2)
-    parser.add_argument("--neighbours", type=int, default=6)
+    parser.add_argument("--neighbours", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--json", type=Path)
     said = parser.parse_args()
@@ -83,10 +98,8 @@ def main() -> None:
     for target in said.targets:
         obj = object_from_path(meshes[target], face_error_m=FIDELITY.face_error_m)
         for scene in range(said.scenes):
-            rest = [name for name in meshes if name != target]
-            names = np.random.default_rng([SEED, scene]).choice(rest, said.neighbours, replace=False)
-            others = [object_from_path(meshes[name], face_error_m=FIDELITY.face_error_m) for name in names]
-            row = {"target": target, "scene": scene, **study(hand, obj, others, scene, said.seconds)}
+            others, row = crowd(hand, obj, {n: p for n, p in meshes.items() if n != target}, scene, said)
+            row = {"target": target, "scene": scene, **row}
             rows.append(row)
             sys.stdout.write(
                 f"| {target} | {scene} | {len(others)} | {row['gap']:.0f} | {row['certified']} | {row['tried']} | "
