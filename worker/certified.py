@@ -21,7 +21,7 @@ from service.model.domain import BATCH_SIZE, JobOptions
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import Wanted, synthesize
+from worker.planners import Wanted, fitting_pairs, synthesize
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
@@ -109,9 +109,11 @@ def certified_grasps(
         run: told of the share that is done; asked often whether to stop. Its device is the planner's.
 
     Raises:
+        InputError: the object does not fit into the gripper.
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
+    fitting_pairs(hand, obj)
     work = _Work(hand, obj, request, batch, run)
     work.scenes = scenes
     with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:

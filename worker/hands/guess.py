@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
+from worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, slides
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel, PalmFrame
 from worker.hands.options import HandOptions
@@ -23,6 +24,10 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     """The hand with fingertips, closing, palm and preshape filled in: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
     hand = replace(hand, closing=_closing_by_limits(hand))
+    if hand.dofs <= MAX_DOFS or slides(hand).any():
+        hand = replace(hand, closing=_closing_seen(hand, dict(_by_dof(hand, tree, options.closing))))
+        if (jaws := find_jaws(hand)) is not None:
+            return _gripper(hand, jaws, tree, options)
     approach = _stated_approach(tree, options)
     if approach is None:
         approach = _guess_approach(hand)
@@ -35,6 +40,52 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     hand = replace(hand, closing=closing)
     hand = replace(hand, preshape=_preshape(hand, tree, options))
     return replace(hand, palm=_palm(hand, tree, options, approach))
+
+
+def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
+    """The hand with what its jaws tell: it comes open, the pads ahead, and takes hold between them."""
+    approach = _stated_approach(tree, options)
+    if approach is None:
+        approach = _snapped(_ahead(hand, jaws))
+    pads = tuple(body for side in jaws.bodies for body in side if body > 0)
+    hand = replace(hand, fingertips=hand.fingertips if options.fingertips else pads)
+    hand = replace(hand, preshape=_preshape(hand, tree, options, share=0.0))
+    if options.palm is None:
+        between = jaws.middle[len(jaws.middle) // 2]
+        corners = [piece.vertices for piece in hand.pieces if piece.body == 0]
+        height = float((np.concatenate(corners) @ approach).max()) if corners else 0.0
+        # A jaw that is part of the palm reaches as far as the pads do.
+        centre = between + min(height - float(between @ approach), 0.0) * approach
+        return replace(hand, palm=PalmFrame(centre, approach))
+    return replace(hand, palm=_palm(hand, tree, options, approach))
+
+
+def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
+    """Direction from the palm to between the pads, across the line on which they close."""
+    half = len(jaws.q) // 2
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(jaws.q[half]))[0]
+    palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
+    bases = [poses[b, :3] for b in range(1, hand.bodies) if hand.parent[b] == 0]
+    way = jaws.middle[half] - np.mean(palm or bases, axis=0)
+    return np.asarray(way - (way @ jaws.axis[half]) * jaws.axis[half])
+
+
+def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
+    """Closing of a hand that may be a gripper: as stated, else as its surfaces come together, else by its limits.
+
+    Raises:
+        HandError: fingers slide, and nothing opposes them.
+    """
+    seen = closing_by_geometry(hand)
+    if not seen.any() and not stated and slides(hand).all():
+        raise HandError(
+            f"no two surfaces of the hand come together when {', '.join(hand.dof_names[:4])} moves: its fingers are "
+            "missing or have no collision shapes; add them"
+        )
+    closing = np.where((seen == 0) & ~slides(hand), hand.closing, seen)
+    for dof, direction in stated.items():
+        closing[dof] = np.sign(direction)
+    return closing
 
 
 def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
@@ -94,6 +145,11 @@ def _guess_approach(hand: HandModel) -> Floats:
     mean = _unit(way) + _unit(ahead)
     if np.linalg.norm(mean) < 1e-6:
         return np.array([0.0, 0, 1])
+    return _snapped(mean)
+
+
+def _snapped(mean: Floats) -> Floats:
+    """The direction as a unit vector, on a root axis where it is within 40 degrees of one."""
     mean = _unit(mean)
     axis = int(np.argmax(np.abs(mean)))
     if abs(mean[axis]) > np.cos(np.deg2rad(40)):
@@ -143,8 +199,8 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     return PalmFrame(through + (height - through @ approach) * approach, approach)
 
 
-def _preshape(hand: HandModel, tree: Tree, options: HandOptions) -> Floats:
-    q = posture(hand, PRESHAPE_SHARE)
+def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = PRESHAPE_SHARE) -> Floats:
+    q = posture(hand, share)
     for dof, value in _by_dof(hand, tree, options.preshape):
         if not hand.lower[dof] - 1e-6 <= value <= hand.upper[dof] + 1e-6:
             raise HandError(

@@ -18,6 +18,7 @@ from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, un
 from service.store.hand_files import files_of_hand
 from service.store.hand_main import hand_name, main_of
 from worker.hands.collisions import resting_neighbours
+from worker.hands.drive import with_drive
 from worker.hands.guess import complete
 from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
 from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
@@ -58,6 +59,7 @@ def assemble(
     """The model of a checked robot and options."""
     tree = build_tree(robot, options)
     hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest), tree, options)
+    hand = with_drive(hand, options, assumed_efforts(robot, tree.dof_names, options))
     return replace(hand, neighbours=resting_neighbours(hand))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.fitting import fitting_pairs
 from worker.planners.port import Method, Options, Planner, Wanted
 from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner
 from worker.run import ALONE, Run
@@ -20,6 +21,7 @@ __all__ = [
     "Planner",
     "Run",
     "Wanted",
+    "fitting_pairs",
     "method",
     "method_names",
     "planner",
@@ -36,5 +38,10 @@ def synthesize(
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
 ) -> GraspSet:
-    """Grasps by the named method with its own `options`; see `Planner`."""
+    """Grasps by the named method with its own `options`; see `Planner`.
+
+    Raises:
+        InputError: the object does not fit into the gripper; see `fitting_pairs`.
+    """
+    fitting_pairs(hand, obj)
     return planner(method, options, in_scenes=wanted.placed is not None)(hand, obj, wanted, run)

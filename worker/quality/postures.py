@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from service.model.transforms import quat_rotate
 from worker.grasps import Posture
+from worker.hands.jaws import jaws_of, slides
 from worker.hands.jacobian import generalized_forces
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
+from worker.quality.jaw_squeeze import jaw_squeeze
 from worker.quality.probe import Distances, Probe, probe_of
 from worker.quality.squeeze import Contacts, Hold, balanced
 from worker.simulation.obstacles import body_distances
@@ -33,8 +35,9 @@ PALM_CLEARANCE_M: Final = 0.0005
 #: Share of plain opening, against `HandModel.closing`, in the way a finger leaves; the rest is along the contact
 #: normals, so that the finger comes back without dragging the object along.
 PLAIN_OPENING: Final = 0.3
-#: Opening steps of each finger [rad, or m for prismatic dofs], and their number.
+#: Opening steps of each finger [rad], of sliding ones [m], and their number.
 OPENING_STEP: Final = 0.05
+SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
 #: A finger may run into the rest of the hand by this much more than it does in the grasp [m]; it is looked at in these
 #: shares of its way, and one that jams opens half as far, at the last of so many looks not at all.
@@ -99,6 +102,9 @@ def squeeze(
     friction: float = FRICTION,
 ) -> Posture:
     """N commanded postures that press: q + Kp^-1 J^T f, the root unchanged; see `worker.quality.squeeze`."""
+    if (jaws := jaws_of(hand)) is not None:
+        probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
+        return jaw_squeeze(probe, jaws, grasp, total_normal_force=total_normal_force)
     holds = hold_forces(hand, obj, grasp, total_normal_force=total_normal_force, friction=friction)
     torque = np.array([h.torque for h in holds]).reshape(len(grasp), hand.dofs)
     q = hand.reduce(grasp.joint_positions) + torque / hand.stiffness
@@ -158,9 +164,24 @@ def _pregrasp(probe: Probe, grasp: Posture, placed: Placed | None) -> Posture:
 
 def _finger_of_dof(hand: HandModel) -> NDArray[np.int32]:
     """(D,) the first finger that each dof drives; -1: none, so it stays when fingers open."""
-    finger = finger_of_body(hand)
+    finger = _finger_of_body(hand)
     driven = [finger[np.flatnonzero((hand.dof == d) & (finger >= 0))] for d in range(hand.dofs)]
     return np.array([f[0] if len(f) else -1 for f in driven], np.int32)
+
+
+def _finger_of_body(hand: HandModel) -> NDArray[np.int32]:
+    """(L,) what opens as one: a finger, as `finger_of_body` has them; of a gripper all that one dof moves."""
+    if jaws_of(hand) is None:
+        return finger_of_body(hand)
+    out = np.full(hand.bodies, -1, np.int32)
+    for body in range(1, hand.bodies):
+        out[body] = out[hand.parent[body]] if out[hand.parent[body]] >= 0 else hand.dof[body]
+    return out
+
+
+def _fingers(hand: HandModel) -> int:
+    """Size of arrays by finger."""
+    return max(1, len(hand.fingertips), int(_finger_of_body(hand).max()) + 1)
 
 
 def _leaving(probe: Probe, found: Distances, finger: NDArray[np.int32]) -> Floats:
@@ -186,6 +207,7 @@ def _leaving(probe: Probe, found: Distances, finger: NDArray[np.int32]) -> Float
 def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
     """(B, K, D) dof values on the way along `direction` (B, D), the grasp first, all within the limits."""
     step = OPENING_STEP * np.arange(OPENING_STEPS + 1)
+    direction = direction * np.where(slides(hand), SLIDING_STEP_M / OPENING_STEP, 1.0)
     path = q[:, None] + step[None, :, None] * direction[:, None]
     # A grasp may stand a hair outside its limits: opening must not make a jump of that.
     return np.clip(path, np.minimum(hand.lower, q)[:, None], np.maximum(hand.upper, q)[:, None])
@@ -197,9 +219,9 @@ def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     A hand whose fingers have all been `CLEARANCE_M` away is not looked at farther on its way: -inf there.
     """
     count, steps, _ = paths.shape
-    finger = finger_of_body(probe.hand)[probe.points.body]
+    finger = _finger_of_body(probe.hand)[probe.points.body]
     points = np.flatnonzero(finger >= 0)
-    out = np.full((count, steps, max(1, len(probe.hand.fingertips))), -np.inf)
+    out = np.full((count, steps, _fingers(probe.hand)), -np.inf)
     going = np.arange(count)
     for first in range(0, steps, _LOOK_STEPS):
         look = paths[going, first : first + _LOOK_STEPS]
@@ -257,11 +279,11 @@ def _without_jams(probe: Probe, hand_pose: Floats, q: Floats, opened: Floats, pl
 def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     """(B, fingers) deepest that each finger is in the rest of the hand, or it in the finger, on paths (B, K, D)."""
     count, steps, _ = paths.shape
-    finger = finger_of_body(probe.hand)
+    finger = _finger_of_body(probe.hand)
     joints = probe.hand.expand(paths).reshape(count * steps, -1)
     bodies = body_poses(probe.hand, np.repeat(hand_pose, steps, axis=0), joints)
     depth = probe.self_depth(bodies, probe.posed_points(bodies)).reshape(count, steps, -1).max(axis=1)
-    out = np.zeros((count, max(1, len(probe.hand.fingertips))))
+    out = np.zeros((count, _fingers(probe.hand)))
     for f in range(out.shape[1]):
         mine = finger == f
         if mine.any():
@@ -272,8 +294,8 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
 def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
     """(B, fingers) least distance of each finger from the obstacles of its scene on paths (B, K, D); inf: no finger."""
     count, steps, _ = paths.shape
-    finger = finger_of_body(hand)
-    out = np.full((count, max(1, len(hand.fingertips))), np.inf)
+    finger = _finger_of_body(hand)
+    out = np.full((count, _fingers(hand)), np.inf)
     for number, scene in enumerate(placed.scenes):
         rows = np.flatnonzero(placed.index == number)
         if not len(rows):

@@ -12,21 +12,22 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from worker.simulation.device import to_wxyz, to_xyzw
+from worker.simulation.device import joint_units, to_wxyz, to_xyzw
 from worker.simulation.kernels import contact
 from worker.simulation.model import MAX_DILATION, Model
 from worker.simulation.state import Floats, HandState, Schedule, still_schedule
 
 
 class Tables:
-    """A schedule on the device."""
+    """A schedule on the device; its rate of joints times the `unit` (D,) of each dof."""
 
-    def __init__(self, schedule: Schedule) -> None:
+    def __init__(self, schedule: Schedule, unit: Floats) -> None:
         self.dilation = wp.array(schedule.dilation, dtype=wp.float32)
         self.penetration = wp.array(schedule.penetration, dtype=wp.float32)
         self.object_penetration = wp.array(schedule.object_penetration, dtype=wp.float32)
         self.self_penetration = wp.array(schedule.self_penetration, dtype=wp.float32)
-        self.rates = wp.array(schedule.rates, dtype=wp.float32)
+        joints = schedule.rates[:, 2:] * unit
+        self.rates = wp.array(np.concatenate([schedule.rates[:, :2], joints], axis=1), dtype=wp.float32)
 
 
 class Contacts:
@@ -62,10 +63,11 @@ class Data:
 
     def __init__(self, model: Model, capacity: int) -> None:
         self.device, self.capacity = model.device, capacity
+        self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
             self.contacts = Contacts(capacity, model.count)
             self.depths = Depths(capacity)
-            self.schedule = Tables(still_schedule())
+            self.schedule = Tables(still_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
             self.states = _solver_states(model, capacity)
 
@@ -129,7 +131,7 @@ class Data:
         if len(schedule) and schedule.dilation.max() > MAX_DILATION:
             raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
         with wp.ScopedDevice(self.device):
-            self.schedule = Tables(schedule)
+            self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
         """(n,) deepest penetration of each hand at the last evaluation, of all kinds [m]."""

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from worker.hands.jaws import slides
 from worker.hands.model import ConvexPiece, HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.kernels import kinematics, pieces, surface
@@ -19,6 +20,8 @@ Floats = NDArray[np.float64]
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
 #: Distances farther than this from the surface are never asked for [m].
 FIELD_REACH: Final = 0.06
+#: Way of a sliding joint that moves a fingertip as a revolute joint of a finger does by one radian [m].
+SLIDE_M: Final = 0.05
 
 
 def to_xyzw(quaternion: Floats) -> Floats:
@@ -29,6 +32,11 @@ def to_xyzw(quaternion: Floats) -> Floats:
 def to_wxyz(quaternion: Floats) -> Floats:
     """graspd's order w x y z from Warp's x y z w, (..., 4)."""
     return np.roll(quaternion, 1, axis=-1)
+
+
+def joint_units(hand: HandModel) -> Floats:
+    """(D,) by how much a step of each dof is that of a revolute joint: 1, or of a sliding one `SLIDE_M`."""
+    return np.where(slides(hand), SLIDE_M, 1.0)
 
 
 @dataclass(frozen=True)

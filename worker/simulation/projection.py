@@ -108,6 +108,7 @@ class Projection:
         g = self.vector.numpy()[:n].astype(float)
         rows = np.minimum(self.residuals.count.numpy()[:n], CAPACITY)
         scale = np.repeat(o.scale, [3, 3, self.model.dofs])
+        scale[6:] *= self.data.unit
         H = H * scale[:, None] * scale[None, :]
         damping = o.damping * np.maximum(rows, 1)
         H[:, np.arange(len(scale)), np.arange(len(scale))] += damping[:, None]

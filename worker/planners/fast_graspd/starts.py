@@ -1,4 +1,5 @@
-"""Approach sampling: where the hands start. The palm looks at a random point of the surface, from a little way off.
+"""Approach sampling: where the hands start. The palm looks at a random point of the surface, from a little way off;
+jaws of a gripper stand around two opposite places (`jaw_starts`).
 
 A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
 """
@@ -15,6 +16,8 @@ from service.model.errors import InputError
 from service.model.transforms import cross, quat_from_axis_angle, quat_from_matrix, quat_multiply
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd import jaw_starts
+from worker.planners.fast_graspd.jaw_starts import JawStarts
 from worker.simulation.data import Data
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
@@ -150,22 +153,26 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
     hand, obj = model.hand.model, model.obj.model
-    probe = Probe(model, len(indices) * each * len(RETREATS))
+    jaws = JawStarts.of(hand, obj)
+    retreats = RETREATS if jaws is None else jaw_starts.RETREATS
+    probe = Probe(model, len(indices) * each * len(retreats))
     pair = _Pair.of(hand, obj)
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     best: list[tuple[float, HandState] | None] = [None] * len(generators)
     open_ = list(range(len(generators)))
     for _ in range(DRAWS):
-        draws = [draw(pair, generators[i]) for i in open_]
-        states = _retreated(draws)
-        depth = probe.depths(states).reshape(len(draws), len(RETREATS))
+        if jaws is None:
+            states = _retreated([draw(pair, generators[i]) for i in open_])
+        else:
+            states = jaws.draw(np.array([generators[i].random(jaw_starts.UNIFORM) for i in open_]))
+        depth = probe.depths(states).reshape(len(open_), len(retreats))
         for row, i in enumerate(open_):
             # The nearest clear distance, or else the least deep.
             clear = np.flatnonzero(depth[row] <= CLEAR)
             pick = int(clear[0]) if len(clear) else int(np.argmin(depth[row]))
             found = best[i]
             if found is None or depth[row, pick] < found[0]:
-                k = row * len(RETREATS) + pick
+                k = row * len(retreats) + pick
                 best[i] = (float(depth[row, pick]), states[k : k + 1])
         open_ = [i for i in open_ if (b := best[i]) is None or b[0] > CLEAR]
         if not open_:

@@ -47,7 +47,7 @@ def adam(
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Adam (Kingma & Ba 2015) with one rate each for translation, rotation and joints (columns of `rate`). Over B."""
+    """Adam (Kingma & Ba 2015) with one rate each for translation, rotation and every dof (columns of `rate`). Over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
@@ -69,7 +69,7 @@ def adam(
         elif column < 6:
             dw[column - 3] = rate_in[it, 1] * step
         else:
-            move(b, column, rate_in[it, 2] * step, lower_in, upper_in, 1, q_inout)
+            move(b, column, rate_in[it, column - 4] * step, lower_in, upper_in, 1, q_inout)
     pivot_inout[b] = pivot_inout[b] + dx
     rotation_inout[b] = turn(rotation_inout[b], dw)
 
@@ -105,7 +105,7 @@ def gradient_descent(
         elif column < 6:
             dw[column - 3] = rate_in[it, 1] * step
         else:
-            move(b, column, rate_in[it, 2] * step, lower_in, upper_in, clamp_in, q_inout)
+            move(b, column, rate_in[it, column - 4] * step, lower_in, upper_in, clamp_in, q_inout)
     pivot_inout[b] = pivot_inout[b] + dx
     rotation_inout[b] = turn(rotation_inout[b], dw)
 

@@ -1,0 +1,273 @@
+"""The jaws of a gripper: which surfaces meet when it closes, how far they open, and along which line.
+
+A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
+pads, together. Everything is found from geometry, so a joint at 0 may as well be open as closed.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel, JointType, SurfacePoints
+from worker.hands.surface import sample_surface
+
+Ints = NDArray[np.intp]
+
+#: Most degrees of freedom of a gripper's closing.
+MAX_DOFS: Final = 2
+#: Points that stand for the hand's surface.
+_POINTS: Final = 1600
+#: Two surfaces face each other where their normals are opposite to within 37 degrees ...
+_FACING_COS: Final = 0.8
+#: ... and one lies before the other, no farther to the side than so many distances between sample points.
+_ASIDE: Final = 1.5
+#: Of facing surfaces the ones that come together count: those with this share of the fastest approach.
+_FAST: Final = 0.5
+#: A pad is what of a jaw lies within this of the place that touches first [m].
+_PAD_DEPTH_M: Final = 0.003
+#: Surfaces look where they go if they move along their normals with this share of the fastest point's speed.
+_LEADING: Final = 0.3
+#: A body carries a pad if it faced the other jaw with this share of the area of the one that faced it most.
+_PAD_SHARE: Final = 0.4
+#: Postures between open and closed that are looked at.
+_STEPS: Final = 17
+#: Pads that are this near touch [m].
+_TOUCH_M: Final = 2e-4
+
+
+@dataclass(frozen=True)
+class Jaws:
+    """What closes in a gripper. K postures from open to where the pads meet, or as near as the limits let them."""
+
+    q: Floats
+    """(K, D) dof values."""
+    width: Floats
+    """(K,) clear width between the pads [m]."""
+    middle: Floats
+    """(K, 3) point between the pads, root frame [m]."""
+    axis: Floats
+    """(K, 3) unit vector from the first pad to the second, root frame."""
+    speed: Floats
+    """(K, D, 2) way of each pad towards the other one with each dof [m/rad or 1]."""
+    bodies: tuple[tuple[int, ...], tuple[int, ...]]
+    """Bodies that carry the first and the second pad; 0 is the root, a jaw that stands still."""
+    points: SurfacePoints
+    """Points on both pads."""
+    first: NDArray[np.bool_]
+    """(P,) which of them are on the first."""
+    length: float
+    """Extent of the pads along the approach that they were found with [m]."""
+
+    @cached_property
+    def opening(self) -> float:
+        """Widest clear width [m]."""
+        return float(self.width.max())
+
+    def speeds(self, q: Floats) -> Floats:
+        """(n, D, 2) `speed` at dof values (n, D)."""
+        apart = np.linalg.norm((q[:, None] - self.q) / np.maximum(np.ptp(self.q, axis=0), 1e-9), axis=2)
+        return self.speed[np.argmin(apart, axis=1)]
+
+    def at(self, width: Floats) -> tuple[Floats, Floats, Floats]:
+        """Dof values (n, D), middles (n, 3) and axes (n, 3) at clear widths (n,), or at the nearest there is."""
+        order = np.argsort(self.width, kind="stable")
+        q, middle, axis = (
+            np.column_stack([np.interp(width, self.width[order], column[order]) for column in array.T])
+            for array in (self.q, self.middle, self.axis)
+        )
+        return q, middle, axis / np.linalg.norm(axis, axis=1, keepdims=True)
+
+
+def closing_by_geometry(hand: HandModel) -> Floats:
+    """(D,) +1, -1: the direction in which each dof brings opposing surfaces together; 0: it moves none together.
+
+    Summed over postures from all dofs at their lower limits to all at their upper ones, the area of facing surfaces
+    times the speed at which they part; what is left after both signs have cancelled decides.
+    """
+    points = _points(hand)
+    balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
+    for share in np.linspace(0.05, 0.95, 5):
+        q = hand.lower + share * hand.span
+        place, normal = _posed(hand, points, q)
+        motions = [_motion(hand, points, q, dof) for dof in range(hand.dofs)]
+        moved = np.max([_ahead(motion, normal) for motion in motions], axis=0) > _LEADING
+        first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
+        for dof, motion in enumerate(motions):
+            rate = np.einsum("ni,ni->n", motion[second] - motion[first], normal[first])
+            # What slides along has rounding for a rate.
+            rate[np.abs(rate) < 1e-3 * np.abs(motion).max(initial=1e-12)] = 0.0
+            balance[dof] += points.area[first] @ rate
+            total[dof] += points.area[first] @ np.abs(rate)
+    return np.where(np.abs(balance) > 0.2 * np.maximum(total, 1e-12), -np.sign(balance), 0.0)
+
+
+def jaws_of(hand: HandModel) -> Jaws | None:
+    """The jaws of a complete hand, or None where it is no gripper; from memory where they were asked for before."""
+    with _lock:
+        if hand.content not in _found:
+            _found[hand.content] = find_jaws(hand, hand.palm.approach)
+        return _found[hand.content]
+
+
+_found: LRUCache[str, Jaws | None] = LRUCache(32)
+_lock = threading.Lock()
+
+
+def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
+    """The jaws of a hand whose `closing` is known; None where more dofs close it, or nothing opposes."""
+    closing = np.flatnonzero(hand.closing)
+    if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
+        return None
+    points = _points(hand)
+    path = _path(hand, np.linspace(0.0, 1.0, _STEPS))
+    met = _meeting(hand, points, path)
+    if met is None:
+        return None
+    closed, first, second, faced = met
+    place, normal = _posed(hand, points, closed)
+    sides = _sides(place, normal, points, np.unique(np.concatenate([first, second])), faced)
+    if sides is None:
+        return None
+    share = float(np.max(np.abs(closed - path[0]) / np.maximum(np.abs(path[-1] - path[0]), 1e-12)))
+    return _measured(hand, points, sides, _path(hand, np.linspace(0.0, share, _STEPS)), approach)
+
+
+def _points(hand: HandModel) -> SurfacePoints:
+    # Seen half open: in a closed gripper the pads may lie inside each other.
+    return sample_surface(replace(hand, preshape=(hand.lower + hand.upper) / 2), _POINTS)
+
+
+def _path(hand: HandModel, shares: Floats) -> Floats:
+    """(K, D) from open (0) to closed (1); a dof that closes nothing stays."""
+    opened = np.where(hand.closing < 0, hand.upper, hand.lower)
+    closed = np.where(hand.closing < 0, hand.lower, hand.upper)
+    rest = np.clip(0.0, hand.lower, hand.upper)
+    moved = opened + shares[:, None] * (closed - opened)
+    return np.where(hand.closing == 0, rest, moved)
+
+
+def _posed(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Floats, Floats]:
+    pose = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0][points.body]
+    return apply(pose, points.position), quat_rotate(pose[:, 3:], points.normal)
+
+
+def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floats:
+    """(N, 3) derivative of the points by a dof [m/rad or 1]."""
+    step = np.zeros(hand.dofs)
+    step[dof] = 1e-4 * max(float(hand.span[dof]), 1e-3)
+    return (_posed(hand, points, q + step)[0] - _posed(hand, points, q - step)[0]) / (2 * step[dof])
+
+
+def _ahead(motion: Floats, normal: Floats) -> Floats:
+    """(N,) speed of points along their normals, either way, over that of the fastest point."""
+    return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
+
+
+def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
+    """Those of the points `among`, for each the nearest one of another body that faces it, and the gap [m]."""
+    aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
+    first, second, gaps = [], [], []
+    for i in among:
+        way = place - place[i]
+        gap = way @ normal[i]
+        near = (gap > -_TOUCH_M) & (normal @ normal[i] < -_FACING_COS) & (points.body != points.body[i])
+        near &= np.einsum("ni,ni->n", way, way) - gap * gap < aside * aside
+        found = np.flatnonzero(near)
+        if len(found):
+            j = int(found[np.argmin(gap[found])])
+            first.append(i)
+            second.append(j)
+            gaps.append(gap[j])
+    return np.array(first, np.intp), np.array(second, np.intp), np.array(gaps)
+
+
+def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
+    """The posture in which the pads meet, or the last of the path; the pairs of points that meet first; and (L,) the
+    area of each body that faced another one while they were apart, summed over postures."""
+    best: tuple[Floats, Ints, Ints, Floats] | None = None
+    step, faced = path[-1] - path[0], np.zeros(hand.bodies)
+    for k in range(len(path)):
+        place, normal = _posed(hand, points, path[k])
+        motion = sum((_motion(hand, points, path[k], d) * step[d] for d in range(hand.dofs)), np.zeros((1, 3)))
+        leading = np.einsum("ni,ni->n", motion, normal) > _LEADING * np.abs(motion).max(initial=1e-12)
+        first, second, gap = _facing(place, normal, points, np.flatnonzero(leading))
+        rate = np.einsum("ni,ni->n", motion[first] - motion[second], normal[first])
+        fast = rate > _FAST * rate.max(initial=1e-9)
+        if not fast.any():
+            continue
+        first, second, gap, rate = first[fast], second[fast], gap[fast], rate[fast]
+        when = np.maximum(gap, 0.0) / rate
+        for side in (first, second) if k < len(path) // 2 or not faced.any() else ():
+            faced += np.bincount(points.body[side], points.area[side], minlength=hand.bodies)
+        soonest = when <= np.quantile(when, 0.02) + _PAD_DEPTH_M / rate
+        best = path[k], first[soonest], second[soonest], faced
+        left = float(np.quantile(when, 0.02))
+        if left < 1.0 / (_STEPS - 1):
+            # They meet before the next posture.
+            return np.clip(path[k] + left * step, hand.lower, hand.upper), first[soonest], second[soonest], faced
+    return best
+
+
+def _sides(
+    place: Floats, normal: Floats, points: SurfacePoints, every: Ints, faced: Floats
+) -> tuple[Ints, Ints] | None:
+    """Points of the two pads, or None where they are not on different bodies."""
+    # The line along which most of the pads' area looks.
+    values, vectors = np.linalg.eigh((points.area[every, None] * normal[every]).T @ normal[every])
+    along = normal[every] @ vectors[:, int(np.argmax(values))]
+    one, two = (_on_pads(side, points, faced) for side in (every[along > _FACING_COS], every[along < -_FACING_COS]))
+    if not len(one) or not len(two) or set(points.body[one]) & set(points.body[two]):
+        return None
+    middle = place[every].mean(axis=0) @ vectors[:, int(np.argmax(values))]
+    # The first pad looks at the second one: it lies on the lower side of the line.
+    return (one, two) if (place[one].mean(axis=0) @ vectors[:, int(np.argmax(values))]) <= middle else (two, one)
+
+
+def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
+    """Points of a side on the bodies that faced the other one most: not on a link that only comes near in the end."""
+    most = float(faced[points.body[side]].max(initial=0.0))
+    return side[faced[points.body[side]] >= _PAD_SHARE * most]
+
+
+def _measured(
+    hand: HandModel, points: SurfacePoints, sides: tuple[Ints, Ints], path: Floats, approach: Floats | None
+) -> Jaws:
+    """Widths, middles and axes of the pads on a path."""
+    one, two = sides
+    width, middle, axes = np.zeros(len(path)), np.zeros((len(path), 3)), np.zeros((len(path), 3))
+    speed = np.zeros((len(path), hand.dofs, 2))
+    for k, q in enumerate(path):
+        place, normal = _posed(hand, points, q)
+        axis = normal[one].mean(axis=0) - normal[two].mean(axis=0)
+        axis /= np.linalg.norm(axis)
+        low, high = place[one] @ axis, place[two] @ axis
+        width[k] = float(np.quantile(high, 0.1) - np.quantile(low, 0.9))
+        middle[k] = (place[one].mean(axis=0) + place[two].mean(axis=0)) / 2
+        axes[k] = axis
+        for dof in range(hand.dofs):
+            motion = _motion(hand, points, q, dof)
+            speed[k, dof] = (motion[one] @ axis).mean(), -(motion[two] @ axis).mean()
+    both = np.concatenate([one, two])
+    place, _ = _posed(hand, points, path[len(path) // 2])
+    along = place[both] @ (approach if approach is not None else np.zeros(3))
+    bodies = tuple(tuple(sorted(set(points.body[side].tolist()))) for side in sides)
+    return Jaws(
+        path, np.maximum(width, 0.0), middle, axes, speed,
+        (bodies[0], bodies[1]),
+        SurfacePoints(points.body[both], points.position[both], points.normal[both], points.area[both]),
+        np.arange(len(both)) < len(one), float(np.ptp(along)),
+    )  # fmt: skip
+
+
+def slides(hand: HandModel) -> NDArray[np.bool_]:
+    """(D,) whether a dof drives a prismatic joint: its unit is the metre."""
+    return np.array([JointType.PRISMATIC in hand.joint_type[hand.dof == d] for d in range(hand.dofs)])

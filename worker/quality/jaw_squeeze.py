@@ -1,0 +1,50 @@
+"""The commanded posture that makes a gripper press: its jaws go on to where they touch, then by force over gain."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.transforms import apply
+from worker.grasps import Posture
+from worker.hands.jaws import Jaws
+from worker.hands.kinematics import body_poses
+from worker.quality.probe import Probe
+
+Floats = NDArray[np.float64]
+
+#: Share of their force that jaws press with that move each by itself: with all of it they give way to any push.
+SEPARATE_SHARE: Final = 0.8
+#: A pad that is farther from the object than this is not waited for [m].
+GAP_M: Final = 0.005
+
+
+def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force: float) -> Posture:
+    """N commanded postures of a gripper, within its stroke; the root unchanged.
+
+    Each pad is to press with half of `total_normal_force` [N], or with what the limits of the dofs leave: a dof that
+    moves both pads shares its limit between them. A gripper told to go beyond its stroke reports an error instead of
+    pressing, so what lies there is cut off.
+    """
+    hand = probe.hand
+    q = hand.reduce(np.asarray(grasp.joint_positions, float))
+    gaps = np.clip(_gaps(probe, jaws, grasp), 0.0, GAP_M)
+    speed = jaws.speeds(q)
+    ways = np.abs(speed).sum(axis=2)
+    share = SEPARATE_SHARE if np.count_nonzero(hand.closing) > 1 else 1.0
+    torque = np.minimum(0.5 * total_normal_force * ways, share * hand.effort)
+    moved = np.abs(speed) > 1e-6
+    travel = np.where(moved, gaps[:, None], 0.0).sum(axis=2) / np.maximum(ways, 1e-6)
+    q = q + hand.closing * (travel + torque / hand.stiffness)
+    return Posture(np.array(grasp.hand_pose, float), hand.expand(np.clip(q, hand.lower, hand.upper)))
+
+
+def _gaps(probe: Probe, jaws: Jaws, grasp: Posture) -> Floats:
+    """(N, 2) least distance of each pad to the object [m]."""
+    bodies = body_poses(probe.hand, grasp.hand_pose, grasp.joint_positions)
+    points = apply(bodies[:, jaws.points.body], jaws.points.position)
+    distance = probe.signed_distance(points.reshape(-1, 3))[0].reshape(points.shape[:2])
+    first = jaws.first
+    return np.stack([distance[:, first].min(axis=1), distance[:, ~first].min(axis=1)], axis=1)
