@@ -37,6 +37,4 @@ def with_drive(hand: HandModel, options: HandOptions, assumed: Sequence[str]) ->
     whole = "stiffness" in options.model_fields_set and not stated
     keeps = np.array([whole or dof in stated for dof in hand.dof_names])
     free = np.array([dof in assumed for dof in hand.dof_names])
-    return replace(
-        hand, stiffness=np.where(keeps, hand.stiffness, gain), effort=np.where(free, limit, hand.effort)
-    )
+    return replace(hand, stiffness=np.where(keeps, hand.stiffness, gain), effort=np.where(free, limit, hand.effort))

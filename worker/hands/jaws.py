@@ -40,6 +40,8 @@ _LEADING: Final = 0.3
 _PAD_SHARE: Final = 0.4
 #: Postures between open and closed that are looked at.
 _STEPS: Final = 17
+#: Pads face each other where the difference of their mean normals is longer than this: up to 120 degrees between them.
+_TOWARDS: Final = 1.0
 #: Pads that are this near touch [m].
 _TOUCH_M: Final = 2e-4
 
@@ -240,15 +242,17 @@ def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
 
 def _measured(
     hand: HandModel, points: SurfacePoints, sides: tuple[Ints, Ints], path: Floats, approach: Floats | None
-) -> Jaws:
-    """Widths, middles and axes of the pads on a path."""
+) -> Jaws | None:
+    """Widths, middles and axes of the pads on a path; None where they never look at each other."""
     one, two = sides
     width, middle, axes = np.zeros(len(path)), np.zeros((len(path), 3)), np.zeros((len(path), 3))
-    speed = np.zeros((len(path), hand.dofs, 2))
+    speed, facing = np.zeros((len(path), hand.dofs, 2)), np.zeros(len(path), bool)
     for k, q in enumerate(path):
         place, normal = _posed(hand, points, q)
         axis = normal[one].mean(axis=0) - normal[two].mean(axis=0)
-        axis /= np.linalg.norm(axis)
+        # Pads that look past each other hold nothing: jaws are not opened that far.
+        facing[k] = float(np.linalg.norm(axis)) > _TOWARDS
+        axis /= max(float(np.linalg.norm(axis)), 1e-9)
         low, high = place[one] @ axis, place[two] @ axis
         width[k] = float(np.quantile(high, 0.1) - np.quantile(low, 0.9))
         middle[k] = (place[one].mean(axis=0) + place[two].mean(axis=0)) / 2
@@ -257,11 +261,14 @@ def _measured(
             motion = _motion(hand, points, q, dof)
             speed[k, dof] = (motion[one] @ axis).mean(), -(motion[two] @ axis).mean()
     both = np.concatenate([one, two])
-    place, _ = _posed(hand, points, path[len(path) // 2])
+    if not facing[-1]:
+        return None
+    kept = slice(int(np.flatnonzero(~facing)[-1]) + 1 if not facing.all() else 0, None)
+    place, _ = _posed(hand, points, path[kept][len(path[kept]) // 2])
     along = place[both] @ (approach if approach is not None else np.zeros(3))
     bodies = tuple(tuple(sorted(set(points.body[side].tolist()))) for side in sides)
     return Jaws(
-        path, np.maximum(width, 0.0), middle, axes, speed,
+        path[kept], np.maximum(width, 0.0)[kept], middle[kept], axes[kept], speed[kept],
         (bodies[0], bodies[1]),
         SurfacePoints(points.body[both], points.position[both], points.normal[both], points.area[both]),
         np.arange(len(both)) < len(one), float(np.ptp(along)),

@@ -16,7 +16,7 @@ Vector = tuple[Finite, Finite, Finite]
 
 #: Position gain of the joints, Kp [N m/rad], where nothing is said: the value of the DexGraspBench protocol.
 DEFAULT_STIFFNESS: Final = 5.0
-#: The same of sliding joints [N/m], and of each pad of a gripper however it is driven: the gain above at a lever of 5 cm.
+#: The same of sliding joints [N/m], and of each pad of a gripper however it is driven: that gain at a lever of 5 cm.
 #: Stiffer drives lose their force in the gap of half a millimetre that a grasp leaves, and in soft contacts.
 DEFAULT_LINEAR_STIFFNESS: Final = 2_000.0
 #: Torque limit [N m] where the URDF gives none or 0: what FRoGGeR uses for the Allegro hand.

@@ -15,10 +15,10 @@ from worker.quality.probe import Probe
 
 Floats = NDArray[np.float64]
 
-#: Share of their force that jaws press with that move each by itself: with all of it they give way to any push.
-SEPARATE_SHARE: Final = 0.8
 #: A pad that is farther from the object than this is not waited for [m].
 GAP_M: Final = 0.005
+#: A dof moves a pad if it does so by this [m/rad or 1].
+LEAST_WAY: Final = 1e-4
 
 
 def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force: float) -> Posture:
@@ -30,14 +30,15 @@ def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force:
     """
     hand = probe.hand
     q = hand.reduce(np.asarray(grasp.joint_positions, float))
-    gaps = np.clip(_gaps(probe, jaws, grasp), 0.0, GAP_M)
-    speed = jaws.speeds(q)
-    ways = np.abs(speed).sum(axis=2)
-    share = SEPARATE_SHARE if np.count_nonzero(hand.closing) > 1 else 1.0
-    torque = np.minimum(0.5 * total_normal_force * ways, share * hand.effort)
-    moved = np.abs(speed) > 1e-6
-    travel = np.where(moved, gaps[:, None], 0.0).sum(axis=2) / np.maximum(ways, 1e-6)
-    q = q + hand.closing * (travel + torque / hand.stiffness)
+    gaps = np.maximum(_gaps(probe, jaws, grasp), 0.0)
+    speed = np.abs(jaws.speeds(q))
+    ways = np.maximum(speed.sum(axis=2), 1e-9)
+    # Both pads press alike, or they would push the object away: the weaker one tells how hard.
+    able = np.where(ways > LEAST_WAY, hand.effort / ways, np.inf).min(axis=1)
+    force = np.where((gaps < GAP_M).all(axis=1), np.minimum(0.5 * total_normal_force, able), 0.0)
+    travel = np.where(speed > LEAST_WAY, np.minimum(gaps, GAP_M)[:, None], 0.0).sum(axis=2) / ways
+    step = np.where(force > 0, 1.0, 0.0)[:, None] * travel + force[:, None] * ways / hand.stiffness
+    q = q + hand.closing * np.where(ways > LEAST_WAY, step, 0.0)
     return Posture(np.array(grasp.hand_pose, float), hand.expand(np.clip(q, hand.lower, hand.upper)))
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from service.model.transforms import quat_rotate
 from worker.grasps import Posture
-from worker.hands.jaws import jaws_of, slides
 from worker.hands.jacobian import generalized_forces
+from worker.hands.jaws import jaws_of, slides
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel

@@ -25,6 +25,11 @@ CLOSED = posture(((0, 0, 0), (0.065, 0.065)))
 STEP, DIFFERENCES = 1e-5, 1e-8
 
 
+def rigid_plates() -> HandModel:
+    """The plates with a drive that presses within its stroke."""
+    return dataclasses.replace(PLATES, stiffness=np.full(2, 1000.0))
+
+
 def coupled_hand() -> HandModel:
     """The two-finger hand with both joints driven by one dof: the right one half as fast."""
     return dataclasses.replace(
@@ -107,15 +112,21 @@ def test_forces_on_a_box_between_plates_balance() -> None:
 
 
 def test_plates_press_with_the_stated_force() -> None:
-    hand = plate_hand()
+    hand = rigid_plates()
     command = squeeze(hand, BOX, CLOSED, total_normal_force=20.0)
     pressed = (command.joint_positions - CLOSED.joint_positions) * hand.stiffness
     # Each plate carries half of the sum of normal forces, along its own slide.
     assert pressed[0] == pytest.approx([10.0, 10.0], rel=0.02)
 
 
+def test_plates_are_not_told_to_go_beyond_their_stroke() -> None:
+    # At 100 N/m the force would need a command 0.1 m behind the object: 35 mm are left.
+    command = squeeze(plate_hand(), BOX, CLOSED, total_normal_force=20.0)
+    assert command.joint_positions[0] == pytest.approx([0.1, 0.1])
+
+
 def test_squeeze_never_asks_more_than_the_hand_can() -> None:
-    weak = dataclasses.replace(plate_hand(), effort=np.array([3.0, 5.0]))
+    weak = dataclasses.replace(rigid_plates(), effort=np.array([3.0, 5.0]))
     command = squeeze(weak, BOX, CLOSED, total_normal_force=200.0)
     pressed = (command.joint_positions - CLOSED.joint_positions) * weak.stiffness
     assert (np.abs(pressed) <= weak.effort + 1e-9).all()
@@ -151,8 +162,10 @@ def test_a_grasp_s_postures_do_not_depend_on_its_companions() -> None:
 
 
 def test_a_finger_opens_no_farther_than_its_neighbour_lets_it() -> None:
-    """Behind the left plate, 10 mm away, stands a wall that belongs to the right one; alone it would open by 50 mm."""
-    wall = piece(2, trimesh.creation.box((0.03, 0.03, 0.01)), "box", (0.03, 0.03, 0.01), (0.0, 0.0, 0.09))
+    """Behind the left plate, 4 mm away, stands a wall that belongs to the right one; alone it would open by 6 mm."""
+    wall = piece(2, trimesh.creation.box((0.03, 0.03, 0.01)), "box", (0.03, 0.03, 0.01), (0.0, 0.0, 0.084))
     hand = dataclasses.replace(PLATES, digest="walled", pieces=(*PLATES.pieces, wall))
     opened = (CLOSED.joint_positions - pregrasp(hand, BOX, CLOSED).joint_positions)[0]
-    assert CLEARANCE_M < opened[0] <= 0.010 + JAM_M
+    assert 0.001 < opened[0] <= 0.004 + JAM_M
+    free = (CLOSED.joint_positions - pregrasp(PLATES, BOX, CLOSED).joint_positions)[0]
+    assert free[0] == pytest.approx(0.006)

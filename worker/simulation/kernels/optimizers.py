@@ -47,7 +47,7 @@ def adam(
     rotation_inout: wp.array(dtype=wp.quat),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Adam (Kingma & Ba 2015) with one rate each for translation, rotation and every dof (columns of `rate`). Over B."""
+    """Adam (Kingma & Ba 2015) with a rate each for translation, rotation and every dof (columns of `rate`). Over B."""
     b = wp.tid()
     if active_in[b] == 0:
         return
