@@ -34,6 +34,8 @@ _ASIDE: Final = 1.5
 _FAST: Final = 0.5
 #: A pad is what of a jaw lies within this of the place that touches first [m].
 _PAD_DEPTH_M: Final = 0.003
+#: Shares of the limits at which the hand is looked at for surfaces that others hide.
+_LOOKS: Final = (0.5, 0.02, 0.98)
 #: Surfaces look where they go if they move along their normals with this share of the fastest point's speed.
 _LEADING: Final = 0.3
 #: A body carries a pad if it faced the other jaw with this share of the area of the one that faced it most.
@@ -144,8 +146,9 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
 
 
 def _points(hand: HandModel) -> SurfacePoints:
-    # Seen half open: in a closed gripper the pads may lie inside each other.
-    return sample_surface(replace(hand, preshape=(hand.lower + hand.upper) / 2), _POINTS)
+    """The hand's surface, seen in the posture that hides least of it: in closed jaws the pads may lie in each other."""
+    seen = [sample_surface(replace(hand, preshape=hand.lower + share * hand.span), _POINTS) for share in _LOOKS]
+    return seen[int(np.argmax([points.area.sum() for points in seen]))]
 
 
 def _path(hand: HandModel, shares: Floats) -> Floats:

@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 
 #: A pad that is farther from the object than this is not waited for [m].
 GAP_M: Final = 0.005
+#: A drive that is to press with its limit is told to go so many times the way that needs.
+STALL: Final = 2.0
 #: A dof moves a pad if it does so by this [m/rad or 1].
 LEAST_WAY: Final = 1e-4
 
@@ -36,8 +38,12 @@ def jaw_squeeze(probe: Probe, jaws: Jaws, grasp: Posture, *, total_normal_force:
     # Both pads press alike, or they would push the object away: the weaker one tells how hard.
     able = np.where(ways > LEAST_WAY, hand.effort / ways, np.inf).min(axis=1)
     force = np.where((gaps < GAP_M).all(axis=1), np.minimum(0.5 * total_normal_force, able), 0.0)
+    # One drive at its limit holds both pads by their coupling: told to go farther it still presses with its limit, and
+    # loses nothing to contacts that give way. Two drives at their limits would give way to any push.
+    stalls = (np.count_nonzero(hand.closing) == 1) & (able < 0.5 * total_normal_force)
+    press = np.where(stalls, STALL, 1.0) * force
     travel = np.where(speed > LEAST_WAY, np.minimum(gaps, GAP_M)[:, None], 0.0).sum(axis=2) / ways
-    step = np.where(force > 0, 1.0, 0.0)[:, None] * travel + force[:, None] * ways / hand.stiffness
+    step = np.where(force > 0, 1.0, 0.0)[:, None] * travel + press[:, None] * ways / hand.stiffness
     q = q + hand.closing * np.where(ways > LEAST_WAY, step, 0.0)
     return Posture(np.array(grasp.hand_pose, float), hand.expand(np.clip(q, hand.lower, hand.upper)))
 

@@ -14,7 +14,7 @@ from service.model.digests import digest_bytes, digest_json
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.quality import postures, squeeze
+from worker.quality import jaw_squeeze, postures, squeeze
 from worker.quality.referee import model, protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 
@@ -35,10 +35,11 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
     ),
     postures: (
-        "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "OPENING_STEPS", "JAM_M", "WAY",
-        "JAM_LOOKS", "RETREATS_M", "PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS",
+        "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M", "OPENING_STEPS",
+        "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M", "PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS",
     ),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
+    jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
 }  # fmt: skip
 LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
     "letter": {protocol: ("LETTER_INTERVAL_S",)},
