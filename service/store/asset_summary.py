@@ -47,6 +47,8 @@ def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines.append(("approach", _vector(facts["palm_approach"])))
     if "fingertips" in facts:
         lines.append(("fingertips", ", ".join(facts["fingertips"])))
+    if "opening_m" in facts:
+        lines.append(("opening", f"{1e3 * facts['opening_m']:.1f} mm between the pads"))
     if "dofs" in facts:
         lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
         lines += [("", _dof(name, facts)) for name in facts["dofs"]]

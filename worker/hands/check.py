@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.model.errors import HandError, InputError
+from worker.hands.jaws import jaws_of
 from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
 from worker.hands.opposition import opposes
@@ -50,6 +51,9 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         f"{name}: {hand.dofs} degrees of freedom in {len(hand.joint_names)} joints, {len(hand.fingertips)} fingertips, "
         f"{len(hand.pieces)} convex pieces; palm {hand.root_link!r} facing {_direction(hand)}"
     )
+    if (jaws := jaws_of(hand)) is not None:
+        facts["opening_m"] = round(jaws.opening, 6)
+        message += f"; opens {1e3 * jaws.opening:.0f} mm"
     notes = [*robot.notes, *_left_out(robot, hand, settings)]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}

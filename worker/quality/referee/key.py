@@ -35,8 +35,9 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
     ),
     postures: (
-        "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M", "OPENING_STEPS",
-        "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M", "PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS",
+        "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M",
+        "OPENING_STEPS", "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M", "PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION",
+        "MAX_PRESSING", "_POINTS",
     ),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
