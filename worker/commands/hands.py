@@ -58,9 +58,12 @@ def check(
     write: Annotated[
         Path | None, typer.Option(help="Write all that was said and guessed into a file: asset.json, to be corrected.")
     ] = None,
+    self_test: Annotated[
+        bool, typer.Option("--self-test/--no-self-test", help="Try 64 grasps of a sphere, a box and a cylinder.")
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Say whether a hand can be used, and what was guessed about it. Needs no server."""
+    """Say whether a hand can be used, what was guessed, and with --self-test what it holds. Needs no server."""
     options = hand_options(
         urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
         fingertips=fingertips, fix=fix, drop=drop,
@@ -70,10 +73,16 @@ def check(
         _draw(hand_from_path(file, options), picture, collision=collision)
     if write and report["verdict"] != "refuse":
         _write(file, options, report, write)
+    if self_test and report["verdict"] != "refuse":
+        from worker.studies.hand_self_test import self_test as tried
+
+        report["self_test"] = tried(hand_from_path(file, options)).facts()
     if json:
         emit(report)
     else:
         say_check(AssetKind.HAND, report)
+        if "self_test" in report:
+            typer.echo(f"  {'self-test':<18} {report['self_test']['says']}")
     if report["verdict"] == "refuse":
         raise typer.Exit(InputError.exit_code)
 

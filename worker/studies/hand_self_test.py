@@ -1,0 +1,97 @@
+"""Does a hand hold anything: grasps of three plain objects of a size that suits it, judged by the certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import trimesh
+
+from service.model.domain import BATCH_SIZE, JobOptions
+from worker.certified import certified_grasps
+from worker.hands.jaws import jaws_of
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.objects.prepare import load_object
+from worker.run import ALONE, Run
+
+#: Grasps in all, and the share that must hold of a hand that is ready.
+GRASPS: Final = 64
+READY: Final = 0.7
+#: Width of the objects as a share of a gripper's opening, or of the reach of a hand's fingers; and its bounds [m].
+OF_OPENING: Final = 0.55
+OF_REACH: Final = 0.5
+WIDTH_M: Final = (0.012, 0.08)
+_IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
+
+
+@dataclass(frozen=True)
+class SelfTest:
+    """What came of it; `gsr` is the share of raw grasps that hold by the certificate."""
+
+    gsr: float
+    n: int
+    width_m: float
+    by_object: dict[str, float]
+
+    @property
+    def line(self) -> str:
+        """One line for people."""
+        share = f"{100 * self.gsr:.0f} % hold"
+        if self.gsr >= READY:
+            return f"ready: {share}"
+        worst = min(self.by_object, key=lambda name: self.by_object[name])
+        return f"suspicious: {share}, {100 * self.by_object[worst]:.0f} % of a {worst}; look at palm, closing and pads"
+
+    def facts(self) -> dict[str, Any]:
+        """As a check reports it."""
+        return {"gsr": self.gsr, "n": self.n, "width_m": self.width_m, "by_object": self.by_object, "says": self.line}
+
+
+def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: int = 0) -> SelfTest:
+    """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly.
+
+    Raises:
+        InputError: a hand finds no place around one of them.
+    """
+    width = fitting_width(hand)
+    held: dict[str, list[bool]] = {}
+    for number, (name, obj) in enumerate(plain_objects(width).items()):
+        share = grasps // 3 + (number < grasps % 3)
+        held[name] = []
+        for batch, first in enumerate(range(0, share, BATCH_SIZE)):
+            count = min(BATCH_SIZE, share - first)
+            request = JobOptions(want="raw", grasps=count, seed=seed, referee="certificate")
+            found = certified_grasps(hand, obj, request, count=count, batch=batch, run=run)
+            held[name] += [bool(value == 1) for value in found.columns["quality/success"]]
+    every = [value for values in held.values() for value in values]
+    by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
+    return SelfTest(float(np.mean(every)), len(every), width, by_object)
+
+
+def fitting_width(hand: HandModel) -> float:
+    """Width of the objects that suit a hand [m]."""
+    if (jaws := jaws_of(hand)) is not None:
+        return float(np.clip(OF_OPENING * jaws.opening, *WIDTH_M))
+    poses = body_poses(hand, _IDENTITY, hand.expand(hand.preshape))[0]
+    tips = poses[list(hand.fingertips) or [hand.bodies - 1], :3]
+    reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
+    return float(np.clip(OF_REACH * reach, *WIDTH_M))
+
+
+def plain_objects(width: float) -> dict[str, ObjectModel]:
+    """Sphere, box and cylinder, the last two longer than they are wide."""
+    meshes = {
+        "sphere": trimesh.creation.icosphere(3, width / 2),
+        "box": trimesh.creation.box((width, 1.2 * width, 1.8 * width)),
+        "cylinder": trimesh.creation.cylinder(width / 2, 2 * width, sections=48),
+    }
+    return {
+        name: load_object(
+            {f"{name}.stl": bytes(mesh.export(file_type="stl"))},
+            name=name, digest=f"{number:032x}", face_error_m=3e-4,
+        )
+        for number, (name, mesh) in enumerate(meshes.items())
+    }  # fmt: skip
