@@ -9,10 +9,10 @@ import numpy as np
 
 from worker.hands.jaws import jaws_of, slides
 from worker.hands.model import HandModel
-from worker.hands.options import DEFAULT_FORCE, DEFAULT_LINEAR_STIFFNESS, HandOptions
+from worker.hands.options import DEFAULT_FORCE, DEFAULT_LINEAR_STIFFNESS
 
 
-def with_drive(hand: HandModel, options: HandOptions, assumed: Sequence[str]) -> HandModel:
+def with_drive(hand: HandModel, stated: Sequence[str], assumed: Sequence[str]) -> HandModel:
     """The hand with the defaults of sliding joints and of jaws instead of those of revolute joints.
 
     A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
@@ -20,7 +20,7 @@ def with_drive(hand: HandModel, options: HandOptions, assumed: Sequence[str]) ->
 
     Args:
         hand: the hand with its palm and closing.
-        options: what is stated stays.
+        stated: dofs whose position gain somebody states: it stays.
         assumed: dofs whose limit of torque or force nobody states.
     """
     slide, jaws = slides(hand), jaws_of(hand)
@@ -33,8 +33,6 @@ def with_drive(hand: HandModel, options: HandOptions, assumed: Sequence[str]) ->
         moves = np.abs(half).sum(axis=1) > 0
         gain = np.where(moves, DEFAULT_LINEAR_STIFFNESS * (half**2).sum(axis=1), gain)
         limit = np.where(moves, DEFAULT_FORCE * np.abs(half).sum(axis=1), limit)
-    stated = options.stiffness if isinstance(options.stiffness, dict) else {}
-    whole = "stiffness" in options.model_fields_set and not stated
-    keeps = np.array([whole or dof in stated for dof in hand.dof_names])
+    keeps = np.array([dof in stated for dof in hand.dof_names])
     free = np.array([dof in assumed for dof in hand.dof_names])
     return replace(hand, stiffness=np.where(keeps, hand.stiffness, gain), effort=np.where(free, limit, hand.effort))

@@ -59,7 +59,9 @@ def assemble(
     """The model of a checked robot and options."""
     tree = build_tree(robot, options)
     hand = complete(body_model(robot, tree, options, files, main, name=name, digest=digest), tree, options)
-    hand = with_drive(hand, options, assumed_efforts(robot, tree.dof_names, options))
+    hand = with_drive(
+        hand, stated_gains(robot, tree.dof_names, options), assumed_efforts(robot, tree.dof_names, options)
+    )
     return replace(hand, neighbours=resting_neighbours(hand))
 
 
@@ -156,6 +158,14 @@ def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
             raise HandError(f"the effort of {dof!r} is {effort:g}; it must be positive")
         values.append(effort)
     return np.array(values)
+
+
+def stated_gains(robot: Robot, dofs: Sequence[str], options: HandOptions) -> list[str]:
+    """Dofs whose position gain somebody states."""
+    stated = options.stiffness
+    if isinstance(stated, float):
+        return list(dofs)
+    return [dof for dof in dofs if dof in (stated or {}) or robot.joints[dof].stiffness]
 
 
 def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
