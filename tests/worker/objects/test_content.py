@@ -12,7 +12,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.surface import sample_surface
 from worker.objects.content import content_of
 from worker.quality.probe import probe_of
-from worker.rendering.scene_setup import _key
+from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.scenes.simulate import rest_probability
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
@@ -49,7 +49,9 @@ def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
     other = dataclasses.replace(object_from_mesh(trimesh.creation.box((0.02, 0.04, 0.05))), digest=BOX.digest)
     one, two = (probe_of(HAND, obj, hand_points=64, object_points=64) for obj in (BOX, other))
     assert not np.array_equal(one.samples, two.samples)
-    assert _key([BOX]) != _key([other])
+    plan, pose = CameraPlan(1, 16, 16, None), np.array([[[0.0, 0, 0, 1, 0, 0, 0]]])
+    first, second = (Setting([obj], pose, plan, seed=0, samples=1) for obj in (BOX, other))
+    assert first._key() != second._key()
 
 
 def test_no_cache_gives_one_tree_of_a_file_for_another() -> None:

@@ -162,7 +162,7 @@ def test_more_faces_than_the_limit_are_refused_before_they_are_read() -> None:
 
 def test_an_unknown_format_is_refused_with_those_that_are_read() -> None:
     with pytest.raises(MeshError, match="obj"):
-        read_mesh("m.dae", b"<COLLADA/>")
+        read_mesh("m.wrl", b"#VRML V2.0 utf8")
 
 
 def test_continued_lines_and_negative_indices_of_obj() -> None:
