@@ -140,15 +140,11 @@ def nonnegative(
                 lower = wp.int32(0)
                 for _half in range(HALVINGS):
                     if lower == 0:
+                        # The factor has served: its first row keeps r for the case that the step is not taken.
                         for i in range(rows):
-                            work.factor[b, 0, i] = work.residual[b, i] + share * (
-                                work.wanted[b, i] - work.residual[b, i]
-                            )
-                        for i in range(rows):
-                            # `wanted` keeps the goal, `residual` the step: they change places only when it is taken.
-                            step_i = work.factor[b, 0, i]
-                            work.factor[b, 0, i] = work.residual[b, i]
-                            work.residual[b, i] = step_i
+                            at = work.residual[b, i]
+                            work.factor[b, 0, i] = at
+                            work.residual[b, i] = at + share * (work.wanted[b, i] - at)
                         if objective(matrix_in, target_in, square, count, b, work.residual) <= before:
                             lower = 1
                         else:
