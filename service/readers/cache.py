@@ -6,13 +6,13 @@ import hashlib
 import os
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.store.integrity import check_content, check_digest, gone
 from service.store.store import Store
+from service.user_cache import make_room
 
 DEFAULT_BYTES: Final = 20 << 30
 
@@ -39,7 +39,7 @@ class ShardCache:
         if self._is_intact(path, sha256):
             return path
         self._download(store, key, sha256, path)
-        self._make_room(keep=path)
+        make_room(self.folder, path.suffix, self.limit_bytes, keep=path)
         return path
 
     @staticmethod
@@ -68,26 +68,3 @@ class ShardCache:
             raise gone(f"{store.url}/{key}") from None
         finally:
             partial.unlink(missing_ok=True)
-
-    def _make_room(self, *, keep: Path) -> None:
-        files = sorted(self._files(), reverse=True)
-        used = 0
-        for _, size, path in files:
-            used += size
-            if used > self.limit_bytes and path != keep:
-                # A process that has it open goes on reading.
-                path.unlink(missing_ok=True)
-
-    def _files(self) -> Iterator[tuple[float, int, Path]]:
-        for path in self.folder.glob("*.h5"):
-            try:
-                facts = path.stat()
-            except FileNotFoundError:
-                continue
-            yield max(facts.st_atime, facts.st_mtime), facts.st_size, path
-
-
-def default_folder() -> Path:
-    """`$XDG_CACHE_HOME/graspd/shards`."""
-    home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "graspd" / "shards"

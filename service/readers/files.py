@@ -11,13 +11,14 @@ from service.model import names
 from service.model.errors import InputError, NotFoundError
 from service.model.planning import plan
 from service.model.records import JobRecord
-from service.readers.cache import DEFAULT_BYTES, ShardCache, default_folder
+from service.readers.cache import DEFAULT_BYTES, ShardCache
 from service.store.datasets import newest_snapshot
 from service.store.integrity import check_file
 from service.store.manifests import load_manifest, shard_exists
 from service.store.records import read_record
 from service.store.shards import ShardKind, kind_of, open_shard
 from service.store.store import Store, open_store
+from service.user_cache import folder
 
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
@@ -116,7 +117,7 @@ def open_shards(
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
         store = source if isinstance(source, Store) else open_store(source)
         found = _of_store(store, job, dataset, snapshot)
-        return Shards(_ordered(found), store, ShardCache(cache or default_folder(), limit_bytes=cache_bytes))
+        return Shards(_ordered(found), store, ShardCache(cache or folder("shards"), limit_bytes=cache_bytes))
     given = [source] if isinstance(source, str | Path) else list(source)
     return Shards(_ordered(_local(path) for entry in given for path in _paths(Path(entry))))
 

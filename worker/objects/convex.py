@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import subprocess
 import sys
+import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import manifold3d as m3d
 import numpy as np
 from numpy.typing import NDArray
+
+from service import user_cache
 
 Floats = NDArray[np.float64]
 
@@ -49,9 +52,8 @@ def union_volume(parts: tuple[Floats, ...]) -> float:
 
 
 def default_cache() -> Path:
-    """Folder for what can be made again: `$XDG_CACHE_HOME/graspd/convex`."""
-    home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "graspd" / "convex"
+    """Folder for pieces that can be made again."""
+    return user_cache.folder("convex")
 
 
 def load_parts(file: Path) -> tuple[Floats, ...] | None:
@@ -59,17 +61,14 @@ def load_parts(file: Path) -> tuple[Floats, ...] | None:
     try:
         with np.load(file) as stored:
             return tuple(stored[name] for name in sorted(stored.files))
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
 
 def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
     """Keep parts in a file; a folder that cannot be written only costs time."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_suffix(f".{os.getpid()}.tmp.npz")
-        arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
-        np.savez(partial, **arrays)
-        partial.replace(file)
-    except OSError:
-        return
+    whole = io.BytesIO()
+    arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
+    np.savez(whole, **arrays)
+    with suppress(OSError):
+        user_cache.write_whole(file, whole.getvalue())

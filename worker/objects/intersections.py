@@ -51,7 +51,7 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
     near = owner[tree.query_pairs(2 * radius, output_type="ndarray")]
-    near = np.unique(np.sort(near[near[:, 0] != near[:, 1]], axis=1), axis=0)
+    near = _distinct(near[near[:, 0] != near[:, 1]], len(faces))
     apart = ~(faces[near[:, 0]][:, :, None] == faces[near[:, 1]][:, None, :]).any(axis=(1, 2))
     near = near[apart]
     depth = DEPTH * float(np.ptp(vertices, axis=0).max())
@@ -60,6 +60,13 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
         for part in np.array_split(near, max(1, len(near) // _CHUNK))
     ]
     return near[np.concatenate(found)]
+
+
+def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Unordered pairs (P, 2) of numbers below `count`, each once, in ascending order: as one number each they sort
+    many times faster than as rows."""
+    keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))
+    return np.stack(np.divmod(keys, count), axis=1)
 
 
 def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:

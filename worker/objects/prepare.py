@@ -17,6 +17,7 @@ from service.model.errors import GraspdError, MeshError, NotFoundError
 from service.settings import Settings
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from worker.objects.formats import READERS, read_mesh
+from worker.objects.kept import kept_or_made
 from worker.objects.mass import mass_properties
 from worker.objects.model import Floats, Ints, ObjectModel
 from worker.objects.normals import corner_normals
@@ -66,15 +67,25 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 @lru_cache(maxsize=8)
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
-    """Cached by content: every batch of a job asks for the same object."""
-    return build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m)
+    """Cached by content: every batch of a job asks for the same object, and every command for the same few."""
+    return kept_or_made(
+        (Path(main).suffix.lower(), options_json, repr(face_error_m)),
+        data,
+        lambda: build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m),
+    )
 
 
 def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> Repaired:
     """The mesh of a file as a solid in metres; errors name the file."""
+    return _repaired(main, data, options.model_dump_json())
+
+
+@lru_cache(maxsize=2)
+def _repaired(main: str, data: bytes, options_json: str) -> Repaired:
+    """Kept for a while: it is the same for every bound of the simplification."""
     soup = read_mesh(main, data)
     try:
-        return repair(soup, options)
+        return repair(soup, ObjectOptions.model_validate_json(options_json))
     except GraspdError as error:
         raise type(error)(f"{main}: {error}") from None
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
+from contextlib import suppress
 from pathlib import Path
 
 from service.model import names
 from service.model.errors import NotFoundError
 from service.store.store import Store
+from service.user_cache import write_whole
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose, piece_file
 
@@ -34,11 +35,6 @@ def _fetch(store: Store, key: str, file: Path) -> None:
         data = store.get(key)
     except NotFoundError:
         return
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_suffix(f".{os.getpid()}.part")
-        partial.write_bytes(data)
-        partial.replace(file)
-    except OSError:
-        # A folder that cannot be written only costs time.
-        return
+    # A folder that cannot be written only costs time.
+    with suppress(OSError):
+        write_whole(file, data)

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import json
 import zipfile
-from dataclasses import fields
-from typing import Any, Final
-
-import numpy as np
 
 from service.model import names
 from service.model.digests import digest_json
@@ -18,18 +12,8 @@ from service.model.version import STAGE_REVISIONS
 from service.store.library import load_asset_files
 from service.store.store import Store
 from worker.objects.model import ObjectModel
+from worker.objects.packed import from_bytes, to_bytes
 from worker.objects.prepare import load_object
-
-_ARRAYS: Final = (
-    "vertices",
-    "faces",
-    "corner_normals",
-    "centre_of_mass",
-    "inertia",
-    "hull_vertices",
-    "hull_faces",
-)
-_NAMES: Final = ("name", "digest")
 
 
 def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
@@ -50,23 +34,6 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     obj = _load(store, digest, name=name, face_error_m=face_error_m)
     store.put(key, to_bytes(obj))
     return obj
-
-
-def to_bytes(obj: ObjectModel) -> bytes:
-    """All of an object but its name and digest, bit for bit."""
-    plain = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name not in (*_ARRAYS, *_NAMES)}
-    arrays: dict[str, Any] = {name: getattr(obj, name) for name in _ARRAYS}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays, plain=np.frombuffer(json.dumps(plain).encode(), np.uint8))
-    return buffer.getvalue()
-
-
-def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
-    """An object from `to_bytes`; ValueError, KeyError, OSError, EOFError or BadZipFile if they are none."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-        plain = json.loads(stored["plain"].tobytes())
-        arrays = {field: stored[field] for field in _ARRAYS}
-    return ObjectModel(name=name, digest=digest, **arrays, **plain | {"repairs": tuple(plain["repairs"])})
 
 
 def _address(face_error_m: float) -> str:

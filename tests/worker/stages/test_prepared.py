@@ -13,9 +13,10 @@ from service.store.library import publish_asset
 from service.store.store import Store, open_store
 from tests.worker.objects.shapes import box, join, sphere, stl
 from worker.objects.model import ObjectModel
+from worker.objects.packed import from_bytes, to_bytes
 from worker.objects.prepare import load_object
 from worker.stages import prepared
-from worker.stages.prepared import from_bytes, prepared_object, to_bytes
+from worker.stages.prepared import prepared_object
 
 #: Two balls in one another: a repair to remember.
 FILES = {"asset.json": b'{"file": "m.stl"}', **stl(join(sphere(), sphere(at=(0.02, 0.0, 0.0))))}

@@ -1,0 +1,116 @@
+"""The user's cache: entries whole, intact and the user's own, wherever it can be written."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from service import user_cache
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each test is a process that has not asked yet, on a machine with its own temporary files."""
+    user_cache._root.cache_clear()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+
+def test_an_entry_is_read_as_it_was_kept(tmp_path: Path) -> None:
+    file = tmp_path / "things" / "a.npz"
+    assert user_cache.load(file) is None
+    user_cache.keep(file, b"first")
+    user_cache.keep(file, b"second")
+    assert user_cache.load(file) == b"second"
+    assert [found.name for found in file.parent.iterdir()] == ["a.npz"]
+
+
+@pytest.mark.parametrize("harm", ["cut", "turned", "empty", "short"])
+def test_a_damaged_entry_is_as_none(tmp_path: Path, harm: str) -> None:
+    file = tmp_path / "a.npz"
+    user_cache.keep(file, b"x" * 100)
+    whole = file.read_bytes()
+    turned = bytes([*whole[:60], whole[60] ^ 1, *whole[61:]])
+    file.write_bytes({"cut": whole[:-1], "turned": turned, "empty": b"", "short": whole[:20]}[harm])
+    assert user_cache.load(file) is None
+
+
+def test_an_entry_of_another_user_is_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "a.npz"
+    user_cache.keep(file, b"x")
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    assert user_cache.load(file) is None
+
+
+def test_the_longest_unused_entries_go_when_it_is_full(tmp_path: Path) -> None:
+    for k in range(4):
+        user_cache.keep(tmp_path / f"{k}.npz", bytes(1000), limit_bytes=10_000)
+        os.utime(tmp_path / f"{k}.npz", (k, k))
+    user_cache.keep(tmp_path / "new.npz", bytes(1000), limit_bytes=3200)
+    assert sorted(file.name for file in tmp_path.glob("*.npz")) == ["2.npz", "3.npz", "new.npz"]
+
+
+def test_it_lies_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert user_cache.folder("objects") == tmp_path / "xdg" / "graspd" / "objects"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert user_cache.folder("objects") == tmp_path / "home" / ".cache" / "graspd" / "objects"
+
+
+@pytest.mark.parametrize("trouble", ["a file", "not writable"])
+def test_a_home_that_cannot_be_written_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, trouble: str
+) -> None:
+    home = tmp_path / "home"
+    if trouble == "a file":
+        home.write_text("")
+    else:
+        # Root may write anywhere but on a read-only disk: what the system answers there.
+        monkeypatch.setattr(os, "access", lambda path, _: not str(path).startswith(str(home)))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(home))
+    with caplog.at_level(logging.WARNING):
+        folders = {user_cache.folder(name) for name in ("objects", "convex", "objects")}
+    private = tmp_path / f"graspd-cache-{os.geteuid()}"
+    assert folders == {private / "objects", private / "convex"}
+    assert private.stat().st_mode & 0o777 == 0o700
+    (line,) = caplog.messages
+    assert str(home) in line and str(private) in line
+
+
+def test_a_folder_that_others_can_write_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "home").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    planted = tmp_path / f"graspd-cache-{os.geteuid()}"
+    planted.mkdir()
+    planted.chmod(0o777)
+    found = user_cache.folder("objects").parent
+    assert found != planted and found.parent == tmp_path
+
+
+def test_without_any_folder_nothing_is_kept_and_nothing_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
+    monkeypatch.setattr(tempfile, "tempdir", os.devnull)
+    file = user_cache.folder("objects") / "a.npz"
+    user_cache.keep(file, b"x")
+    assert user_cache.load(file) is None
+
+
+def test_processes_that_keep_the_same_entry_leave_one_that_is_whole(tmp_path: Path) -> None:
+    write = (
+        "import sys, pathlib; from service import user_cache\n"
+        "for _ in range(200):\n"
+        "    user_cache.keep(pathlib.Path(sys.argv[1]), sys.argv[2].encode() * 50_000)\n"
+        "    assert user_cache.load(pathlib.Path(sys.argv[1])) is not None, 'torn'\n"
+    )
+    file = tmp_path / "a.npz"
+    running = [subprocess.Popen([sys.executable, "-c", write, str(file), letter]) for letter in "ab"]
+    assert [process.wait() for process in running] == [0, 0]
+    assert user_cache.load(file) in (b"a" * 50_000, b"b" * 50_000)
+    assert list(tmp_path.iterdir()) == [file]
