@@ -90,6 +90,7 @@ class GraspQuery(BaseModel):
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
         None, description="kind of the scene it was planned in; any: whichever, but not free"
     )
+    neighbours: bool | None = Field(None, description="whether other objects stood in that scene")
     lift_hard: bool | None = Field(None, description="lifted at half the friction")
     pushes_held: bool | None = Field(
         None, description="planned in a scene, and holds against the six pushes without it"

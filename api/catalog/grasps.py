@@ -73,6 +73,7 @@ def grasp_filter(query: GraspQuery) -> GraspFilter:
         valid=query.valid,
         success=query.success,
         scene=query.scene,
+        neighbours=query.neighbours,
         lift_hard=query.lift_hard,
         pushes_held=query.pushes_held,
         at_least=bounds["min"],

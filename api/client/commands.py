@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,7 @@ from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.domain import AssetKind, State
 from service.model.errors import InputError
-from service.model.scene_spec import scene_option
+from service.model.scene_options import scene_option
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -52,6 +53,10 @@ def submit(
         str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
     ] = "free",
     faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
+    with_: Annotated[
+        list[str] | None,
+        typer.Option("--with", help="Another object in the scene: a name, or a mesh to upload; up to eight."),
+    ] = None,
     scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps; 4 where a scene is named.")] = 0,
     views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
     stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
@@ -65,10 +70,11 @@ def submit(
 ) -> None:
     """Submit a job: one hand on one object."""
     with open_client(url) as client:
+        as_object = partial(_uploaded, client, AssetKind.OBJECT)
         request = job_request(
             {
                 "hand": _uploaded(client, AssetKind.HAND, hand),
-                "object": _uploaded(client, AssetKind.OBJECT, object),
+                "object": as_object(object),
                 "grasps": grasps,
                 "want": want,
                 "budget": budget,
@@ -80,8 +86,9 @@ def submit(
                 "fidelity": fidelity,
                 "target": target,
                 "seed": seed,
-                "scene": scene_option(scene),
+                "scene": scene_option(scene, named=as_object),
                 "faces": faces,
+                "neighbours": [as_object(one) for one in with_ or []],
                 "scenes": scenes,
                 "views": views,
                 "stereo": stereo,

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from api.client.job_options import pairs, validated
 from service.model.domain import JobOptions, Name
 from service.model.errors import InputError
-from service.model.scene_spec import scene_option
+from service.model.scene_options import known_name, scene_option
 
 SpecOption = Annotated[
     Path | None, typer.Option("--spec", help="TOML or JSON file that says it; options go over what it says.")
@@ -76,6 +76,8 @@ def wanted(
         given["options"] = pairs(given["options"])
     if "scene" in given:
         given["scene"] = scene_option(given["scene"])
+    if "neighbours" in given:
+        given["neighbours"] = [known_name(one) for one in given["neighbours"]]
     said = read_spec(spec) if spec is not None else {}
     total = None if "grasps" in given else said.pop("total_grasps", None)
     said.pop("total_grasps", None)

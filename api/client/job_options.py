@@ -23,10 +23,11 @@ _HELP: Final = {
     "method": "Planner.",
     "seed": "The same seed gives the same grasps.",
     "scene": "Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.",
+    "neighbours": "Another object in each scene, by name; up to eight.",
     "faces": "In a scene: drawn, as drops fall, or all, a scene for each stable face.",
 }
 _SHORT: Final = {"grasps": "-n"}
-_FLAGS: Final = {"options": "--option"}
+_FLAGS: Final = {"options": "--option", "neighbours": "--with"}
 
 
 def with_job_options(command: Callable[..., None]) -> Callable[..., None]:

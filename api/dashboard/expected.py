@@ -41,6 +41,11 @@ class Expected:
     origin: str
 
 
+def listed(text: str) -> list[str]:
+    """Names that a field of a form holds, between commas or spaces."""
+    return text.replace(",", " ").split()
+
+
 class Expectations:
     """Estimates for the form of a job; what it remembers between two requests may be lost."""
 
@@ -51,6 +56,7 @@ class Expectations:
     def of(self, form: Mapping[str, Any]) -> list[Expected]:
         """Every offered fidelity for what a form says; without numbers where it cannot be estimated."""
         wanted = {key: value for key, value in form.items() if key not in ("hand", "object", "fidelity")}
+        wanted["neighbours"] = listed(str(form.get("neighbours", "")))
         return [self._one(name, wanted, str(form["hand"]), str(form["object"])) for name in OFFERED]
 
     def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> Expected:

@@ -12,6 +12,7 @@ from starlette.datastructures import FormData, UploadFile
 
 from api.catalog.assets import Assets
 from api.catalog.jobs import Jobs
+from api.dashboard.expected import listed
 from api.dashboard.form_uploads import FILE_FIELDS, UNITS, Chosen, choices, chosen
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, JobsOf, may_read, may_submit
@@ -22,8 +23,8 @@ router = APIRouter(include_in_schema=False)
 
 DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
-    "scene": "free", "faces": "drawn", "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240,
-    "want": "valid", "referee": "certificate",
+    "scene": "free", "faces": "drawn", "neighbours": "", "scenes": 0, "views": 0, "stereo": False,
+    "width": 320, "height": 240, "want": "valid", "referee": "certificate",
 }  # fmt: skip
 
 
@@ -90,7 +91,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     refused = {one.field(kind): one.refused for kind, one in things.items() if one.refused}
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
-        body = JobRequest.model_validate(form | named)
+        body = JobRequest.model_validate(form | named | {"neighbours": listed(str(form.get("neighbours", "")))})
     except ValidationError as error:
         return _form(request, assets, shown, things=things, errors=refused | _by_field(error), status=422)
     if refused:

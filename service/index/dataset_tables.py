@@ -24,6 +24,7 @@ datasets: Final = Table(
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
     Column("planned", Boolean, nullable=False, default=False),
+    Column("neighbours", String(300), nullable=False, server_default=""),
     Index("datasets_newest", "created", "name"),
 )
 

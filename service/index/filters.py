@@ -23,6 +23,8 @@ class GraspFilter(Model):
     success: bool | None = None
     scene: str | None = None
     """Kind of the scene that it was planned in; any: whichever, but not free."""
+    neighbours: bool | None = None
+    """Whether other objects stood in that scene."""
     lift_hard: bool | None = None
     pushes_held: bool | None = None
     at_least: dict[Metric, float] = Field(default_factory=dict)

@@ -32,6 +32,9 @@ jobs: Final = Table(
     Column("created", String(32), nullable=False),
     Column("finished", String(32)),
     Column("reason", Text),
+    # Digests of its neighbours, with a space between; a list would need a table.
+    Column("neighbours", String(300), nullable=False, server_default=""),
+    Index("jobs_beside", "neighbours"),
     Index("jobs_newest", "created", "id"),
     Index("jobs_by_state", "state", "created", "id"),
     Index("jobs_by_pair", "hand", "object"),
@@ -141,6 +144,7 @@ grasps: Final = Table(
     Column("success", Boolean),
     Column("verdict_level", String(12)),
     Column("scene_kind", String(8), nullable=False, server_default="free"),
+    Column("neighbours", Integer, nullable=False, server_default="0"),
     Column("lift_hard", Boolean),
     Column("pushes_held", Boolean),
     Column("created", String(32), nullable=False),

@@ -143,6 +143,7 @@ class GraspView(View):
     success: bool | None = Field(description="verdict of the referee; None: not tested")
     verdict_level: str | None = Field(description="level of the referee that gave it")
     scene_kind: str = Field("free", description="kind of the scene it was planned in; free: around a floating object")
+    neighbours: int = Field(0, description="other objects that stood in that scene")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction; None: not tested")
     pushes_held: bool | None = Field(
         None, description="in a scene: held against the six pushes without it; None: not tested"

@@ -5,24 +5,27 @@ Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: positio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from service.model.scene_spec import SceneOption, SceneSpec, scene_of
+from service.model.labels import Digest as Digest
+from service.model.labels import Name as Name
+from service.model.labels import Word as Word
+from service.model.scene_options import (
+    BesideOption,
+    NamedNeighbour,
+    SceneDocument,
+    SceneOption,
+    scene_of,
+)
+from service.model.scene_spec import MOST_NEIGHBOURS, SceneSpec
 
 BATCH_SIZE: Final = 32
 #: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
-
-#: A name a user gives: used in file names and URLs, so letters, digits, dot, dash and underscore only.
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-#: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
-Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
-
-#: An id or nothing. Whoever writes to Redis may say anything, so what is read from there is bounded like this.
-Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 
 
 class State(StrEnum):
@@ -152,6 +155,13 @@ class JobOptions(Model):
         description="faces that the object lies on in its scenes. drawn: as often as drops end on them; all: one scene "
         "for each stable face, whatever `scenes` says",
     )
+    neighbours: tuple[BesideOption, ...] = Field(
+        (),
+        max_length=MOST_NEIGHBOURS,
+        exclude_if=lambda value: not value,
+        description="names of up to eight other objects, which are dropped around this one in its scenes; a document "
+        "places its own",
+    )
     scenes: int = Field(0, ge=0, le=64, description="scenes per batch of grasps")
     views: int = Field(0, ge=0, le=256, description="camera placements per scene")
     stereo: bool = Field(False, description="a left and a right picture per placement instead of one")
@@ -240,7 +250,28 @@ class JobOptions(Model):
     @property
     def place(self) -> SceneSpec:
         """The scene."""
-        return scene_of(self.scene, faces=self.faces)
+        return scene_of(self.scene, faces=self.faces, beside=self._dropped)
+
+    @property
+    def _dropped(self) -> tuple[NamedNeighbour, ...]:
+        # A name alone was made one of these when it was read.
+        return tuple(one for one in self.neighbours if isinstance(one, NamedNeighbour))
+
+    @property
+    def beside(self) -> tuple[NamedNeighbour, ...]:
+        """The neighbours of the document, then those that are dropped."""
+        placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
+        return (*placed, *self._dropped)
+
+    def with_beside(self, found: Sequence[NamedNeighbour]) -> Self:
+        """The same with other words for its neighbours, in the order of `beside`."""
+        if not found:
+            return self
+        first = len(self.beside) - len(self.neighbours)
+        changed: dict[str, Any] = {"neighbours": tuple(found[first:])}
+        if isinstance(self.scene, SceneDocument):
+            changed["scene"] = self.scene.model_copy(update={"neighbours": tuple(found[:first])})
+        return self.model_copy(update=changed)
 
     @property
     def in_scene(self) -> bool:
@@ -276,6 +307,12 @@ class JobRequest(JobOptions):
 
     hand: Name = Field(description="name of a hand known to the service")
     object: Name = Field(description="name of an object known to the service")
+
+
+def check_known(options: JobOptions) -> None:
+    """Raises ValueError where a neighbour lacks the digest of its files: a name may stand for another object later."""
+    if any(one.digest is None for one in options.beside):
+        raise ValueError("each neighbour of a stored job has the digest of its files")
 
 
 class Asset(Model):
@@ -328,6 +365,11 @@ class TaskMessage(Model):
     origin: Origin | None = None
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    @model_validator(mode="after")
+    def _knows_its_neighbours(self) -> Self:
+        check_known(self.request)
+        return self
 
 
 class IngestMessage(Model):

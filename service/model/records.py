@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.model.domain import Digest, JobRequest, Lane, Origin, Stage
+from service.model.domain import AssetKind, Digest, JobRequest, Lane, Origin, Stage, check_known
 from service.model.version import STAGE_REVISIONS
 
 
@@ -39,6 +39,17 @@ class JobRecord(Record):
             request = {"want": "raw", "referee": "none", **data.get("request", {})}
             return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
         return data
+
+    @model_validator(mode="after")
+    def _knows_its_neighbours(self) -> Self:
+        check_known(self.request)
+        return self
+
+    @property
+    def assets(self) -> tuple[tuple[AssetKind, str], ...]:
+        """Kind and digest of all that it is made of."""
+        beside = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
+        return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *beside)
 
 
 class JobEvent(Record):

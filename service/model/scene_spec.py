@@ -11,15 +11,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from service.model.errors import InputError
+from service.model.labels import Digest
 
 #: Kinds of scenes; `free` is an object that floats, `file` one whose supports are given.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
-_FILES: Final = (".json", ".yaml", ".yml")
+SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
 #: A scene is no larger than this [m].
 FARTHEST_M: Final = 10.0
@@ -33,11 +34,13 @@ Vector = tuple[_Metres, _Metres, _Metres]
 Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
 
-class _Part(BaseModel):
+class Part(BaseModel):
+    """Base of what a scene is said with."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class HalfSpace(_Part):
+class HalfSpace(Part):
     """Everything below a plane."""
 
     kind: Literal["half_space"] = "half_space"
@@ -53,7 +56,7 @@ class HalfSpace(_Part):
         return self
 
 
-class Box(_Part):
+class Box(Part):
     """A box about the origin of its pose."""
 
     kind: Literal["box"] = "box"
@@ -64,57 +67,33 @@ class Box(_Part):
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
-        _check_quaternion(self.pose)
+        check_quaternion(self.pose)
         return self
 
 
-class NeighbourSpec(_Part):
+class NeighbourSpec(Part):
     """Another object in the scene."""
 
     object: str = Field(min_length=1, max_length=1024)
     """A built-in object, or a mesh; in a scene file a relative path starts at the file's folder."""
-    pose: Pose | None = None
-    """Its frame in the scene; None: it is dropped around the target."""
+    pose: Pose | None = Field(
+        None, description="its frame in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
+    )
+    digest: Digest | None = Field(
+        None, exclude_if=lambda value: value is None, description="of the object's files; the service fills it in"
+    )
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
         if self.pose is not None:
-            _check_quaternion(self.pose)
+            check_quaternion(self.pose)
         return self
 
 
 Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
-class SceneDocument(_Part):
-    """A scene that a request holds whole."""
-
-    supports: Supports = Field(
-        min_length=1, max_length=MOST_SUPPORTS, description="what the object stands on and among, scene frame, z up [m]"
-    )
-    target: Pose | None = Field(
-        None, description="frame of the object in the scene: x y z [m], unit quaternion w x y z; absent: it is dropped"
-    )
-
-    @model_validator(mode="after")
-    def _turned(self) -> Self:
-        if self.target is not None:
-            _check_quaternion(self.target)
-        return self
-
-
-def _form(value: object) -> str:
-    return "document" if isinstance(value, dict | SceneDocument) else "kind"
-
-
-#: A scene as a request says it: a kind, or a document. One of two forms, so that a mistake is told of the one meant.
-SceneOption = Annotated[
-    Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
-    Discriminator(_form),
-]
-
-
-class SceneSpec(_Part):
+class SceneSpec(Part):
     """What stands around the object."""
 
     kind: SceneKind = "free"
@@ -138,56 +117,27 @@ class SceneSpec(_Part):
         if self.kind == "free" and self.faces != "drawn":
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
         if self.target is not None:
-            _check_quaternion(self.target)
+            check_quaternion(self.target)
             if self.faces == "all":
                 raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
         return self
+
+    def told(self) -> dict[str, Any]:
+        """The scene as a shard's attribute says it; digests of neighbours stand in one of their own."""
+        return self.model_dump(mode="json", exclude={"neighbours": {"__all__": {"digest"}}})
 
     def _check_neighbours(self) -> None:
         placed = {one.pose is not None for one in self.neighbours}
         if not placed:
             return
-        if self.kind not in ("table", "file"):
-            raise ValueError(f"neighbours stand on a table or in a scene file, not with scene {self.kind}")
+        if self.kind == "free":
+            raise ValueError("neighbours stand in a scene: choose table, bin, shelf or a scene file, not free")
         if len(placed) > 1:
             raise ValueError("give all neighbours a pose, or none: those without are dropped together")
         if placed == {True} and self.kind != "file":
             raise ValueError("neighbours with poses belong into a scene file")
-        if placed == {False} and (self.target is not None or self.faces == "all"):
+        if placed == {False} and self.target is not None:
             raise ValueError("neighbours without a pose are dropped with the target: give all of them poses")
-
-
-def scene_of(option: str | SceneDocument, *, faces: Literal["drawn", "all"] = "drawn") -> SceneSpec:
-    """The scene that a request means.
-
-    Raises:
-        ValueError: the faces do not go with it, in one line.
-    """
-    try:
-        if isinstance(option, SceneDocument):
-            return SceneSpec(kind="file", supports=option.supports, target=option.target, faces=faces)
-        return SceneSpec(kind=option, faces=faces)
-    except ValidationError as error:
-        raise ValueError(_first(error)) from None
-
-
-def scene_option(text: str, *, beside: Path | None = None) -> str | dict[str, Any]:
-    """What a request says for a scene that a user names: the kind, or the document in a file.
-
-    Args:
-        text: one of `KINDS`, or a JSON or YAML file.
-        beside: folder in which the file lies; None: this one.
-
-    Raises:
-        InputError: as `parse_scene`.
-    """
-    if text in KINDS:
-        return text
-    is_file = Path(text).suffix.lower() in _FILES
-    found = read_scene(Path(text) if beside is None else beside / text) if is_file else parse_scene(text)
-    if found.neighbours:
-        raise InputError(f"scene {text} has neighbours: jobs have none yet, `graspd synth --scene` plans with them")
-    return found.model_dump(mode="json", include={"supports", "target"}, exclude_none=True)
 
 
 def parse_scene(text: str, *, faces: str = "drawn", beside: Sequence[str] = ()) -> SceneSpec:
@@ -200,7 +150,7 @@ def parse_scene(text: str, *, faces: str = "drawn", beside: Sequence[str] = ()) 
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
-    if text not in KINDS and path.suffix.lower() not in _FILES:
+    if text not in KINDS and path.suffix.lower() not in SCENE_FILES:
         raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file")
     found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
     if faces == found.faces and not beside:
@@ -210,7 +160,7 @@ def parse_scene(text: str, *, faces: str = "drawn", beside: Sequence[str] = ()) 
     try:
         return SceneSpec(**said, faces=faces, neighbours=[*(one.model_dump() for one in found.neighbours), *more])
     except ValidationError as error:
-        raise InputError(f"scene {text}: {_first(error)}") from None
+        raise InputError(f"scene {text}: {first_mistake(error)}") from None
 
 
 def read_scene(path: Path) -> SceneSpec:
@@ -227,7 +177,7 @@ def read_scene(path: Path) -> SceneSpec:
     try:
         return _found_from(path.parent, SceneSpec(**{"kind": "file", **found}))
     except (ValidationError, TypeError) as error:
-        raise InputError(f"the scene file {path} is wrong: {_first(error)}") from None
+        raise InputError(f"the scene file {path} is wrong: {first_mistake(error)}") from None
 
 
 def _found_from(folder: Path, spec: SceneSpec) -> SceneSpec:
@@ -251,7 +201,8 @@ def _loaded(text: str, path: Path) -> object:
         raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason}") from None
 
 
-def _first(error: ValidationError | TypeError) -> str:
+def first_mistake(error: ValidationError | TypeError) -> str:
+    """What is wrong first, in one line that names the place."""
     if isinstance(error, TypeError):
         return str(error)
     one = error.errors()[0]
@@ -259,6 +210,7 @@ def _first(error: ValidationError | TypeError) -> str:
     return f"{place}: {words}" if place else words
 
 
-def _check_quaternion(pose: tuple[float, ...]) -> None:
+def check_quaternion(pose: tuple[float, ...]) -> None:
+    """Raises ValueError for a pose whose quaternion is no rotation."""
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")

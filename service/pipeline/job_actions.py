@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 
 from service.index.queries.feed import ReadyTask
-from service.index.views import AssetView, JobView
+from service.index.views import JobView
 from service.logs import bound
 from service.model import names
 from service.model.clock import timestamp
@@ -18,6 +18,7 @@ from service.model.records import JobRecord
 from service.pipeline import fidelity_choice
 from service.pipeline.backends import Parts
 from service.pipeline.scene_check import check_scene
+from service.pipeline.usable import usable, with_neighbours
 from service.queue.port import Event, EventKind
 from service.store.deletions import refuse_pending
 from service.store.records import add_job_event, job_events, put_record, read_record
@@ -47,15 +48,16 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owne
         owner: id of the API key that submits it.
 
     Raises:
-        NotFoundError: unknown hand or object.
-        InputError: the hand or object was refused when it was checked; no chart tells which fidelity meets the target;
-            the object stands in a support of its scene (SceneError).
-        ConflictError: the check of the hand or object is still running.
+        NotFoundError: unknown hand, object or neighbour.
+        InputError: one of them was refused when it was checked; no chart tells which fidelity meets the target;
+            the object or a neighbour stands in a support of its scene (SceneError).
+        ConflictError: the check of one of them is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
     hand = usable(parts, AssetKind.HAND, request.hand)
     obj = usable(parts, AssetKind.OBJECT, request.object)
-    check_scene(request, obj)
+    request, beside = with_neighbours(parts, request)
+    check_scene(request, obj, beside)
     parts.queue.ping()
     request = fidelity_choice.explicit(parts.store, request.model_copy(update={"hand": hand.name, "object": obj.name}))
     return JobRecord(
@@ -74,13 +76,13 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
     """Keep a planned job and queue its first tasks.
 
     Args:
-        keeps_assets: a dataset keeps the hand and the object from being deleted meanwhile.
+        keeps_assets: a dataset keeps hand, object and neighbours from being deleted meanwhile.
 
     Returns:
         the job, and whether it is new.
 
     Raises:
-        NotFoundError: the hand or the object was deleted meanwhile.
+        NotFoundError: the hand, the object or a neighbour was deleted meanwhile.
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
@@ -89,11 +91,10 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
         refuse_pending(parts.store, "job", record.id)
         if not new:
             record = read_record(JobRecord, parts.store, key)
-        wanted = ((AssetKind.HAND, record.hand_digest), (AssetKind.OBJECT, record.object_digest))
         with parts.index.database.writing() as connection:
             if not new and not parts.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
-            if not keeps_assets and (missing := parts.index.assets.missing(wanted, within=connection)):
+            if not keeps_assets and (missing := parts.index.assets.missing(record.assets, within=connection)):
                 raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
             parts.index.write.add_job(record, within=connection)
     except InputError:
@@ -194,22 +195,6 @@ def _told(parts: Parts, job_id: str) -> JobView:
     except UnavailableError as error:
         log.warning("nobody was told that job %s is %s: %s", job_id, job.state, error)
     return job
-
-
-def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
-    """A hand or object by name or digest that jobs may use.
-
-    Raises:
-        NotFoundError: there is none.
-        InputError: it was refused when it was checked.
-        ConflictError: its check is still running.
-    """
-    asset = parts.index.assets.get(kind, name)
-    if asset.verdict == "refuse":
-        raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
-    if asset.verdict is None:
-        raise ConflictError(f"{kind.value} {name!r} is still being checked; submit again in a moment")
-    return asset
 
 
 def _present_origin() -> Origin | None:

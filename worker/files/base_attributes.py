@@ -27,7 +27,7 @@ def base_attributes(
         "tried": tried,
     }
     if request.in_scene:
-        said["scene"] = json_attribute(request.place.model_dump(mode="json"))
+        said["scene"] = json_attribute(request.place.told())
     if verdict_key is None:
         return said | {"verdict_level": "none"}
     return said | {"verdict_level": request.referee, "verdict_key": verdict_key}

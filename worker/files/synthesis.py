@@ -150,7 +150,7 @@ def synthesized(
 
 def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:
     """The scene as a shard tells it: neighbours by their names, not by files of this machine."""
-    said = place.model_dump(mode="json")
+    said = place.told()
     for one, other in zip(said["neighbours"], others, strict=True):
         one["object"] = other.name
     return said

@@ -16,10 +16,11 @@ from service.model.scene_spec import SceneSpec
 from worker.objects.convex import union_volume
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import decompose
-from worker.scenes.kinds import SUNK, check_free, rest_poses, supports_of
+from worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
+from worker.scenes.laid import lay_beside
 from worker.scenes.neighbours import drop_together
 from worker.simulation.outer import outer_solid
-from worker.simulation.surroundings import Neighbour, Scenes
+from worker.simulation.surroundings import Neighbour, Obstacle, Scenes
 
 Floats = NDArray[np.float64]
 
@@ -98,15 +99,44 @@ def scenes_of(
         poses = rest_poses(spec, obj, count=count, seed=seed)
         stand = np.asarray(given, float)
         poses["scene/neighbour_pose"] = np.tile(stand, (len(poses["scene/object_pose"]), 1, 1))
-    else:
-        poses = drop_together(obj, others, count=count, seed=seed)
+    elif spec.faces == "drawn" and room_in(spec) is None:
+        poses = _dropped(obj, others, supports, count=count, seed=seed)
         check_free(obj, poses["scene/object_pose"], supports)
+    else:
+        poses = _laid(spec, obj, others, supports, count=count, seed=seed)
     beside = tuple(neighbour_of(other) for other in others)
     for number, other in enumerate(others):
         check_free(other, poses["scene/neighbour_pose"][:, number], supports)
     if given:
         _check_apart([neighbour_of(obj), *beside], _all_poses(poses))
     return Scenes(supports, poses["scene/object_pose"], beside, poses["scene/neighbour_pose"]), poses
+
+
+def _dropped(
+    obj: ObjectModel, others: Sequence[ObjectModel], supports: Sequence[Obstacle], *, count: int, seed: int
+) -> dict[str, Floats]:
+    """Dropped together, or where so many never come to rest apart, laid beside each other."""
+    try:
+        return drop_together(obj, others, count=count, seed=seed)
+    except MeshError:
+        return _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
+
+
+def _laid(
+    spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel], supports: Sequence[Obstacle], *, count: int,
+    seed: int,
+) -> dict[str, Floats]:  # fmt: skip
+    """The object as it stands alone, and the others beside it; where they find no room it moves elsewhere."""
+    poses = rest_poses(spec, obj, count=count, seed=seed)
+    alone, size = poses["scene/object_pose"], room_in(spec)
+
+    def again(scene: int, draw: int) -> Floats:
+        if size is None or not draw:
+            return alone[scene]
+        return inside(obj, alone[scene], size, np.random.default_rng([seed, scene, draw]))
+
+    found, beside = lay_beside(obj, again, others, supports, within=size, count=len(alone), seed=seed)
+    return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
 
 
 def _all_poses(poses: dict[str, Floats]) -> Floats:

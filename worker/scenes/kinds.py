@@ -34,6 +34,11 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
     )
 
 
+def room_in(spec: SceneSpec) -> tuple[float, float] | None:
+    """x by y about the origin in which things stand between the walls or on the board [m]; None: no walls."""
+    return {"bin": BIN_SIZE, "shelf": (SHELF_SIZE[1], SHELF_SIZE[0])}.get(spec.kind)
+
+
 def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Where the object stands in `count` scenes (with `faces all`, in as many as it has stable faces).
 
@@ -57,9 +62,8 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         found = drop(obj, count=count, seed=seed)
     poses = found["scene/object_pose"]
     supports = supports_of(spec)
-    if spec.kind in ("bin", "shelf"):
-        size = BIN_SIZE if spec.kind == "bin" else SHELF_SIZE[::-1]
-        poses = np.array([_inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)])
+    if (size := room_in(spec)) is not None:
+        poses = np.array([inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)])
     check_free(obj, poses, supports)
     return {**found, "scene/object_pose": poses}
 
@@ -87,7 +91,7 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     }
 
 
-def _inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
+def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
     """The pose moved to a random place within a rectangle of x by y [m] about the origin.
 
     Raises:

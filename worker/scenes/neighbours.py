@@ -110,7 +110,7 @@ class _Heap:
         for k, obj in enumerate(objects):
             body = spec.worldbody.add_body(name=str(k))
             body.add_freejoint()
-            _add_hull(spec, body, str(k), obj, **contact)
+            add_hull(spec, body, str(k), obj, **contact)
             body.explicitinertial = True
             mass = DENSITY * obj.volume
             inertia = mass * obj.inertia
@@ -211,7 +211,7 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
     for k, piece in enumerate(hand.pieces):
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)
     for k, obj in enumerate(neighbours.objects):
-        _add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj)
+        add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj)
     model = spec.compile()
     data = mujoco.MjData(model)
     pieces, count = len(hand.pieces), len(neighbours.objects)
@@ -232,7 +232,8 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
     return clearance
 
 
-def _add_hull(spec: Any, body: Any, name: str, obj: ObjectModel, **options: Any) -> None:
+def add_hull(spec: Any, body: Any, name: str, obj: ObjectModel, **options: Any) -> None:
+    """Give a body of a MuJoCo specification an object's convex hull as its shape, with options of the geom."""
     mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert = np.asarray(obj.hull_vertices, np.float32).ravel()
     mesh.userface = np.asarray(obj.hull_faces, np.int32).ravel()

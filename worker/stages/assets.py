@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from typing import TypeVar, cast
 
 from cachetools import LRUCache
 
 from service.model import names
 from service.model.domain import AssetKind, TaskMessage
+from service.model.errors import MeshError
+from service.store.attributes import Attribute
 from service.store.library import load_asset_files
 from service.store.store import Store
+from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.stages.models import SHOWN_ERROR_M, publish_model
+from worker.stages.pieces import pieces_of
 from worker.stages.prepared import prepared_object
 
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
-_cache: LRUCache[Hashable, object] = LRUCache(8)
+_cache: LRUCache[Hashable, object] = LRUCache(16)
 
 
 def hand_of(store: Store, message: TaskMessage) -> HandModel:
@@ -50,6 +55,33 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
         return obj
 
     return _cached(key, load)
+
+
+def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:
+    """The other objects in the scenes of a task, in the order of its request."""
+    return [_neighbour(store, one.object, one.digest or "") for one in message.request.beside]
+
+
+def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
+    def load() -> ObjectModel:
+        obj = prepared_object(store, digest, name=name, face_error_m=NEIGHBOUR_FACE_ERROR_M)
+        publish_model(store, AssetKind.OBJECT, obj)
+        with suppress(MeshError):  # without pieces it is stayed clear of as its hull
+            pieces_of(store, obj)
+        return obj
+
+    return _cached((store.url, "neighbour", name, digest), load)
+
+
+def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
+    """What a shard says of the objects beside its own; nothing if there are none."""
+    beside = message.request.beside
+    if not beside:
+        return {}
+    return {
+        "neighbours": [one.object for one in beside],
+        "neighbour_digests": [one.digest or "" for one in beside],
+    }
 
 
 def _cached(key: Hashable, load: Callable[[], T]) -> T:

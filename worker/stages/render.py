@@ -14,7 +14,8 @@ from service.store.shards import Shard, json_attribute
 from worker.rendering import Extras, render
 from worker.rendering.hands import DrawnHand
 from worker.rendering.pages.sheets import best_in_scenes
-from worker.stages.assets import hand_of, object_of
+from worker.scenes.neighbours import Neighbours
+from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output, batch_seed
 
@@ -28,9 +29,12 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
     extras = Extras(channels=request.channels)
     if request.in_scene:
-        drawn = _drawn(shard, message, context)
-        extras = Extras(channels=request.channels, supports=supports_in(request.place), drawn=drawn)
-        said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.model_dump(mode="json"))}
+        extras = Extras(
+            channels=request.channels, supports=supports_in(request.place), drawn=_drawn(shard, message, context),
+            neighbours=_beside(shard, message, context),
+        )  # fmt: skip
+        said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.told())}
+        said |= beside_attributes(message)
     context.check()
     pictures = render(
         obj,
@@ -44,6 +48,12 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         extras=extras,
     )
     return Output(pictures, said)
+
+
+def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbours | None:
+    """The other objects of the scenes; None where the object is alone."""
+    others = neighbours_of(context.store, message)
+    return Neighbours(others, np.asarray(base["scene/neighbour_pose"], float)) if others else None
 
 
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:

@@ -14,9 +14,9 @@ from service.store.manifests import load_shard
 from service.store.shards import json_attribute
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
+from worker.scenes.beside import scenes_of
 from worker.scenes.clearance import count_rejections
-from worker.scenes.kinds import rest_poses
-from worker.stages.assets import hand_of, object_of
+from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output, batch_seed
 
@@ -36,10 +36,10 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
-    """Lay the object into `request.scenes` scenes.
+    """Lay the object and its neighbours into `request.scenes` scenes.
 
     Raises:
-        SceneError: it does not fit in, or does not come to rest.
+        SceneError: they do not fit in, stand in one another, or do not come to rest.
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
@@ -47,12 +47,15 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     place = message.request.place
     # The first batch has the scenes of `graspd synth` with the same seed.
     seed = batch_seed(message) if message.batch else message.request.seed
+    others = neighbours_of(context.store, message)
+    context.check()
     try:
-        scenes = rest_poses(place, obj, count=message.request.scenes, seed=seed)
+        _, scenes = scenes_of(place, obj, others, count=message.request.scenes, seed=seed)
     except MeshError as error:
         raise SceneError(str(error)) from None
     said: dict[str, Attribute] = {
-        "scene": json_attribute(place.model_dump(mode="json")), "root_link": hand.root_link,
+        "scene": json_attribute(place.told()), "root_link": hand.root_link,
+        **beside_attributes(message),
     }  # fmt: skip
     return Output({**scenes, **_NO_GRASPS}, said)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,15 +16,16 @@ from service.store.manifests import load_shard
 from worker.certified import Certified, certified_grasps
 from worker.files.base_attributes import base_attributes
 from worker.planners import planner
+from worker.scenes.beside import neighbour_of
 from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Scenes
-from worker.stages.assets import hand_of, object_of
+from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.output import Output
 from worker.stages.pieces import pieces_of
 
 #: Columns of the scene shard that stand in the base shard as well: so it can be used by itself.
-_OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability")
+_OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
@@ -34,7 +36,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     columns = _scene_columns(message, context)
-    scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"]) if columns else None
+    scenes = _scenes(message, columns, context) if columns else None
     context.check()
     try:
         found = certified_grasps(
@@ -59,7 +61,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     info = {**seconds, **shares, "rejected": found.rejected, "planned": found.planned, **_json(found.grasps.info)}
     said = base_attributes(hand, message.request, tried=found.tried, verdict_key=found.verdict_key)
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes is not None else {}
-    return Output({**found.grasps.to_columns(), **found.columns, **columns}, {**said, **of_scenes}, info)
+    said |= of_scenes | beside_attributes(message)
+    return Output({**found.grasps.to_columns(), **found.columns, **columns}, said, info)
 
 
 def _scene_columns(message: TaskMessage, context: TaskContext) -> dict[str, NDArray[Any]]:
@@ -72,7 +75,17 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> dict[str, NDAr
     except InputError as error:
         raise SceneError(str(error)) from None
     shard = load_shard(context.store, Stage.SCENE, message.inputs[0])
-    return {name: np.asarray(shard[name], float) for name in _OF_SCENES}
+    return {name: np.asarray(shard[name], float) for name in _OF_SCENES if name in shard.arrays}
+
+
+def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
+    """The scenes of the batch, with what stands there."""
+    scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
+    others = neighbours_of(context.store, message)
+    if not others:
+        return scenes
+    beside = tuple(neighbour_of(other) for other in others)
+    return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
 
 
 def _check_hope(message: TaskMessage, found: Certified) -> None:

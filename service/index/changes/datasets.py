@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, update
 
+from service.index.changes.rows import beside
 from service.index.database import Database, upsert
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
@@ -34,6 +35,7 @@ class DatasetChanges:
             "events": 0,
             "applied": 0,
             "planned": False,
+            "neighbours": beside(record.options),
         }
         cells = [
             {

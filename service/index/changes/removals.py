@@ -29,6 +29,8 @@ class Removals:
         if dataset := within.scalar(cell):
             return f"dataset {dataset!r}"
         if kind is AssetKind.OBJECT:
+            if user := _user_of_neighbour(digest, within):
+                return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             present = {row["name"]: row["objects"] for row in within.execute(newest).mappings()}
             if found := next((of for of, objects in present.items() if name in objects), None):
@@ -90,3 +92,14 @@ class Removals:
         within.execute(delete(grasps).where(grasps.c.shard_id == shard))
         within.execute(delete(shards).where(shards.c.id == shard))
         return True
+
+
+def _user_of_neighbour(digest: str, connection: Connection) -> str:
+    """What has an object in its scenes beside its own, in a few words; empty if nothing does."""
+    among = f"%{digest}%"
+    # The first test leaves an index those that have any.
+    of_job = select(jobs.c.id).where(jobs.c.neighbours > "", jobs.c.neighbours.like(among)).limit(1)
+    if job := connection.scalar(of_job):
+        return f"job {job}"
+    dataset = connection.scalar(select(datasets.c.name).where(datasets.c.neighbours.like(among)).limit(1))
+    return f"dataset {dataset!r}" if dataset else ""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from service.model.domain import Asset, State
+from service.model.domain import Asset, JobOptions, State
 from service.model.planning import plan, stages_of
 from service.model.records import AttemptRecord, JobRecord
 from service.store.manifests import ShardManifest
@@ -36,7 +36,13 @@ def job_row(record: JobRecord) -> Row:
         "created": record.created,
         "finished": None,
         "reason": None,
+        "neighbours": beside(record.request),
     }
+
+
+def beside(options: JobOptions) -> str:
+    """Digests of the neighbours, with a space between."""
+    return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
 def task_rows(record: JobRecord) -> Iterator[Row]:
@@ -131,6 +137,7 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
         "hand": manifest.hand,
         "object": manifest.object,
         "scene_kind": manifest.request.place.kind,
+        "neighbours": len(manifest.request.beside),
         "created": manifest.created,
     }
     return [of_shard | {"row": row} | grasp.model_dump() for row, grasp in enumerate(manifest.grasps)]

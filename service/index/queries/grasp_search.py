@@ -65,6 +65,8 @@ def conditions(where: GraspFilter | None) -> list[Condition]:
         anyone = where.scene == "any"
         compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)
         found.append(Condition("flag", grasps.c.scene_kind, compared, kind))
+    if where.neighbours is not None:
+        found.append(Condition("flag", grasps.c.neighbours, operator.gt if where.neighbours else operator.eq, 0))
     found += [Condition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
     found += [Condition(name, grasps.c[name], operator.le, bound) for name, bound in where.at_most.items()]
     return found

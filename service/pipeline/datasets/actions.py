@@ -13,11 +13,11 @@ from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snap
 from service.model.digests import digest_json
 from service.model.domain import AssetKind, JobOptions, State
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
-from service.model.scene_spec import SceneDocument
+from service.model.scene_options import NamedNeighbour, SceneDocument
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver
-from service.pipeline.job_actions import usable
+from service.pipeline.usable import usable, with_neighbours
 from service.store.datasets import add_dataset_event, dataset_events, load_dataset, load_snapshot
 from service.store.deletions import refuse_pending
 from service.store.records import put_record, read_record
@@ -33,29 +33,32 @@ def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[D
         the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
 
     Raises:
-        NotFoundError: unknown hand, object or set.
+        NotFoundError: unknown hand, object, neighbour or set.
         InputError: a hand or object was refused when it was checked; no chart tells which fidelity meets the target.
         ConflictError: a check is still running, or the name stands for another dataset.
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
     hands, objects = members(parts, request)
+    shared, beside = with_neighbours(parts, request.shared)
     parts.queue.ping()
     key = names.dataset_record(request.name)
     new = False
     # One that is there stays what it is: a later chart changes none of its fidelities.
     if not parts.store.exists(key):
-        found = describe(request.name, hands, objects, request.shared, Resolver(parts.store), owner)
+        found = describe(request.name, hands, objects, shared, Resolver(parts.store), owner)
         new = put_record(parts.store, key, found)
     record = load_dataset(parts.store, request.name)
     if not new:
         # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
-        other = _difference(record, hands, objects, request.shared)
+        other = _difference(record, hands, objects, shared)
         if other:
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
     try:
         refuse_pending(parts.store, "dataset", record.name)
-        wanted = [(AssetKind.HAND, one.digest) for one in hands] + [(AssetKind.OBJECT, one.digest) for one in objects]
+        wanted = [(AssetKind.HAND, one.digest) for one in hands]
+        wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
+        wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
         with parts.index.database.writing() as connection:
             if not parts.store.exists(key):
                 raise ConflictError(f"dataset {record.name!r} was deleted just now; create it again")
@@ -202,6 +205,8 @@ def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member]
 
 
 def _said(value: object) -> str:
+    if isinstance(value, tuple) and value and isinstance(value[0], NamedNeighbour):
+        return ", ".join(one.object for one in value)
     return "a document of its own" if isinstance(value, SceneDocument) else repr(value)
 
 

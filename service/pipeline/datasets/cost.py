@@ -90,7 +90,12 @@ def estimate(
             sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
     later = _later_rates(costs, options, sums.machine)
-    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, objects))
+    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, _once(objects, options)))
+
+
+def _once(objects: list[str], options: JobOptions) -> list[str]:
+    """The objects of all cells, neighbours too."""
+    return list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:

@@ -161,7 +161,9 @@ class Rates:
 def _stored_of(options: JobOptions) -> tuple[float, float, str]:
     """Stored seconds per try, yield and origin."""
     if options.in_scene:
-        seconds, _, origin = _stored_of(options.model_copy(update={"scene": "free", "faces": "drawn"}))
+        seconds, _, origin = _stored_of(
+            options.model_copy(update={"scene": "free", "faces": "drawn", "neighbours": ()})
+        )
         longer, share = STORED_IN_SCENE
         return longer * seconds, share, f"{origin}, in a scene"
     method, name = options.method, options.knobs.name
@@ -216,6 +218,7 @@ def recipe_of(options: JobOptions) -> Hashable:
         options.referee,
         options.robustness,
         options.place.kind,
+        len(options.beside),
     )
 
 

@@ -12,6 +12,7 @@ from tests.api.factories import add_job, finish_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 PLANE = {"kind": "half_space"}
+UPRIGHT = [0, 0, 0, 1, 0, 0, 0]
 
 
 def test_a_job_in_a_scene_tells_its_stages_and_its_scene(http: TestClient) -> None:
@@ -43,8 +44,8 @@ def test_the_document_offers_scenes_and_keeps_the_defaults(http: TestClient) -> 
     defaults = {name: field["default"] for name, field in fields.items() if "default" in field}
     assert defaults == {
         "grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scene": "free", "faces": "drawn",
-        "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240, "channels": [], "friction": 1.0,
-        "want": "valid", "budget": 4.0, "referee": "certificate", "audits": 8, "robustness": 0, "target": "",
+        "neighbours": [], "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240, "channels": [],
+        "friction": 1.0, "want": "valid", "budget": 4.0, "referee": "certificate", "audits": 8, "robustness": 0, "target": "",
     }  # fmt: skip
 
 
@@ -57,6 +58,12 @@ def test_the_document_offers_scenes_and_keeps_the_defaults(http: TestClient) -> 
         ({"scene": {"supports": [PLANE] * 33}}, "scene", "at most 32"),
         ({"scene": "bin", "method": "graspit"}, "body", "plans around free objects only"),
         ({"scene": "free", "faces": "all"}, "body", "lies on no face"),
+        ({"neighbours": ["block"]}, "body", "neighbours stand in a scene"),
+        ({"scene": "bin", "neighbours": ["block"] * 9}, "neighbours", "at most 8"),
+        ({"scene": "bin", "neighbours": ["../block"]}, "neighbours", "match pattern"),
+        ({"scene": "bin", "neighbours": [{"object": "block", "pose": [0, 0, 0, 1, 0, 0, 0]}]}, "body", "scene file"),
+        ({"scene": {"supports": [PLANE], "neighbours": [{"object": "a"}] * 9}}, "scene", "at most 8"),
+        ({"scene": {"supports": [PLANE], "target": UPRIGHT, "neighbours": [{"object": "a"}]}}, "body", "give all"),
     ],
 )
 def test_a_scene_that_is_none_is_a_problem(http: TestClient, wrong: dict[str, Any], where: str, words: str) -> None:
@@ -67,6 +74,32 @@ def test_a_scene_that_is_none_is_a_problem(http: TestClient, wrong: dict[str, An
     assert http.get("/v1/jobs").json()["items"] == []
 
 
+def test_neighbours_are_named_and_come_back_with_their_digests(http: TestClient) -> None:
+    block = http.get("/v1/objects/block").json()["digest"]
+    job = http.post("/v1/jobs", json={**JOB, "scene": "bin", "neighbours": ["block", {"object": "bottle"}]}).json()
+    assert [one["object"] for one in job["request"]["neighbours"]] == ["block", "bottle"]
+    assert job["request"]["neighbours"][0]["digest"] == block
+    page = http.get(f"/jobs/{job['id']}").text
+    assert "in a bin beside block, bottle" in page
+    again = http.post("/v1/jobs", json=job["request"])
+    assert again.json()["id"] == job["id"], "what was read can be sent again"
+    unknown = http.post("/v1/jobs", json={**JOB, "scene": "bin", "neighbours": ["teapot"]})
+    assert (unknown.status_code, unknown.headers["content-type"]) == (404, "application/problem+json")
+    assert "there is no object 'teapot'" in unknown.json()["detail"]
+
+
+def test_a_document_holds_neighbours_with_their_poses(http: TestClient) -> None:
+    places = [{"object": "block", "pose": [0.15, 0, 0.03, 1, 0, 0, 0]}]
+    document = {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.1, 1, 0, 0, 0], "neighbours": places}
+    told = http.post("/v1/jobs", json={**JOB, "scene": document}).json()["request"]["scene"]["neighbours"]
+    assert [(one["object"], one["pose"]) for one in told] == [("block", places[0]["pose"])]
+    sunk = {**document, "neighbours": [{"object": "block", "pose": [0.15, 0, -0.3, 1, 0, 0, 0]}]}
+    answer = http.post("/v1/jobs", json={**JOB, "scene": sunk})
+    assert answer.status_code in (202, 422)  # where the check told its centre, it is refused here
+    if answer.status_code == 422:
+        assert "block stands in support 0" in answer.json()["detail"]
+
+
 def test_grasps_are_filtered_by_the_kind_of_their_scene(http: TestClient, parts: Parts) -> None:
     for fields in ({}, {"scene": "table", "scenes": 2}):
         finish_all(parts, add_job(parts, **fields))
@@ -75,6 +108,18 @@ def test_grasps_are_filtered_by_the_kind_of_their_scene(http: TestClient, parts:
         assert {grasp["scene_kind"] for grasp in found} == counts
     assert http.get("/v1/grasps", params={"scene": "moon"}).status_code == 422
     assert http.get("/v1/grasps", params={"min_clearance_m": 0.001, "lift_hard": "true"}).json()["items"] == []
+
+
+def test_the_form_asks_for_neighbours(http: TestClient) -> None:
+    form = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "draft", "scene": "table"}
+    answer = http.post("/submit", data=form | {"neighbours": "block, bottle block"}, follow_redirects=False)
+    assert answer.status_code == 303
+    told = http.get("/v1" + answer.headers["location"]).json()["request"]["neighbours"]
+    assert [one["object"] for one in told] == ["block", "bottle", "block"]
+    page = http.post("/submit", data=form | {"scene": "free", "neighbours": "block"})
+    assert page.status_code == 422 and "neighbours stand in a scene" in page.text
+    assert 'value="block"' in page.text, "what was typed stays"
+    assert http.post("/submit", data=form | {"neighbours": "teapot"}).status_code == 404
 
 
 def test_the_form_asks_for_a_scene(http: TestClient) -> None:

@@ -151,9 +151,8 @@ def test_synth_with_neighbours_writes_them_and_its_lifts_are_judged_again_alike(
     ("args", "words"),
     [
         (["--scene", "table", *["--with", "mug"] * 9], "at most 8"),
-        (["--scene", "bin", "--with", "mug"], "neighbours stand on a table or in a scene file"),
-        (["--with", "mug"], "neighbours stand on a table or in a scene file"),
-        (["--scene", "table", "--faces", "all", "--with", "mug"], "give all of them poses"),
+        (["--with", "mug"], "neighbours stand in a scene"),
+        (["--scene", "bin", *["--with", "bottle"] * 8], "no room for 8 neighbours beside block"),
         (["--scene", "table", "--with", "no-such-thing"], "no-such-thing"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from service.model.domain import AssetKind, JobRequest, Lane, Stage
 from service.model.errors import TaskRefused
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.scene_kinds import supports_in
 from service.queue.port import EventKind
 from service.readers import Grasps, Pictures, open_shards
 from service.store.assets import builtin_files
@@ -25,10 +27,15 @@ from service.store.manifests import load_manifest, load_shard
 from service.store.records import put_record, read_record
 from service.store.shards import Shard
 from service.store.store import Store, open_store
+from worker.files.of_shard import placed_of_shard
 from worker.files.synthesis import synthesized
 from worker.process.runner import Runner
+from worker.rendering import Extras
+from worker.rendering import render as pictures
 from worker.stages import render, scene, synthesize
+from worker.stages.assets import object_of
 from worker.stages.context import TaskContext
+from worker.stages.output import batch_seed
 
 TABLE = {
     "grasps": 6, "fidelity": "draft", "seed": 3, "audits": 0, "scene": "table", "scenes": 2, "views": 1, "width": 48,
@@ -48,6 +55,9 @@ class Bench:
         """Kind and words of the end of a job's first batch."""
         hand = publish_asset(self.store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
         obj = publish_asset(self.store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
+        for one in request.get("neighbours", ()):
+            files = builtin_files(AssetKind.OBJECT, one["object"])
+            one["digest"] = publish_asset(self.store, AssetKind.OBJECT, one["object"], files).digest
         wanted = JobRequest(hand="barrett", object="block", **request)
         self.job = JobRecord(
             id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest,
@@ -115,6 +125,46 @@ def test_readers_give_the_way_of_a_grasp_and_the_grasps_of_a_picture(table: Benc
     base, views = table.made(Stage.SYNTHESIZE), table.made(Stage.RENDER)
     row = int(pictures[0]["grasp/base_row"][0])
     assert base["grasp/scene_index"][row] == pictures[0]["scene"] == views["camera/scene_index"][0]
+
+
+def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -> None:
+    bench = Bench(table.store)
+    beside = [{"object": "mug"}, {"object": "block"}]
+    bench_of = {"scene": "bin", "neighbours": beside, "want": "raw", "grasps": 2, "scenes": 1}
+    assert bench.run(**TABLE | bench_of) == (EventKind.FINISHED, "")
+    shards = [bench.made(stage) for stage in STAGES]
+    for shard in shards:
+        assert shard.attributes["neighbours"] == ["mug", "block"]
+        assert shard.attributes["neighbour_digests"] == [one["digest"] for one in beside]
+    first, base, views = shards
+    assert base["scene/neighbour_pose"].shape == (1, 2, 7)
+    np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
+    scenes = placed_of_shard(base)
+    assert scenes is not None and len(scenes.neighbours) == 2
+    assert table.store.exists(names.asset_model(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
+    alone = render_alone(bench, base)
+    assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"
+    assert set(np.unique(views["image/segmentation"])) - {0, 1, 2}
+
+
+def render_alone(bench: Bench, base: Shard) -> dict[str, Any]:
+    """The pictures of a job's scenes as they would be without neighbours."""
+    message = message_of(bench.job, list(plan(bench.job))[-1], attempt=1, max_attempt=3)
+    request = bench.job.request
+    return pictures(
+        object_of(bench.store, message), np.asarray(base["scene/object_pose"]), views=1, stereo=False,
+        width=request.width, height=request.height, seed=batch_seed(message),
+        extras=Extras(supports=supports_in(request.place)),
+    )  # fmt: skip
+
+
+def test_neighbours_that_overlap_fail_the_job_in_a_line(table: Bench) -> None:
+    bench = Bench(table.store)
+    one = {"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}
+    scene = {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]}
+    kind, words = bench.run(**TABLE | {"scene": scene, "neighbours": [one]})
+    assert kind is EventKind.FAILED
+    assert re.search(r"block and mug overlap by [\d.]+ mm in scene 0; move one of them", words)
 
 
 def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> None:

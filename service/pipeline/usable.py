@@ -1,0 +1,48 @@
+"""Which hands and objects jobs may use: those of the request, and the neighbours in its scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+from service.index.views import AssetView
+from service.model.domain import AssetKind, JobOptions
+from service.model.errors import ConflictError, InputError
+from service.pipeline.backends import Parts
+
+Options = TypeVar("Options", bound=JobOptions)
+
+
+def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
+    """A hand or object by name or digest that jobs may use.
+
+    Raises:
+        NotFoundError: there is none.
+        InputError: it was refused when it was checked.
+        ConflictError: its check is still running.
+    """
+    asset = parts.index.assets.get(kind, name)
+    if asset.verdict == "refuse":
+        raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
+    if asset.verdict is None:
+        raise ConflictError(f"{kind.value} {name!r} is still being checked; submit again in a moment")
+    return asset
+
+
+def with_neighbours(parts: Parts, options: Options) -> tuple[Options, Sequence[AssetView]]:
+    """Options whose neighbours have the digests of the very files that the names stand for, and these neighbours.
+
+    A digest that the request says itself, as one that was read from a job does, is kept.
+
+    Raises:
+        what `usable` raises; InputError where a name and a digest are of two objects.
+    """
+    beside = [usable(parts, AssetKind.OBJECT, one.digest or one.object) for one in options.beside]
+    for one, asset in zip(options.beside, beside, strict=True):
+        if one.object not in (asset.name, asset.digest):
+            raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")
+    found = [
+        one.model_copy(update={"object": asset.name, "digest": asset.digest})
+        for one, asset in zip(options.beside, beside, strict=True)
+    ]
+    return options.with_beside(found), beside
