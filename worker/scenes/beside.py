@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any, Final
 
@@ -37,7 +38,7 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
         MeshError: the object is flat.
     """
     if (found := _made.get(obj.content)) is not None:
-        return found
+        return replace(found, obj=obj)  # the same mesh may go by another name
     try:
         pieces = decompose(obj).vertices
     except MeshError:
