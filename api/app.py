@@ -23,7 +23,7 @@ from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
 from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
-from api.routes import datasets, grasps, jobs, shards, system
+from api.routes import datasets, grasps, hand_corrections, jobs, shards, system
 from api.routes.assets import asset_router
 from api.routes.dependencies import provide
 from api.routes.long_requests import FORMS, UPLOADS, Turns
@@ -74,7 +74,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     problems.install(app, problem_page)
-    for routes in (jobs, grasps, shards, system):
+    for routes in (jobs, grasps, shards, system, hand_corrections):
         app.include_router(routes.router)
     for router in (*map(asset_router, AssetKind), *datasets.routers):
         app.include_router(router)

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import json
 import logging
 from collections.abc import Mapping
+from typing import Final
 
 from api.access.auth import caller_id, must_own
 from service.index.views import AssetView, Page
 from service.model import names
 from service.model.digests import digest_files
 from service.model.domain import AssetKind
-from service.model.errors import ConflictError, NotFoundError
+from service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
 from service.store import library
+from service.store.assets import ZipFiles, asset_json
+from service.store.descriptions import MAX_BYTES, json_object
+from service.store.hand_corrections import HandCorrections, HandFacts, corrected, facts_of
 
 log = logging.getLogger(__name__)
+_MAX_NAME: Final = 64
+_NAMES_TRIED: Final = 100
 
 
 class Assets:
@@ -59,6 +67,56 @@ class Assets:
             asset = library.record_asset(store, asset)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
         return index.assets.get(kind, asset.digest)
+
+    def hand_facts(self, asset: AssetView) -> HandFacts:
+        """What was found and guessed of a hand.
+
+        Raises:
+            NotFoundError: it has not been checked yet, or was refused.
+            ConflictError: its model was made by an older version.
+        """
+        return facts_of(self.model(asset))
+
+    def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
+        """A hand of the same files whose `asset.json` says what was found, with corrections; its check is queued.
+
+        Args:
+            name: the hand that was guessed wrongly, or its digest.
+            corrections: what to say instead.
+            new_name: of the corrected hand; empty: the name with the next free number.
+
+        Raises:
+            NotFoundError: there is no such hand, or no model of it yet.
+            ConflictError: the new name stands for another hand, or these corrections are known under another name.
+            InputError: a link or a joint that it does not have, or a value out of its limits.
+        """
+        hand = self.one(AssetKind.HAND, name)
+        facts = self.hand_facts(hand)
+        archive = self._parts.store.get(names.asset_files(AssetKind.HAND, hand.digest))
+        files = ZipFiles(io.BytesIO(archive), limit_bytes=library.UNPACKED_LIMIT_BYTES)
+        if digest_files(AssetKind.HAND, files) != hand.digest:
+            raise DamagedError(f"the files of the hand {hand.name!r} in the store are damaged; upload it again")
+        said = json_object(asset_json(files), "asset.json")
+        text = json.dumps(corrected(said, facts, corrections)).encode()
+        if len(text) > MAX_BYTES:
+            raise LimitError(f"what is said of the hand takes more than {MAX_BYTES} bytes; correct less")
+        files["asset.json"] = text
+        if not new_name:
+            # The same corrections are the same hand.
+            with contextlib.suppress(NotFoundError):
+                return self.one(AssetKind.HAND, digest_files(AssetKind.HAND, files))
+        return self.add(AssetKind.HAND, new_name or self._next_name(hand.name), files)
+
+    def _next_name(self, name: str) -> str:
+        stem, _, number = name.rpartition("-")
+        stem, first = (stem, int(number) + 1) if stem and number.isdigit() and len(number) < 4 else (name, 2)
+        for tried in range(first, first + _NAMES_TRIED):
+            named = f"{stem[: _MAX_NAME - 5]}-{tried}"
+            try:
+                self.one(AssetKind.HAND, named)
+            except NotFoundError:
+                return named
+        raise ConflictError(f"there are many hands named {stem}-...; choose a name")
 
     def delete(self, kind: AssetKind, name: str) -> None:
         """Take a hand or object away that nothing needs.

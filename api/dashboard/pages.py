@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from api.catalog import events
-from api.dashboard import dataset_pages, forms, grasp_pages, job_pages, service_pages, session
+from api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages, session
 from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
@@ -26,7 +26,7 @@ def install(app: FastAPI, parts: Parts) -> None:
     app.state.templates = environment()
     app.state.pictures = Pictures(parts.store)
     app.state.expectations = Expectations(parts.index)
-    for part in (service_pages, job_pages, grasp_pages, dataset_pages, forms, session):
+    for part in (service_pages, job_pages, grasp_pages, hand_pages, dataset_pages, forms, session):
         app.include_router(part.router)
     app.include_router(router)
 

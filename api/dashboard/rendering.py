@@ -20,6 +20,7 @@ NAVIGATION: Final = (
     ("/", "Home"),
     ("/datasets", "Datasets"),
     ("/grasps", "Grasps"),
+    ("/hands", "Hands"),
     ("/workers", "Workers"),
     ("/chart", "Chart"),
     ("/stability", "Stability"),

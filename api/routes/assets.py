@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from threading import BoundedSemaphore
 from typing import Annotated, Final
 
@@ -19,6 +21,7 @@ from api.uploads import files_of_upload, name_of_upload
 from service.index.views import AssetView, Page
 from service.model.domain import AssetKind, Name
 from service.model.errors import RateError
+from service.store.hand_corrections import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
 #: Uploads being unpacked and packed in this process; each may hold one file of its size in memory.
@@ -124,10 +127,26 @@ def store_upload(
         RateError: too many others are being taken; their number bounds the memory that uploads use.
     """
     filename = file.filename or ""
+    with _one_of_few():
+        files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
+        return assets.add(kind, name or name_of_upload(filename), files)
+
+
+def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:
+    """A corrected hand, and the task that checks it; it counts as an upload.
+
+    Raises:
+        RateError: too many others are being taken.
+    """
+    with _one_of_few():
+        return assets.correct(name, corrections, new_name or "")
+
+
+@contextmanager
+def _one_of_few() -> Iterator[None]:
     if not _AT_ONCE.acquire(timeout=_TURN_S):
         raise RateError("too many uploads at once; try again in a moment")
     try:
-        files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
-        return assets.add(kind, name or name_of_upload(filename), files)
+        yield
     finally:
         _AT_ONCE.release()

@@ -98,8 +98,15 @@ def publish_builtins(store: Store) -> list[Asset]:
                 published.append(publish_asset(store, kind, name, files, builtin=True, created=asset.created))
             except DamagedError as error:
                 log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
-            store.put(names.asset_model(kind, asset.digest), builtin_model(kind, name))
+            _put_model(store, names.asset_model(kind, asset.digest), builtin_model(kind, name))
     return published
+
+
+def _put_model(store: Store, key: str, model: bytes) -> None:
+    """A picture follows from the program as well as from the asset: one of an older version is replaced."""
+    if not store.put(key, model) and store.get(key) != model:
+        store.delete(key)
+        store.put(key, model)
 
 
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:

@@ -116,6 +116,7 @@ def photograph(address: str, places: dict[str, str], folder: Path, only: set[str
         ("grasps", "/grasps", "#found canvas[data-state=ready]", LAPTOP, "light", False),
         ("grasp", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", (1440, 1000), "light", False),
         ("grasp-dark", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", (1440, 1000), "dark", False),
+        ("hand", "/hands/allegro", ".viewer[data-state=ready]", (1440, 1000), "light", False),
         ("workers", "/workers", ".worker", LAPTOP, "light", False),
         ("chart", "/chart", ".trade circle", LAPTOP, "light", False),
         ("stability", "/stability", ".failure", (1440, 1180), "light", False),

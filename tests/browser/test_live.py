@@ -48,7 +48,7 @@ def places(parts: Parts) -> list[str]:
     return [
         "/", "/datasets", "/datasets/kitchen", "/datasets/kitchen?state=queued", f"/jobs/{record.id}",
         f"/jobs/{waiting.id}", "/grasps", "/grasps?view=table", "/grasps?min_epsilon=99", f"/grasps/{shard}/0",
-        "/workers", "/chart", "/stability", "/submit", "/problems", "/login",
+        "/hands", "/hands/shadow", "/workers", "/chart", "/stability", "/submit", "/problems", "/login",
     ]  # fmt: skip
 
 
@@ -182,6 +182,7 @@ def test_every_page_reads_without_javascript(address: str, page: Any, places: li
     assert "Penetration" in of("/grasps/")
     assert "allegro × mug" in of("/grasps")
     assert "kitchen" in of("/datasets")
+    assert "Save as a hand of its own" in of("/hands/")
     assert "standard" in of("/chart")
     assert "hands sink in" in of("/stability")
 

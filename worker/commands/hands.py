@@ -25,7 +25,8 @@ from service.store.asset_options import (
     hand_options,
 )
 from service.store.asset_summary import say_check
-from worker.hands.check import check_hand, described
+from service.store.hand_corrections import described
+from worker.hands.check import check_hand
 from worker.hands.load import files_from_path, hand_from_path, main_file
 from worker.hands.model import HandModel
 from worker.hands.options import parse_options

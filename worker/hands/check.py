@@ -11,7 +11,7 @@ from service.model.errors import HandError, InputError
 from worker.hands.jaws import jaws_of
 from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
-from worker.hands.opposition import opposes
+from worker.hands.oppositions import opposes
 from worker.hands.options import HandOptions, parse_options
 from worker.hands.read import read_robot
 from worker.hands.robot import Robot
@@ -83,6 +83,16 @@ def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
     """What a user should look at before trusting a hand; numbers in SI units."""
     return {
         "links": len(robot.links),
+        **model_facts(hand),
+        "mass": float(hand.masses.sum()),
+        "pieces": len(hand.pieces),
+        "notes": list(robot.notes),
+    }
+
+
+def model_facts(hand: HandModel) -> dict[str, Any]:
+    """Those of them that follow from the model alone."""
+    return {
         "bodies": hand.bodies,
         "joints": list(hand.joint_names),
         "dofs": list(hand.dof_names),
@@ -95,21 +105,6 @@ def hand_facts(hand: HandModel, robot: Robot) -> dict[str, Any]:
         "lower": dict(zip(hand.dof_names, _rounded(hand.lower), strict=True)),
         "upper": dict(zip(hand.dof_names, _rounded(hand.upper), strict=True)),
         "effort": dict(zip(hand.dof_names, _rounded(hand.effort), strict=True)),
-        "mass": float(hand.masses.sum()),
-        "pieces": len(hand.pieces),
-        "notes": list(robot.notes),
-    }
-
-
-def described(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of an `asset.json` that say what was found or guessed: root, palm, pre-shape, closing, fingertips."""
-    root = facts["root"]
-    return {
-        "root": root,
-        "palm": {"link": root, "centre": facts["palm_centre"], "approach": facts["palm_approach"]},
-        "preshape": facts["preshape"],
-        "closing": facts["closing"],
-        "fingertips": facts["fingertips"],
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from worker.hands.model import HandModel
 from worker.hands.options import DEFAULT_FORCE, DEFAULT_LINEAR_STIFFNESS
 
 
-def with_drive(hand: HandModel, stated: Sequence[str], assumed: Sequence[str]) -> HandModel:
+def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
     """The hand with the defaults of sliding joints and of jaws instead of those of revolute joints.
 
     A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit

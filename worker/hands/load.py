@@ -108,6 +108,7 @@ def body_model(
         velocity=tree.velocity,
         arm=chain_to(robot, tree.body_names[0]),
         visuals=Visuals(_placed_visuals(robot, tree), files, base),
+        frames=dict(tree.links),
     )
 
 
@@ -160,21 +161,18 @@ def _effort(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
     return np.array(values)
 
 
-def stated_gains(robot: Robot, dofs: Sequence[str], options: HandOptions) -> list[str]:
-    """Dofs whose position gain somebody states."""
-    stated = options.stiffness
-    if isinstance(stated, float):
-        return list(dofs)
-    return [dof for dof in dofs if dof in (stated or {}) or robot.joints[dof].stiffness]
+def stated_gains(robot: Robot, dofs: Sequence[str], options: HandOptions) -> dict[str, float]:
+    """Position gains that somebody states: the options, else the robot's servos."""
+    if isinstance(options.stiffness, float):
+        return dict.fromkeys(dofs, options.stiffness)
+    said = {dof: robot.joints[dof].stiffness for dof in dofs if robot.joints[dof].stiffness}
+    return said | {dof: gain for dof, gain in (options.stiffness or {}).items() if dof in dofs}
 
 
 def _stiffness(robot: Robot, tree: Tree, options: HandOptions) -> Floats:
-    """(D,) stated, else that of the robot's servos, else assumed."""
-    stated = options.stiffness
-    values = []
-    for dof in tree.dof_names:
-        gain = stated if isinstance(stated, float) else (stated or {}).get(dof)
-        values.append(gain if gain is not None else robot.joints[dof].stiffness or DEFAULT_STIFFNESS)
+    """(D,) stated, else assumed."""
+    stated = stated_gains(robot, tree.dof_names, options)
+    values = [stated.get(dof, DEFAULT_STIFFNESS) for dof in tree.dof_names]
     if min(values) <= 0:
         raise HandError("a stiffness in asset.json is not positive")
     return np.array(values)

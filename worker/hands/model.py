@@ -6,6 +6,7 @@ Frames: body frame = frame of the link that the moving joint carries; root frame
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -127,6 +128,8 @@ class HandModel:
     """Joints, fixed ones too, from the root of the robot that the hand came on to `root_link`, for export."""
     visuals: Visuals = NO_VISUALS
     """What the hand looks like."""
+    frames: Mapping[str, tuple[int, Floats]] = field(default_factory=dict)
+    """Each link: its body, and its pose (7,) in the body's frame."""
 
     @cached_property
     def content(self) -> str:

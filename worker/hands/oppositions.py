@@ -1,4 +1,5 @@
-"""Postures in which a hand's fingers oppose one another: between how wide a thing they can take hold of.
+"""Whether a hand's surfaces oppose one another, and postures in which its fingers do: between how wide a thing they
+can take hold of.
 
 A hand holds between one finger, as a rule the thumb, and others whose pads look at it. Such postures are found by
 sampling and random steps, for as many widths as there are.
@@ -14,9 +15,11 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_conjugate, quat_rotate
+from service.model.transforms import IDENTITY_POSE, quat_rotate
+from worker.hands.guess import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
+from worker.hands.pads import Pad, fingertip_pad
 from worker.hands.surface import sample_surface
 
 #: Postures that are wanted, from so many times as many, and random steps that make them better.
@@ -35,13 +38,15 @@ WIDTH_M: Final = 0.02
 #: Spread of dofs that do not close the hand about the pre-shape, and of fingers that close together: shares of a range.
 SIDEWAYS: Final = 0.15
 UNEVEN: Final = 0.06
-#: Share of a fingertip's speed, and so of its length, within which its points are its pad.
-PAD: Final = 0.5
-#: Points of the hand's surface that pads are made of.
-_POINTS: Final = 1000
-_STILL: Final = (0.0, 0, 0, 1, 0, 0, 0)
-
-Pad = tuple[Floats, Floats]
+#: Points of the surface, and postures at random, with which it is told whether a hand can hold anything.
+_CHECKED_POINTS: Final = 512
+_CHECKED_AT_RANDOM: Final = 11
+#: Surfaces farther apart than this hold nothing that a hand can lift, nearer than this nothing at all [m].
+_GAP_M: Final = (0.004, 0.3)
+#: Least cosine between a normal and the way to the other surface: within 60 degrees.
+_TOWARD: Final = 0.5
+#: A gap that changes less than this is that of a rigid fork [m].
+_CLOSING_M: Final = 0.003
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ def oppositions_of(hand: HandModel) -> Oppositions:
 def _oppositions(hand: HandModel) -> Oppositions:
     if len(hand.fingertips) < 2:
         return Oppositions(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    pads = [_pad(hand, body) for body in hand.fingertips]
+    pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     tried = []
     for one in range(len(pads)):
         seen = _Seen.of(hand, pads, one, _postures(hand, one, POSTURES))
@@ -116,9 +121,9 @@ class _Seen:
 
     @classmethod
     def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _Seen:
-        tips = body_poses(hand, np.tile(_STILL, (len(q), 1)), hand.expand(q))[:, list(hand.fingertips)]
-        place = quat_rotate(tips[..., 3:], np.array([p[0] for p in pads])) + tips[..., :3]
-        looks = quat_rotate(tips[..., 3:], np.array([p[1] for p in pads]))
+        tips = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, list(hand.fingertips)]
+        place = quat_rotate(tips[..., 3:], np.array([p.centre for p in pads])) + tips[..., :3]
+        looks = quat_rotate(tips[..., 3:], np.array([p.normal for p in pads]))
         others = [f for f in range(len(pads)) if f != one]
         a, b = place[:, one], place[:, others].mean(axis=1)
         width = np.linalg.norm(b - a, axis=1)
@@ -182,28 +187,30 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return finger, rank
 
 
-def _pad(hand: HandModel, tip: int) -> Pad:
-    """Where and whereto a fingertip presses, body frame: the end of the side that its last joint moves ahead."""
-    points = sample_surface(hand, _POINTS)
-    mine = points.body == tip
-    place, normal = points.position[mine], points.normal[mine]
-    chain, body = [], tip
-    while body > 0:
-        chain.append(body)
-        body = int(hand.parent[body])
-    driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
-    if not len(place) or not driven:
-        return np.zeros(3), np.array([0.0, 0, 1])
-    dof = int(hand.dof[driven[0]])
-    step = np.zeros(hand.dofs)
-    step[dof] = 1e-4 * (hand.closing[dof] or 1.0)
-    q = np.stack([hand.preshape, hand.preshape + step])
-    pose = body_poses(hand, np.tile(_STILL, (2, 1)), hand.expand(q))[:, tip]
-    moved = quat_rotate(pose[:, None, 3:], place[None]) + pose[:, None, :3]
-    move = quat_rotate(quat_conjugate(pose[0, 3:]), moved[1] - moved[0])
-    speed = np.linalg.norm(move, axis=1)
-    ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > 0.7
-    far = speed >= speed.max() - PAD * np.ptp(speed)
-    chosen = next((part for part in (ahead & far, ahead) if part.any()), far)
-    look = normal[chosen].mean(axis=0)
-    return place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9)
+def opposes(hand: HandModel) -> bool:
+    """Whether two points on different bodies face each other in some posture, with a gap that the joints change."""
+    points = sample_surface(hand, _CHECKED_POINTS)
+    rng = np.random.default_rng(0)
+    shares = [posture(hand, share) for share in np.linspace(0, 1, 5)]
+    q = np.concatenate([shares, rng.uniform(hand.lower, hand.upper, (_CHECKED_AT_RANDOM, hand.dofs))])
+    poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, points.body]
+    position = quat_rotate(poses[..., 3:], points.position) + poses[..., :3]
+    normal = quat_rotate(poses[..., 3:], points.normal)
+    apart = points.body[:, None] != points.body[None]
+    gaps = np.linalg.norm(position[0][:, None] - position[0][None], axis=2)
+    least, most = gaps.copy(), gaps.copy()
+    facing = np.zeros_like(apart)
+    for at, outward in zip(position, normal, strict=True):
+        found, gaps = _face_to_face(at, outward)
+        facing |= found & apart
+        np.minimum(least, gaps, out=least)
+        np.maximum(most, gaps, out=most)
+    return bool((facing & (most - least > _CLOSING_M)).any())
+
+
+def _face_to_face(position: Floats, normal: Floats) -> tuple[np.ndarray, Floats]:
+    """(N, N) whether two points look at each other over a gap, and the gap [m]."""
+    way = position[None] - position[:, None]
+    gap = np.linalg.norm(way, axis=2)
+    toward = np.einsum("ijk,ik->ij", way, normal) > _TOWARD * gap
+    return toward & toward.T & (gap > _GAP_M[0]) & (gap < _GAP_M[1]), gap

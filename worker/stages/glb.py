@@ -2,6 +2,8 @@
 
 The joint tree stands in the `extras` of the nodes, so a viewer poses the hand from the joint positions of a shard:
 a node's pose is parent * rest pose * motion about `axis`. Points of the hand's surface come as POINTS primitives.
+Of a body that is shown by visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The
+document's `extras` say what was found of the hand: facts, frames of its links, what drives its joints, its pads.
 """
 
 from __future__ import annotations
@@ -10,7 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from worker.hands.model import HandModel, JointType
+from worker.hands.check import model_facts
+from worker.hands.model import Floats, HandModel, JointType
+from worker.hands.pads import pads_of
+from worker.hands.robot import Ints
 from worker.hands.surface import sample_surface
 from worker.hands.visuals import VisualMesh, lighter
 from worker.objects.glb_document import Document, plain
@@ -18,10 +23,14 @@ from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals
 from worker.rendering.palette import linear
 
+Colour = tuple[float, float, float]
+
 #: Points on the hand from which a viewer measures its distance to the object.
 SURFACE_POINTS: Final = 3000
 #: Triangles of a hand's visual meshes together: a browser draws them at once.
 MAX_FACES: Final = 60_000
+#: Points of a pad at most.
+PAD_POINTS: Final = 60
 #: sRGB of parts without a colour beside parts with one.
 _GREY: Final = (0.45, 0.5, 0.55)
 
@@ -41,6 +50,8 @@ def hand_glb(hand: HandModel) -> bytes:
             kind = "prismatic" if hand.joint_type[body] == JointType.PRISMATIC else "revolute"
             node["extras"] |= {"joint": joint_of_body[body], "type": kind, "axis": plain(hand.axis[body])}
         primitives = _body_primitives(document, hand, body, visuals)
+        if any(mesh.body == body for mesh in visuals) and (pieces := _piece_primitive(document, hand, body)):
+            node["extras"]["collision"] = document.mesh([pieces])
         if (on_body := points.position[points.body == body]).size:
             primitives.append(document.points(on_body))
         if primitives:
@@ -50,7 +61,8 @@ def hand_glb(hand: HandModel) -> bytes:
         nodes.append(node)
     preshape = dict(zip(hand.joint_names, plain(hand.expand(hand.preshape)), strict=True))
     palm = {"centre": plain(hand.palm.centre), "approach": plain(hand.palm.approach)}
-    return document.bytes(nodes, {"kind": "hand", "name": hand.name, "preshape": preshape, "palm": palm})
+    extras = {"kind": "hand", "name": hand.name, "preshape": preshape, "palm": palm, **_found(hand)}
+    return document.bytes(nodes, extras)
 
 
 def object_glb(obj: ObjectModel) -> bytes:
@@ -61,26 +73,53 @@ def object_glb(obj: ObjectModel) -> bytes:
     return document.bytes([{"name": obj.name, "mesh": document.mesh([primitive])}], extras)
 
 
+def _found(hand: HandModel) -> dict[str, Any]:
+    """What a user looks at and corrects."""
+    drives = {
+        joint: {
+            "dof": hand.dof_names[hand.dof[body]],
+            "times": float(hand.multiplier[body]),
+            "plus": float(hand.offset[body]),
+        }
+        for body, joint in zip(hand.joint_body.tolist(), hand.joint_names, strict=True)
+    }
+    pads = []
+    for pad in pads_of(hand):
+        few = pad.points[:: max(1, -(-len(pad.points) // PAD_POINTS))]
+        pads.append({"body": pad.body, "normal": plain(pad.normal), "points": [plain(point) for point in few]})
+    links = {link: {"body": body, "pose": plain(pose)} for link, (body, pose) in hand.frames.items()}
+    return {"facts": model_facts(hand), "links": links, "drives": drives, "pads": pads}
+
+
+def _piece_primitive(document: Document, hand: HandModel, body: int) -> dict[str, Any] | None:
+    return _joined(document, [(p.vertices, p.faces, None) for p in hand.pieces if p.body == body])
+
+
 def _body_primitives(
     document: Document, hand: HandModel, body: int, visuals: tuple[VisualMesh, ...]
 ) -> list[dict[str, Any]]:
     """The visual meshes in their colours; of a body without any, its pieces, which viewers colour themselves."""
-    meshes = [(mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body]
-    meshes = meshes or [(piece.vertices, piece.faces, None) for piece in hand.pieces if piece.body == body]
+    meshes: list[tuple[Floats, Ints, Colour | None]] = [
+        (mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body
+    ]
+    primitive = _joined(document, meshes) if meshes else _piece_primitive(document, hand, body)
+    return [primitive] if primitive else []
+
+
+def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
+    """One primitive of vertices, faces and sRGB colours."""
     if not meshes:
-        return []
+        return None
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
     colours = None
     if any(colour for _, _, colour in meshes):
         colours = np.concatenate([np.tile(linear(*(colour or _GREY)), (len(faces), 1)) for _, faces, colour in meshes])
-    return [
-        document.triangles(
-            np.concatenate([vertices for vertices, _, _ in meshes]),
-            np.concatenate([faces + start for (_, faces, _), start in zip(meshes, starts, strict=False)]),
-            np.concatenate([corner_normals(vertices, faces) for vertices, faces, _ in meshes]),
-            face_colours=colours,
-        )
-    ]
+    return document.triangles(
+        np.concatenate([vertices for vertices, _, _ in meshes]),
+        np.concatenate([faces + start for (_, faces, _), start in zip(meshes, starts, strict=False)]),
+        np.concatenate([corner_normals(vertices, faces) for vertices, faces, _ in meshes]),
+        face_colours=colours,
+    )
 
 
 def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:

@@ -7,6 +7,15 @@ function material(color) {
   return new MeshStandardMaterial({ color, roughness: 0.58, metalness: 0 });
 }
 
+function glass(looks, on) {
+  for (const look of looks) {
+    look.transparent = on;
+    look.opacity = on ? 0.32 : 1;
+    look.depthWrite = !on;
+    look.needsUpdate = true;
+  }
+}
+
 function solid(geometry, look) {
   const mesh = new Mesh(geometry, look);
   mesh.castShadow = mesh.receiveShadow = true;
@@ -18,7 +27,10 @@ export class Hand {
   constructor(model) {
     const looks = { palm: material(COLOURS.palm), finger: material(COLOURS.finger), tip: material(COLOURS.tip), own: material(0xffffff) };
     looks.own.vertexColors = true;
+    // The housing is seen through by itself.
+    looks.housing = looks.own.clone();
     this.looks = Object.values(looks);
+    this.housing = [looks.palm, looks.housing];
     this.extras = model.extras;
     this.joints = new Map();
     this.bodies = model.nodes.map((node, index) => {
@@ -27,13 +39,18 @@ export class Hand {
       group.position.fromArray(node.translation);
       group.quaternion.copy(rest);
       const look = index === 0 ? looks.palm : node.extras.fingertip ? looks.tip : looks.finger;
-      if (node.solid) group.add(solid(node.solid, node.solid.getAttribute("color") ? looks.own : look));
+      const shown = node.solid && solid(node.solid, !node.solid.getAttribute("color") ? look : index === 0 ? looks.housing : looks.own);
+      if (shown) group.add(shown);
+      const collision = node.collision && solid(node.collision, look);
+      if (collision) group.add(collision);
       if (node.extras.joint) {
         const at = new Vector3(...node.translation);
         this.joints.set(node.extras.joint, { group, rest, at, axis: new Vector3(...node.extras.axis), slides: node.extras.type === "prismatic" });
       }
-      return { group, points: node.points };
+      return { name: node.name, group, shown, collision, points: node.points };
     });
+    this.hasCollision = this.bodies.some((body) => body.collision);
+    this.setCollision(false);
     model.nodes.forEach((node, index) => node.children.forEach((child) => this.bodies[index].group.add(this.bodies[child].group)));
     this.group = new Group();
     this.group.add(this.bodies[0].group);
@@ -58,11 +75,20 @@ export class Hand {
 
   /** Glass lets one see what happens behind a finger. */
   setGlass(on) {
-    for (const look of this.looks) {
-      look.transparent = on;
-      look.opacity = on ? 0.32 : 1;
-      look.depthWrite = !on;
-      look.needsUpdate = true;
+    glass(this.looks, on);
+  }
+
+  /** The same of the root body alone. */
+  setHousingGlass(on) {
+    glass(this.housing, on);
+  }
+
+  /** Collision shapes instead of the meshes that the hand is shown by. */
+  setCollision(on) {
+    for (const { shown, collision } of this.bodies) {
+      if (!collision) continue;
+      collision.visible = on;
+      if (shown) shown.visible = !on;
     }
   }
 

@@ -5,7 +5,7 @@ const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5123: Uint16Array, 5125: Uint
 const WIDTHS = { SCALAR: 1, VEC3: 3 };
 const POINTS = 0;
 
-/** The document of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, points}]}`. */
+/** The document of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, collision, points}]}`. */
 export function readGlb(buffer) {
   const view = new DataView(buffer);
   if (view.getUint32(0, true) !== 0x46546c67) throw new Error("the model is no binary glTF");
@@ -26,20 +26,21 @@ export function readGlb(buffer) {
     }
     return new BufferAttribute(packed, width, accessor.normalized ?? false);
   };
+  const solid = (primitive) => {
+    const made = new BufferGeometry();
+    made.setAttribute("position", attribute(primitive.attributes.POSITION));
+    made.setAttribute("normal", attribute(primitive.attributes.NORMAL));
+    if (primitive.attributes.COLOR_0 !== undefined) made.setAttribute("color", attribute(primitive.attributes.COLOR_0));
+    made.setIndex(attribute(primitive.indices));
+    return made;
+  };
   const nodes = json.nodes.map((node) => {
-    const made = { translation: [0, 0, 0], rotation: [0, 0, 0, 1], extras: {}, children: [], ...node, solid: null, points: null };
+    const made = { translation: [0, 0, 0], rotation: [0, 0, 0, 1], extras: {}, children: [], ...node, solid: null, collision: null, points: null };
     for (const primitive of node.mesh === undefined ? [] : json.meshes[node.mesh].primitives) {
-      const position = attribute(primitive.attributes.POSITION);
-      if (primitive.mode === POINTS) {
-        made.points = position.array;
-        continue;
-      }
-      made.solid = new BufferGeometry();
-      made.solid.setAttribute("position", position);
-      made.solid.setAttribute("normal", attribute(primitive.attributes.NORMAL));
-      if (primitive.attributes.COLOR_0 !== undefined) made.solid.setAttribute("color", attribute(primitive.attributes.COLOR_0));
-      made.solid.setIndex(attribute(primitive.indices));
+      if (primitive.mode === POINTS) made.points = attribute(primitive.attributes.POSITION).array;
+      else made.solid = solid(primitive);
     }
+    if (made.extras.collision !== undefined) made.collision = solid(json.meshes[made.extras.collision].primitives[0]);
     return made;
   });
   return { extras: json.asset.extras, nodes };

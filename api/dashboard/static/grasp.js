@@ -68,12 +68,14 @@ function wire(figure, { stage, hand, thing, scenery, contacts, slider, way, show
   const toggles = {
     contacts: (on) => { contacts.group.visible = on; },
     glass: (on) => hand.setGlass(on),
+    collision: (on) => hand.setCollision(on),
     wire: (on) => thing.setWire(on),
     scenery: (on) => { scenery.group.visible = on; },
   };
   for (const [name, apply] of Object.entries(toggles)) {
     const box = figure.querySelector(`[data-toggle=${name}]`);
     if (!box) continue;
+    if (name === "collision") box.closest("label").hidden = !hand.hasCollision;
     const change = () => { apply(box.checked); stage.invalidate(); };
     box.addEventListener("change", change);
     change();

@@ -2,7 +2,7 @@
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand, Thing } from "./figures.js";
-import { LiveStage } from "./stage.js";
+import { beforePalm, LiveStage } from "./stage.js";
 
 const stages = new Map();
 
@@ -42,15 +42,6 @@ function clear(figure) {
   }
   delete figure.dataset.shown;
   figure.dataset.state = "none";
-}
-
-/** Where one sees the palm of a hand that stands in its own frame. */
-function beforePalm(hand) {
-  const approach = new Vector3(...hand.extras.palm.approach);
-  const up = new Vector3(0, 0, 1);
-  const side = new Vector3().crossVectors(up, approach);
-  if (side.length() < 0.2) return new Vector3(1, -1.2, 0.55);
-  return approach.addScaledVector(side.normalize(), 0.75).addScaledVector(up, 0.35);
 }
 
 for (const figure of document.querySelectorAll("[data-viewer=model]")) {

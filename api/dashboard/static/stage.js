@@ -158,3 +158,12 @@ export function besideHand(hand) {
   side.normalize();
   return side.multiplyScalar(1).addScaledVector(up, 0.55).addScaledVector(approach, -0.35);
 }
+
+/** Where one sees the palm of a hand that stands in its own frame. */
+export function beforePalm(hand) {
+  const approach = new Vector3(...hand.extras.palm.approach);
+  const up = new Vector3(0, 0, 1);
+  const side = new Vector3().crossVectors(up, approach);
+  if (side.length() < 0.2) return new Vector3(1, -1.2, 0.55);
+  return approach.addScaledVector(side.normalize(), 0.75).addScaledVector(up, 0.35);
+}

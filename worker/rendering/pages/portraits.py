@@ -16,6 +16,7 @@ from service.model.transforms import IDENTITY_POSE, apply, compose, quat_from_ma
 from worker.hands.guess import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
+from worker.hands.pads import pads_of
 from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals
 from worker.objects.solid import from_manifold
@@ -43,6 +44,10 @@ _CAPTION: Final = 30
 _CLOSING_SHARE: Final = 0.6
 _ARROW: Final = Look(hexadecimal("#dd7432"), roughness=0.5)
 _CLOSING: Final = Look(hexadecimal("#2fa7a0"), roughness=0.5)
+_PAD: Final = Look(hexadecimal("#d6409f"), roughness=0.5)
+#: Radius of a dot of a pad over the largest extent of the hand; dots of a pad at most.
+_DOT_SHARE: Final = 0.008
+_DOTS: Final = 60
 #: Axes x, y, z of the palm's frame.
 _AXES: Final = tuple(Look(hexadecimal(code), roughness=0.5) for code in ("#c8343c", "#3c9a4a", "#3566c8"))
 _FRAME_SHARE: Final = 0.25
@@ -82,7 +87,8 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
     """The hand as the engine sees it, about to close, from three sides; the palm's body is half transparent.
 
     Three thin arrows are the palm's frame (x red, y green, z blue: the approach), the orange one is the approach, and
-    teal ones show where each fingertip goes as the hand closes.
+    teal ones show where each fingertip goes as the hand closes. Pink dots are the pads: where jaws meet, or the inner
+    sides of fingertips.
     """
     bare = without_visuals(hand)
     upright = _upright(bare)
@@ -105,6 +111,9 @@ def hand_sides(hand: HandModel, *, device: str = "cpu") -> Image.Image:
         if np.linalg.norm(end - start) > 1e-6:
             way = np.concatenate([start, _quat_of_z((end - start) / np.linalg.norm(end - start))])
             marks.append((_arrow(_CLOSING_ARROW_SHARE * extent), _CLOSING, way))
+    marks += [
+        (_dots(pad.points, _DOT_SHARE * extent), _PAD, bodies[pad.body]) for pad in pads_of(hand) if len(pad.points)
+    ]
     poses = np.stack([*bodies[drawn_bodies(bare)], *(pose for _, _, pose in marks)])
     solids = [*hand_solids(bare), *(solid for solid, _, _ in marks)]
     looks = [*hand_looks(bare), *(look for _, look, _ in marks)]
@@ -200,6 +209,16 @@ def _quat_of_z(direction: Floats) -> Floats:
     side = np.cross(np.eye(3)[int(np.argmin(np.abs(direction)))], direction)
     side /= np.linalg.norm(side)
     return quat_from_matrix(np.stack([side, np.cross(direction, side), direction], axis=1))
+
+
+def _dots(points: Floats, radius: float) -> Solid:
+    """Small balls at points (P, 3), thinned to `_DOTS`."""
+    ball = manifold3d.Manifold.sphere(radius, 12)
+    few = points[:: max(1, -(-len(points) // _DOTS))]
+    vertices, faces = from_manifold(ball)
+    corners = (few[:, None] + vertices[None]).reshape(-1, 3)
+    every = (np.arange(len(few))[:, None, None] * len(vertices) + faces[None]).reshape(-1, 3).astype(np.int32)
+    return Solid(corners, every, corner_normals(corners, every))
 
 
 def _arrow(length: float) -> Solid:

@@ -1,0 +1,164 @@
+"""The pages of hands: the list, and one hand in 3D with what was guessed of it, to be corrected there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+from pydantic import ValidationError
+from starlette.datastructures import FormData
+
+from api.catalog.assets import Assets
+from api.dashboard.forms import first_message
+from api.dashboard.rendering import render
+from api.routes.assets import store_correction
+from api.routes.dependencies import AssetsOf, may_read, may_submit
+from api.routes.hand_corrections import CorrectionRequest
+from service.index.views import AssetView
+from service.model.domain import AssetKind
+from service.model.errors import ConflictError, InputError, NotFoundError
+from service.store.hand_corrections import MAX_ENTRIES, HandFacts
+
+PAGE_SIZE: Final = 50
+#: A check takes seconds.
+_CHECK_S: Final = 2
+_MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
+_CENTRE_DIGITS_MM: Final = 3
+
+router = APIRouter(prefix="/hands", include_in_schema=False)
+
+
+@router.get("", dependencies=[Depends(may_read)])
+def hands_page(
+    request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
+) -> HTMLResponse:
+    """All hands, by name."""
+    page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor)
+    # What an upload says of itself stands beside what a check found: of any type.
+    numbers = {
+        hand.digest: [len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))]
+        for hand in page.items
+    }
+    return render(
+        request, "hands.html", page="/hands", poll_s=2 * _CHECK_S, hands=page.items, numbers=numbers, next=page.next
+    )
+
+
+@router.get("/{name}", dependencies=[Depends(may_read)])
+def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
+    """One hand in 3D, and the form that corrects it."""
+    hand = assets.one(AssetKind.HAND, name)
+    facts, trouble = _facts(assets, hand)
+    return _page(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
+
+
+@router.post("/{name}", dependencies=[Depends(may_submit)], response_model=None)
+async def correct(request: Request, name: str, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
+    """Keep what the form says as another hand, and show that."""
+    async with request.form(max_files=0, max_fields=_MAX_FIELDS) as fields:
+        return await request.app.state.uploads.run(_correct, request, assets, name, fields)
+
+
+def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> HTMLResponse | RedirectResponse:
+    hand = assets.one(AssetKind.HAND, name)
+    facts = assets.hand_facts(hand)
+    shown = _form_of(facts) | {key: value for key, value in fields.multi_items() if isinstance(value, str)}
+    shown["fingertips"] = [str(value) for value in fields.getlist("fingertip")]
+    try:
+        said = CorrectionRequest.model_validate(dict(_said(facts, shown)))
+        made = store_correction(assets, hand.digest, said, said.name)
+    except (InputError, ConflictError, ValueError) as error:
+        message = first_message(error) if isinstance(error, ValidationError) else str(error)
+        return _page(request, hand, facts, problem=message, form=shown, status=422)
+    return RedirectResponse(f"/hands/{made.digest}", status_code=303)
+
+
+def _page(
+    request: Request, hand: AssetView, facts: HandFacts | None, *, problem: str, form: dict[str, Any], status: int = 200
+) -> HTMLResponse:
+    guessed = hand.facts.get("guessed")
+    checked = hand.builtin or hand.verdict is not None
+    waits = (facts is None or not checked) and hand.verdict != "refuse" and not problem
+    return render(
+        request,
+        "hand.html",
+        status=status,
+        page="/hands",
+        poll_s=_CHECK_S if waits else 0,
+        hand=hand,
+        facts=facts,
+        waits=waits,
+        problem=problem,
+        form=form,
+        guessed=guessed if isinstance(guessed, list) else [],
+        approaches=_APPROACHES,
+    )
+
+
+_APPROACHES: Final = (
+    ("+x", "1,0,0"), ("-x", "-1,0,0"), ("+y", "0,1,0"), ("-y", "0,-1,0"), ("+z", "0,0,1"), ("-z", "0,0,-1"),
+)  # fmt: skip
+
+
+def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
+    """What was found of a hand, or why it cannot be shown; neither while it is being checked."""
+    try:
+        return assets.hand_facts(hand), ""
+    except NotFoundError:
+        return None, ""
+    except ConflictError as error:
+        return None, str(error)
+
+
+def _form_of(facts: HandFacts) -> dict[str, Any]:
+    """The form as it stands before anybody corrects."""
+    form: dict[str, Any] = {"palm_link": facts.root, "name": "", "fingertips": facts.fingertips}
+    for axis, centre, approach in zip("xyz", facts.palm_centre, facts.palm_approach, strict=True):
+        form[f"centre_{axis}"] = f"{round(1e3 * centre, _CENTRE_DIGITS_MM):g}"
+        form[f"approach_{axis}"] = f"{approach:.6g}"
+    for number, dof in enumerate(facts.dofs):
+        form[f"closing.{number}"] = str(facts.closing[dof])
+        form[f"preshape.{number}"] = f"{facts.preshape[dof]:.6g}"
+    return form
+
+
+def _said(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What of a form differs from what was found, as fields of a request."""
+    before = _form_of(facts)
+    if name := form["name"].strip():
+        yield "name", name
+    palm = [f"{what}_{axis}" for what in ("centre", "approach") for axis in "xyz"]
+    if any(form[key] != before[key] for key in ("palm_link", *palm)):
+        x, y, z, *approach = (_number(form, key) for key in palm)
+        yield "palm", {"link": form["palm_link"], "centre": [x / 1e3, y / 1e3, z / 1e3], "approach": approach}
+    turned = {
+        dof: _direction(form, f"closing.{i}")
+        for i, dof in enumerate(facts.dofs)
+        if form[f"closing.{i}"] != before[f"closing.{i}"]
+    }
+    yield "closing", turned
+    yield (
+        "preshape",
+        {
+            dof: _number(form, f"preshape.{i}")
+            for i, dof in enumerate(facts.dofs)
+            if form[f"preshape.{i}"] != before[f"preshape.{i}"]
+        },
+    )
+    if set(form["fingertips"]) != set(facts.fingertips):
+        yield "fingertips", form["fingertips"]
+
+
+def _number(form: dict[str, Any], key: str) -> float:
+    try:
+        return float(form[key])
+    except ValueError:
+        raise InputError(f"{key.replace('_', ' ')} {form[key][:40]!r} is no number") from None
+
+
+def _direction(form: dict[str, Any], key: str) -> int:
+    if form[key] not in ("-1", "0", "1"):
+        raise InputError(f"{key} {form[key][:40]!r} must be -1, 0 or 1")
+    return int(form[key])

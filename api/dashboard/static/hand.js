@@ -1,0 +1,217 @@
+// The page of a hand: it stands in 3D with what was found of it, moves by a slider for each joint, and follows the form.
+import { Box3, Quaternion, Vector3 } from "./vendor/three.min.js";
+import { loadGlb } from "./glb.js";
+import { Hand } from "./figures.js";
+import { Marks } from "./marks.js";
+import { beforePalm, LiveStage } from "./stage.js";
+
+const ROOT = [0, 0, 0, 1, 0, 0, 0];
+/** Share of the way from open to closed at which a hand approaches; a gripper comes open. */
+const PRESHAPE_SHARE = 0.25;
+const GRIPPER_DOFS = 2;
+const STEP = 0.02;
+
+class HandPage {
+  constructor(figure, form, model) {
+    this.figure = figure;
+    this.form = form;
+    this.hand = new Hand(model);
+    ({ facts: this.facts, links: this.links, drives: this.drives } = model.extras);
+    this.dofs = this.facts.dofs;
+    this.stage = new LiveStage(figure.querySelector("canvas"));
+    this.q = this.preshape();
+    this.pose(this.q);
+    this.marks = new Marks(this.hand, new Box3().setFromObject(this.hand.group).getSize(new Vector3()).toArray().reduce((a, b) => Math.max(a, b)));
+    this.stage.scene.add(this.hand.group);
+    this.stage.frame(this.hand.group, beforePalm(this.hand), 1.0);
+    this.hand.group.add(this.marks.group);
+    this.link = this.field("palm_link").value;
+    this.show();
+    this.wire();
+  }
+
+  field(name) {
+    return this.form.elements[name];
+  }
+
+  number(name) {
+    return Number(this.field(name).value) || 0;
+  }
+
+  closing() {
+    return this.dofs.map((_, i) => Number(this.field(`closing.${i}`).value));
+  }
+
+  preshape() {
+    return this.dofs.map((_, i) => this.number(`preshape.${i}`));
+  }
+
+  limits(i) {
+    return [this.facts.lower[this.dofs[i]], this.facts.upper[this.dofs[i]]];
+  }
+
+  /** Joint values at a share of the way from open to closed; what closes nothing stays. */
+  posture(share) {
+    return this.closing().map((way, i) => {
+      const [low, high] = this.limits(i);
+      if (way === 0) return this.q[i];
+      return way > 0 ? low + share * (high - low) : high - share * (high - low);
+    });
+  }
+
+  pose(q) {
+    const values = Object.fromEntries(this.dofs.map((name, i) => [name, q[i]]));
+    const positions = Object.fromEntries(Object.entries(this.drives).map(([joint, drive]) => [joint, drive.times * values[drive.dof] + drive.plus]));
+    this.hand.pose(ROOT, positions);
+  }
+
+  /** Pose of a link in the root frame while the hand is in its pre-shape. */
+  frameOf(link) {
+    this.pose(this.preshape());
+    const { body, pose: [x, y, z, w, i, j, k] } = this.links[link];
+    const group = this.hand.bodies[body].group;
+    const turn = group.getWorldQuaternion(new Quaternion());
+    const at = group.localToWorld(new Vector3(x, y, z));
+    return { at, turn: turn.multiply(new Quaternion(i, j, k, w)) };
+  }
+
+  vector(name, scale = 1) {
+    return new Vector3(...["x", "y", "z"].map((axis) => scale * this.number(`${name}_${axis}`)));
+  }
+
+  write(name, vector, scale, digits) {
+    ["x", "y", "z"].forEach((axis, i) => { this.field(`${name}_${axis}`).value = String(Number((scale * vector.getComponent(i)).toFixed(digits))); });
+  }
+
+  /** The palm in the root frame, as the form says. */
+  palm() {
+    const { at, turn } = this.frameOf(this.field("palm_link").value);
+    const approach = this.vector("approach").applyQuaternion(turn);
+    return { centre: this.vector("centre", 0.001).applyQuaternion(turn).add(at), approach: approach.length() > 1e-6 ? approach.normalize() : null };
+  }
+
+  /** Where a fingertip's pad, or else the middle of its surface, is. */
+  spot({ group, points, name }) {
+    const pad = this.hand.extras.pads.find((one) => this.hand.bodies[one.body].name === name);
+    const flat = pad ? pad.points.flat() : points ?? [0, 0, 0];
+    const mean = [0, 1, 2].map((axis) => flat.reduce((sum, value, i) => sum + (i % 3 === axis ? value : 0), 0) / (flat.length / 3));
+    return group.localToWorld(new Vector3(...mean));
+  }
+
+  show() {
+    const { centre, approach } = this.palm();
+    this.marks.approach.group.visible = approach !== null;
+    if (approach) this.marks.placePalm(centre, approach);
+    const chosen = new Set([...this.form.querySelectorAll("[name=fingertip]:checked")].map((box) => box.value));
+    const tips = this.hand.bodies.filter((body) => chosen.has(body.name));
+    const closer = this.q.map((value, i) => value + STEP * this.closing()[i] * (this.limits(i)[1] - this.limits(i)[0]));
+    this.pose(closer);
+    const after = tips.map((body) => this.spot(body));
+    this.pose(this.q);
+    this.marks.placeClosing(tips.map((body, i) => [body.name, this.spot(body), after[i]]));
+    this.dofs.forEach((_, i) => {
+      const slider = this.form.querySelector(`[data-joint="${i}"]`);
+      slider.value = String(this.q[i]);
+      slider.nextElementSibling.textContent = this.said(i);
+    });
+    this.figure.querySelector("[data-close]").value = String(this.share());
+    this.stage.invalidate();
+  }
+
+  /** How far the joints that close are on their way, 0 to 1. */
+  share() {
+    const ways = this.closing(), closing = this.dofs.map((_, i) => i).filter((i) => ways[i] !== 0);
+    const shares = closing.map((i) => {
+      const [low, high] = this.limits(i);
+      return (ways[i] > 0 ? this.q[i] - low : high - this.q[i]) / Math.max(high - low, 1e-9);
+    });
+    return shares.reduce((sum, one) => sum + one, 0) / Math.max(shares.length, 1);
+  }
+
+  said(i) {
+    const joint = this.hand.joints.get(this.dofs[i]);
+    return joint?.slides ? `${(1000 * this.q[i]).toFixed(1)} mm` : `${((180 / Math.PI) * this.q[i]).toFixed(0)}°`;
+  }
+
+  take(q) {
+    this.q = q;
+    this.show();
+  }
+
+  /** Another link says the same palm in other numbers. */
+  movePalm() {
+    const before = this.frameOf(this.link), link = this.field("palm_link").value, after = this.frameOf(link);
+    const back = after.turn.clone().invert();
+    const centre = this.vector("centre", 0.001).applyQuaternion(before.turn).add(before.at).sub(after.at).applyQuaternion(back);
+    const approach = this.vector("approach").applyQuaternion(before.turn).applyQuaternion(back);
+    this.link = link;
+    this.write("centre", centre, 1000, 3);
+    this.write("approach", approach, 1, 6);
+    this.show();
+  }
+
+  /** A joint that closes another way opens at its other end. */
+  turn(i) {
+    const [low, high] = this.limits(i);
+    const share = this.dofs.length <= GRIPPER_DOFS ? 0 : PRESHAPE_SHARE;
+    const way = this.closing()[i];
+    const value = way === 0 ? Math.min(Math.max(0, low), high) : way > 0 ? low + share * (high - low) : high - share * (high - low);
+    this.field(`preshape.${i}`).value = String(Number(value.toFixed(6)));
+    this.q[i] = value;
+    this.show();
+  }
+
+  wire() {
+    const every = (selector, event, act) => this.form.querySelectorAll(selector).forEach((element) => element.addEventListener(event, () => act(element)));
+    every("[data-joint]", "input", (slider) => { this.q[Number(slider.dataset.joint)] = Number(slider.value); this.show(); });
+    every("[name^='closing.']", "change", (radio) => this.turn(Number(radio.name.slice(8))));
+    every("[name^='preshape.']", "input", (input) => { this.q[Number(input.name.slice(9))] = Number(input.value) || 0; this.show(); });
+    every("[name=palm_link]", "change", () => this.movePalm());
+    every("[name^='centre_'], [name^='approach_'], [name=fingertip]", "input", () => this.show());
+    every("[data-approach]", "click", (button) => { this.write("approach", new Vector3(...button.dataset.approach.split(",").map(Number)), 1, 0); this.show(); });
+    every("[data-take]", "click", () => {
+      this.q.forEach((value, i) => { this.field(`preshape.${i}`).value = String(Number(value.toFixed(6))); });
+      this.show();
+    });
+    const postures = { open: () => this.posture(0), preshape: () => this.preshape(), closed: () => this.posture(1) };
+    for (const button of this.figure.querySelectorAll("[data-posture]")) {
+      button.addEventListener("click", () => this.take(postures[button.dataset.posture]()));
+    }
+    this.figure.querySelector("[data-close]").addEventListener("input", (event) => this.take(this.posture(Number(event.target.value))));
+    const toggles = {
+      housing: (on) => this.hand.setHousingGlass(on),
+      collision: (on) => this.hand.setCollision(on),
+      marks: (on) => this.marks.setVisible(on),
+    };
+    for (const [name, apply] of Object.entries(toggles)) {
+      const box = this.figure.querySelector(`[data-toggle=${name}]`);
+      box.closest("label").hidden = name === "collision" && !this.hand.hasCollision;
+      const change = () => { apply(box.checked); this.stage.invalidate(); };
+      box.addEventListener("change", change);
+      change();
+    }
+    this.figure.querySelector("[data-reset]").addEventListener("click", () => this.stage.reset());
+    for (const hidden of document.querySelectorAll("[data-moves]")) hidden.hidden = false;
+  }
+}
+
+async function start(figure) {
+  const model = await loadGlb(figure.dataset.model);
+  if (!model.extras.facts) throw new Error("the model was made by an older version");
+  figure.graspd = new HandPage(figure, document.getElementById("hand"), model);
+  figure.dataset.state = "ready";
+}
+
+function find() {
+  for (const figure of document.querySelectorAll("[data-viewer=hand][data-state=loading]")) {
+    figure.dataset.state = "reading";
+    start(figure).catch((error) => {
+      figure.dataset.state = "failed";
+      figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The form beside it is complete.`;
+    });
+  }
+}
+
+find();
+// The page shows the hand as soon as its check has ended.
+document.addEventListener("graspd:swapped", find);

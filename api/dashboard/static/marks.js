@@ -1,0 +1,108 @@
+// What was found of a hand, drawn on it: the palm's frame and approach, which way fingertips close, and their pads.
+import { BufferAttribute, BufferGeometry, Group, InstancedMesh, Matrix4, Mesh, MeshBasicMaterial, MeshStandardMaterial, SphereGeometry, Vector3 } from "./vendor/three.min.js";
+
+const COLOURS = { approach: 0xdd7432, closing: 0x1f9c93, pad: 0xd6409f, axes: [0xc8343c, 0x3c9a4a, 0x3566c8] };
+const SIDES = 20;
+const Z = new Vector3(0, 0, 1);
+
+/** A unit arrow along z: profile of radius and height, turned about the axis. */
+function arrowGeometry() {
+  const profile = [[0, 0], [0.03, 0], [0.03, 0.72], [0.09, 0.72], [0, 1]];
+  const position = [], index = [];
+  for (let p = 0; p + 1 < profile.length; p++) {
+    for (let i = 0; i < SIDES; i++) {
+      const corner = (k, j) => {
+        const [radius, height] = profile[p + k], angle = (2 * Math.PI * (i + j)) / SIDES;
+        return [radius * Math.cos(angle), radius * Math.sin(angle), height];
+      };
+      const first = position.length / 3;
+      position.push(...corner(0, 0), ...corner(0, 1), ...corner(1, 1), ...corner(1, 0));
+      index.push(first, first + 1, first + 2, first, first + 2, first + 3);
+    }
+  }
+  const made = new BufferGeometry();
+  made.setAttribute("position", new BufferAttribute(new Float32Array(position), 3));
+  made.setIndex(new BufferAttribute(new Uint16Array(index), 1));
+  made.computeVertexNormals();
+  return made;
+}
+
+const ARROW = arrowGeometry();
+
+/** An arrow that shines faintly through what stands before it. */
+class Arrow {
+  constructor(color) {
+    this.group = new Group();
+    const faint = new Mesh(ARROW, new MeshBasicMaterial({ color, transparent: true, opacity: 0.3, depthTest: false }));
+    faint.renderOrder = 3;
+    this.group.add(new Mesh(ARROW, new MeshStandardMaterial({ color, roughness: 0.5 })), faint);
+  }
+
+  place(from, direction, length) {
+    this.group.position.copy(from);
+    this.group.quaternion.setFromUnitVectors(Z, direction);
+    this.group.scale.setScalar(length);
+  }
+}
+
+/** Dots on a body. */
+function dots(points, radius) {
+  const sphere = new SphereGeometry(radius, 8, 6);
+  const group = new Group();
+  for (const look of [{ color: COLOURS.pad }, { color: COLOURS.pad, transparent: true, opacity: 0.3, depthTest: false }]) {
+    const mesh = new InstancedMesh(sphere, new MeshBasicMaterial(look), points.length);
+    points.forEach(([x, y, z], i) => mesh.setMatrixAt(i, new Matrix4().makeTranslation(x, y, z)));
+    mesh.frustumCulled = false;
+    if (look.transparent) mesh.renderOrder = 2;
+    group.add(mesh);
+  }
+  return group;
+}
+
+/** All marks of a hand of a size [m]; `group` stands in the hand's root frame. */
+export class Marks {
+  constructor(hand, size) {
+    this.hand = hand;
+    this.size = size;
+    this.group = new Group();
+    this.approach = new Arrow(COLOURS.approach);
+    this.axes = COLOURS.axes.map((color) => new Arrow(color));
+    this.closing = new Map();
+    this.group.add(this.approach.group, ...this.axes.map((axis) => axis.group));
+    this.pads = hand.extras.pads.map(({ body, points }) => {
+      const group = dots(points, 0.007 * size);
+      hand.bodies[body].group.add(group);
+      return { body: hand.bodies[body].name, group };
+    });
+  }
+
+  setVisible(on) {
+    this.group.visible = on;
+    for (const { group } of this.pads) group.visible = on;
+  }
+
+  /** The palm's frame: z is the approach, as in the pictures of `graspd hands check`. */
+  placePalm(centre, approach) {
+    this.approach.place(centre, approach, 0.4 * this.size);
+    const least = [0, 1, 2].reduce((a, b) => (Math.abs(approach.getComponent(b)) < Math.abs(approach.getComponent(a)) ? b : a));
+    const side = new Vector3().setComponent(least, 1).cross(approach).normalize();
+    const frame = [side, new Vector3().crossVectors(approach, side), approach];
+    this.axes.forEach((axis, k) => axis.place(centre, frame[k], (k === 2 ? 0.26 : 0.2) * this.size));
+  }
+
+  /** An arrow at each fingertip: where it is, and where it goes as the hand closes. */
+  placeClosing(ways) {
+    for (const { group } of this.closing.values()) group.visible = false;
+    for (const [name, from, to] of ways) {
+      const way = to.clone().sub(from);
+      if (way.length() < 1e-7) continue;
+      if (!this.closing.has(name)) {
+        this.closing.set(name, new Arrow(COLOURS.closing));
+        this.group.add(this.closing.get(name).group);
+      }
+      const arrow = this.closing.get(name);
+      arrow.group.visible = true;
+      arrow.place(from, way.normalize(), 0.22 * this.size);
+    }
+  }
+}

@@ -1,0 +1,167 @@
+"""Corrections of a hand: what was guessed is said instead, and is a hand of its own."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, Scope
+from api.app import create_app
+from service.model import names
+from service.model.domain import AssetKind
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from service.store.assets import builtin_files
+from service.store.hand_corrections import MAX_ENTRIES
+from service.store.library import load_asset, load_asset_files
+from tests.api.conftest import BASE_URL
+
+FILES = builtin_files(AssetKind.HAND, "barrett")
+SAID = {
+    "closing": {"finger_1_spread": 1},
+    "fingertips": ["finger_1_distal_link"],
+    "preshape": {"finger_2_medial": -0.3},
+}
+
+
+def corrected(http: TestClient, body: dict[str, Any], hand: str = "barrett") -> Any:
+    return http.post(f"/v1/hands/{hand}/corrections", json=body)
+
+
+def test_a_corrected_hand_is_another_one_of_the_same_files_that_says_it_all(http: TestClient, parts: Parts) -> None:
+    answer = corrected(http, {"closing": {"finger_1_spread": 1}, "preshape": {"finger_2_medial": -0.3}})
+    assert answer.status_code == 202, answer.text
+    made = http.get(answer.headers["location"]).json()
+    assert (made["name"], made["verdict"]) == ("barrett-2", None)
+    kept = load_asset_files(parts.store, AssetKind.HAND, made["digest"])
+    said = json.loads(kept.pop("asset.json"))
+    assert kept == {name: data for name, data in FILES.items() if name != "asset.json"}
+    assert said["closing"]["finger_1_spread"] == 1 and said["closing"]["finger_2_medial"] == -1
+    # The joint that closes another way has its pre-shape guessed anew.
+    assert "finger_1_spread" not in said["preshape"] and said["preshape"]["finger_2_medial"] == -0.3
+    assert said["root"] == said["palm"]["link"] == "palm" and len(said["fingertips"]) == 3
+    assert [check.name for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == ["barrett-2"]
+
+
+def test_the_same_corrections_are_the_same_hand_and_others_get_the_next_number(http: TestClient) -> None:
+    first = corrected(http, {"closing": {"finger_1_spread": 1}}).json()
+    assert corrected(http, {"closing": {"finger_1_spread": 1}}).json()["digest"] == first["digest"]
+    assert corrected(http, {"closing": {"finger_1_spread": -1}}).json()["name"] == "barrett-3"
+
+
+def test_a_name_may_be_given_and_one_that_is_taken_is_refused(http: TestClient) -> None:
+    assert corrected(http, {"name": "mine", "closing": {"finger_1_spread": 1}}).json()["name"] == "mine"
+    answer = corrected(http, {"name": "mine", "closing": {"finger_1_spread": -1}})
+    assert answer.status_code == 409 and "'mine'" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ({"closing": {"elbow": 1}}, "no joint 'elbow'"),
+        ({"preshape": {"elbow": 1}}, "no joint 'elbow'"),
+        ({"preshape": {"finger_1_medial": 3}}, "outside its limits"),
+        ({"fingertips": ["elbow"]}, "'elbow' is no link that a joint moves"),
+        ({"fingertips": ["palm"]}, "'palm' is no link that a joint moves"),
+        ({"fingertips": []}, "fingertips"),
+        ({"palm": {"link": "elbow"}}, "no link 'elbow'"),
+        ({"palm": {"link": "palm", "approach": [0, 0, 0]}}, "no direction"),
+        ({"palm": {"link": "palm", "centre": [0, 0, 9]}}, "centre"),
+        ({"closing": {"finger_1_medial": 2}}, "closing"),
+        ({"closing": {str(n): 1 for n in range(MAX_ENTRIES + 1)}}, "closing"),
+        ({"closing": {"x" * 300: 1}}, "closing"),
+        ({"name": "../up", "closing": {}}, "name"),
+        ({"root": "palm"}, "root"),
+    ],
+)  # fmt: skip
+def test_what_a_hand_does_not_have_is_refused_and_leaves_nothing(
+    http: TestClient, body: dict[str, Any], says: str
+) -> None:
+    before = http.get("/v1/hands").json()
+    answer = corrected(http, body)
+    assert answer.status_code == 422
+    assert says in answer.text, answer.text
+    assert http.get("/v1/hands").json() == before
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
+def test_a_number_that_is_none_is_refused(http: TestClient, number: str) -> None:
+    text = f'{{"preshape": {{"finger_1_medial": {number}}}}}'
+    answer = http.post("/v1/hands/barrett/corrections", content=text, headers={"content-type": "application/json"})
+    assert answer.status_code == 422
+
+
+def test_an_unknown_hand_is_not_found_and_one_without_a_model_waits(http: TestClient) -> None:
+    assert corrected(http, SAID, hand="nobody").status_code == 404
+    http.post("/v1/hands", files={"file": ("new.urdf", b"<robot/>")})
+    assert corrected(http, SAID, hand="new").status_code == 404
+
+
+def test_a_model_of_an_older_version_says_the_mend(http: TestClient, parts: Parts) -> None:
+    made = http.post("/v1/hands", files={"file": ("old.urdf", b"<robot/>")}).json()
+    for model in (b"glTF", b"glTF" + bytes(40), parts.store.get(names.asset_model(AssetKind.OBJECT, mug(http)))):
+        key = names.asset_model(AssetKind.HAND, made["digest"])
+        parts.store.delete(key)
+        parts.store.put(key, model)
+        answer = corrected(http, SAID, hand="old")
+        assert answer.status_code == 409 and "graspd hands check --write" in answer.json()["detail"]
+        assert "older version" in http.get("/hands/old").text
+
+
+def mug(http: TestClient) -> str:
+    return str(http.get("/v1/objects/mug").json()["digest"])
+
+
+def test_who_may_only_read_corrects_nothing_and_who_corrects_owns_the_hand(settings: Settings, parts: Parts) -> None:
+    keys = KeyFile(settings.resolved_keys_file)
+    tokens = {scope: keys.add(scope.value, scope) for scope in (Scope.READ, Scope.SUBMIT)}
+    app: FastAPI = create_app(settings, parts)
+    with TestClient(app, base_url=BASE_URL, raise_server_exceptions=False) as http:
+        body = {"closing": {"finger_1_spread": 1}}
+        path = "/v1/hands/barrett/corrections"
+        assert http.post(path, json=body).status_code == 401
+        reader, writer = ({"authorization": f"Bearer {tokens[scope]}"} for scope in (Scope.READ, Scope.SUBMIT))
+        assert http.post(path, json=body, headers=reader).status_code == 403
+        assert http.post("/hands/barrett", data={"closing.0": "1"}, headers=reader).status_code == 403
+        assert "Save as a hand" not in http.get("/hands/barrett", headers=reader).text
+        made = http.post(path, json=body, headers=writer).json()
+        assert load_asset(parts.store, AssetKind.HAND, made["digest"]).owner == made["owner"] != ""
+
+
+def test_the_page_has_a_field_for_all_that_was_guessed_and_works_without_scripts(http: TestClient) -> None:
+    page = http.get("/hands/barrett").text
+    assert page.count('type="radio" name="closing.') == 3 * page.count('name="preshape.')
+    assert 'name="palm_link"' in page and 'name="fingertip"' in page and "asset.json" in page
+    form = {"palm_link": "palm", "approach_x": "1", "closing.0": "1", "fingertip": "finger_1_distal_link"}
+    answer = http.post("/hands/barrett", data=form, follow_redirects=False)
+    assert answer.status_code == 303
+    made = http.get("/v1/hands/barrett-2").json()
+    assert answer.headers["location"] == f"/hands/{made['digest']}"
+    shown = http.get(answer.headers["location"]).text
+    assert "A worker looks at it" in shown and 'data-poll="2"' in shown
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("approach_x", "far", "no number"), ("closing.0", "7", "must be -1, 0 or 1"), ("palm_link", "<b>", "&lt;b&gt;"),
+        ("name", "a b", "name"), ("preshape.1", "9", "outside its limits"), ("fingertip", "elbow", "elbow"),
+    ],
+)  # fmt: skip
+def test_a_wrong_form_is_shown_again_with_what_is_wrong(http: TestClient, field: str, value: str, says: str) -> None:
+    answer = http.post("/hands/barrett", data={"palm_link": "palm", "fingertip": "finger_1_distal_link", field: value})
+    assert answer.status_code == 422
+    assert says in answer.text and "That cannot be kept" in answer.text
+
+
+def test_hands_are_listed_with_what_they_say_of_themselves_as_text(http: TestClient) -> None:
+    options = {"facts": {"dofs": 7, "fingertips": "<b>", "guessed": 3}}
+    http.post("/v1/hands", files={"file": ("odd.urdf", b"<robot/>")}, data={"options": json.dumps(options)})
+    page = http.get("/hands")
+    assert page.status_code == 200
+    assert "odd" in page.text and "being checked" in page.text and "<b>" not in page.text
+    assert http.get("/hands/odd").status_code == 200

@@ -1,0 +1,119 @@
+"""A hand in the browser: what was guessed of it is seen, corrected, kept as a hand of its own, and used."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import httpx
+import pytest
+
+from service.model.domain import AssetKind, IngestMessage
+from service.pipeline.backends import Parts
+from service.store import library
+from tests.browser.test_flows import colours
+from tests.worker.hands.urdfs import joint, link, robot
+from worker.hands.load import load_hand
+from worker.stages import ingest
+from worker.stages.context import TaskContext
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
+
+SHOWN_MS = 60_000
+BAR = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.016 0.02 0.06"/></geometry></collision>'
+SEEN = (
+    '<visual><origin xyz="0 0 0.03"/><geometry><cylinder radius="0.009" length="0.06"/></geometry>'
+    '<material name="m"><color rgba="0.8 0.5 0.1 1"/></material></visual>'
+)
+BASE = (
+    '<collision><geometry><box size="0.1 0.04 0.03"/></geometry></collision>'
+    '<visual><geometry><box size="0.1 0.04 0.03"/></geometry>'
+    '<material name="g"><color rgba="0.2 0.3 0.7 1"/></material></visual>'
+)
+#: A claw whose finger `a` bends far one way only by its limits: graspd guesses that it closes outwards.
+CLAW = robot(
+    link("palm", BASE), link("a", BAR + SEEN), link("b", BAR + SEEN), link("c", BAR + SEEN),
+    joint("ja", "palm", "a", origin="0.04 0 0.015", limit='<limit lower="-0.4" upper="1.4" effort="1" velocity="2"/>'),
+    joint("jb", "palm", "b", origin="-0.04 0 0.015"),
+    joint("jc", "palm", "c", origin="-0.04 0.03 0.015"),
+)  # fmt: skip
+
+
+def checked(parts: Parts, name: str) -> None:
+    """What a worker and the keeper make of an upload."""
+    asset = parts.index.assets.get(AssetKind.HAND, name)
+    message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name=asset.name, digest=asset.digest)
+    ingest.run(message, TaskContext(parts.store))
+    found = library.load_check(parts.store, AssetKind.HAND, asset.digest)
+    parts.index.write.add_asset(library.load_asset(parts.store, AssetKind.HAND, asset.digest), found)
+
+
+def drawn(page: Any) -> bytes:
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return bytes(page.locator(".viewer canvas").screenshot())
+
+
+def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
+    page: Any, parts: Parts, address: str
+) -> None:
+    httpx.post(f"{address}/v1/hands", files={"file": ("claw.urdf", CLAW)}, trust_env=False).raise_for_status()
+    # A small canvas is drawn quickly without a GPU.
+    page.set_viewport_size({"width": 700, "height": 700})
+    page.goto("/hands")
+    page.click("text=claw")
+    assert page.inner_text("#shown") == "A worker looks at it: what it finds is shown here."
+    checked(parts, "claw")
+    page.wait_for_selector(".viewer[data-state=ready]", timeout=SHOWN_MS)
+    assert colours(page.locator(".viewer canvas")) > 50
+    assert page.is_checked("[name='closing.0'][value='1']")
+
+    # The joints move, the housing becomes glass, collision shapes take the place of what the hand looks like.
+    seen = [drawn(page)]
+    page.locator("[data-joint='0']").fill("-0.3")
+    assert page.inner_text("[data-joint='0'] + output") == "-17°"
+    seen.append(drawn(page))
+    page.check("[data-toggle=housing]")
+    seen.append(drawn(page))
+    page.check("[data-toggle=collision]")
+    seen.append(drawn(page))
+    page.uncheck("[data-toggle=marks]")
+    seen.append(drawn(page))
+    page.click("[data-posture=closed]")
+    assert len(set(seen)) == len(seen)
+    assert float(page.input_value("[data-close]")) == pytest.approx(1, abs=0.02)
+
+    # Another way to close opens at the other end; another link says the same palm in its own numbers.
+    page.locator("[name='closing.0'][value='-1']").check()
+    assert float(page.input_value("[name='preshape.0']")) == pytest.approx(1.4 - 0.25 * 1.8)
+    page.click("[data-approach='0,0,1']")
+    for axis, value in zip("xyz", ("0", "0", "15"), strict=True):
+        page.fill(f"[name=centre_{axis}]", value)
+    page.select_option("[name=palm_link]", "b")
+    assert [float(page.input_value(f"[name=centre_{axis}]")) for axis in "xyz"] != pytest.approx([0, 0, 15], abs=1)
+    page.select_option("[name=palm_link]", "palm")
+    assert float(page.input_value("[name=centre_z]")) == pytest.approx(15, abs=0.01)
+    page.locator("[data-joint='1']").fill("0.5")
+    page.click("[data-take]")
+    page.uncheck("[name=fingertip][value=c]")
+    page.fill("[name=name]", "claw-right")
+    page.click("text=Save as a hand of its own")
+    page.wait_for_url(lambda url: "/hands/" in url and not url.endswith("claw"))
+    assert page.inner_text("h1") == "claw-right"
+    checked(parts, "claw-right")
+    page.wait_for_selector(".viewer[data-state=ready]", timeout=SHOWN_MS)
+
+    asset = parts.index.assets.get(AssetKind.HAND, "claw-right")
+    files = library.load_asset_files(parts.store, AssetKind.HAND, asset.digest)
+    hand = load_hand(files, name="claw-right", digest="")
+    assert hand.closing.tolist() == [-1, 1, 1] and hand.preshape.tolist() == pytest.approx([0.95, 0.5, 1.5], abs=0.01)
+    assert [hand.body_names[tip] for tip in hand.fingertips] == ["a", "b"]
+    assert hand.palm.centre.tolist() == pytest.approx([0, 0, 0.015], abs=1e-4)
+    assert hand.palm.approach.tolist() == pytest.approx([0, 0, 1])
+    assert json.loads(files["asset.json"])["closing"]["ja"] == -1 and asset.facts["guessed"] in ([], ["effort"])
+    assert not page.is_visible("text=guessed")
+
+    page.click("text=Use it in a job")
+    page.wait_for_selector("[data-thing=hand] figure[data-state=ready]", timeout=SHOWN_MS)
+    assert page.input_value("#hand") == "claw-right"
+    job = httpx.post(f"{address}/v1/jobs", json={"hand": "claw-right", "object": "mug"}, trust_env=False)
+    assert job.status_code == 202

@@ -1,0 +1,98 @@
+"""What is corrected in the browser is what the command line says and writes: the same hand comes of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from graspd.cli import build
+from service.model.domain import AssetKind
+from service.store.assets import builtin_names
+from service.store.hand_corrections import HandCorrections, corrected, facts_of
+from tests.worker.hands.grippers import gripper
+from tests.worker.hands.urdfs import BOX, joint, link, robot
+from worker.hands.load import files_from_path, hand_from_path, load_hand
+from worker.hands.model import HandModel
+from worker.hands.pads import pads_of
+from worker.stages.glb import hand_glb
+
+CLAW = robot(
+    link("palm", BOX), link("a", BOX), link("b", BOX), link("c", BOX), link("mount", ""), link("tip", ""),
+    joint("ja", "palm", "a", origin="0.02 0 0.02", axis="0 -1 0"),
+    joint("jb", "palm", "b", origin="-0.02 0 0.02"),
+    joint("jc", "palm", "c", origin="-0.02 0.03 0.02"),
+    joint("jm", "palm", "mount", kind="fixed", origin="0.01 0.02 0.03"),
+    joint("jt", "a", "tip", kind="fixed", origin="0 0 0.04"),
+)  # fmt: skip
+
+
+def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
+    """Numbers in files are rounded to a micrometre or a microradian."""
+    pairs = [(one.closing, other.closing), (one.preshape, other.preshape)]
+    if palm:
+        pairs += [(one.palm.centre, other.palm.centre), (one.palm.approach, other.palm.approach)]
+    return one.fingertips == other.fingertips and all(np.allclose(a, b, atol=2e-6) for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    ("said", "options", "palm"),
+    [
+        ({}, [], True),
+        ({"closing": {"ja": -1}}, ["--closing", "ja=-1"], False),
+        ({"fingertips": ["a"], "preshape": {"jb": 0.7}}, ["--fingertips", "a", "--pre-shape", "jb=0.7"], False),
+        ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
+    ],
+)  # fmt: skip
+def test_corrections_and_options_make_the_same_hand(
+    said: dict[str, object], options: list[str], palm: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "claw.urdf").write_bytes(CLAW)
+    guessed = hand_from_path(tmp_path / "claw.urdf")
+    facts = facts_of(hand_glb(guessed))
+    there = corrected({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
+    named = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
+
+    command = ["hands", "check", str(tmp_path / "claw.urdf"), *options, "--write", str(tmp_path / "asset.json")]
+    assert CliRunner().invoke(build(), command).exit_code == 0
+    here = hand_from_path(tmp_path / "claw.urdf")
+    # The page keeps the palm that one sees on it; the command guesses it anew from what else it is told.
+    assert same(named, here, palm=palm)
+    assert set(there) >= {"root", "palm", "preshape", "closing", "fingertips", "file"}
+
+
+def test_a_corrected_approach_is_a_direction_and_leaves_the_rest_as_it_was() -> None:
+    hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
+    said = HandCorrections.model_validate({"palm": {"link": "palm", "approach": [0, 2, 0]}})
+    there = corrected({"file": "claw.urdf", "approach": [1, 0, 0]}, facts_of(hand_glb(hand)), said)
+    made = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
+    assert made.palm.approach.tolist() == [0, 1, 0] and same(made, hand, palm=False)
+    assert np.allclose(made.palm.centre, hand.palm.centre, atol=2e-6)
+
+
+def test_the_model_tells_every_link_and_where_it_is() -> None:
+    hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
+    facts = facts_of(hand_glb(hand))
+    assert set(facts.links) == {"palm", "a", "b", "c", "mount", "tip"} and facts.bodies == ["palm", "a", "b", "c"]
+    body, pose = hand.frames["tip"]
+    assert hand.body_names[body] == "a" and np.allclose(pose[:3], [0, 0, 0.04])
+
+
+def test_the_pads_of_a_gripper_are_where_its_jaws_meet() -> None:
+    one, two = pads_of(gripper())
+    assert one.body != two.body and len(one.points) > 3 and len(two.points) > 3
+    assert one.normal @ two.normal < -0.95
+
+
+@pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
+def test_each_fingertip_of_a_hand_has_its_pad_on_its_surface(name: str) -> None:
+    _, files, _ = files_from_path(name)
+    hand = load_hand(files, name=name, digest="")
+    pads = pads_of(hand)
+    assert [pad.body for pad in pads] == list(hand.fingertips)
+    for pad in pads:
+        corners = np.concatenate([piece.vertices for piece in hand.pieces if piece.body == pad.body])
+        assert (pad.points >= corners.min(axis=0) - 1e-6).all() and (pad.points <= corners.max(axis=0) + 1e-6).all()
