@@ -38,7 +38,9 @@ def hands_page(
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor)
     # What an upload says of itself stands beside what a check found: of any type.
     numbers = {
-        hand.digest: [len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))]
+        hand.digest: [
+            len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))
+        ]
         for hand in page.items
     }
     return render(

@@ -112,6 +112,7 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     assert json.loads(files["asset.json"])["closing"]["ja"] == -1 and asset.facts["guessed"] in ([], ["effort"])
     assert not page.is_visible("text=guessed")
 
+    assert page.is_visible("text=Collision shapes")
     page.click("text=Use it in a job")
     page.wait_for_selector("[data-thing=hand] figure[data-state=ready]", timeout=SHOWN_MS)
     assert page.input_value("#hand") == "claw-right"
