@@ -20,9 +20,9 @@ from typing import Any, Final
 import numpy as np
 from sqlalchemy import Connection, Table
 
+from service.index.bulk import upsert
 from service.index.changes.rows import attempt_row, job_row, shard_row, task_rows
 from service.index.changes.states import settle
-from service.index.database import upsert
 from service.index.index import Index
 from service.index.tables import attempts, grasps, jobs, shards, tasks
 from service.model import names

@@ -55,7 +55,9 @@ class Settings(BaseSettings):
     )
     retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
     max_upload_bytes: int = Field(64 * 2**20, gt=0, description="largest hand or object taken over HTTP [bytes]")
-    queue_window: int = Field(1000, ge=1, description="tasks kept waiting in the queue; the rest waits in the index")
+    queue_window: int = Field(
+        1000, ge=1, description="tasks kept waiting in a lane, or two a worker; the rest waits in the index"
+    )
     shard_grace_s: float = Field(
         7 * 86400.0, ge=0, description="how long shards are kept that no job needs since theirs was deleted [s]"
     )

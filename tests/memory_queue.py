@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from service.model.domain import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.at_scrape import QueueNow, WorkerPulse
-from service.queue.port import Event, Lease, Message, lane_order
+from service.queue.port import Event, Holder, Lease, Message, Report, lane_order
 
 
 @dataclass
@@ -35,6 +35,7 @@ class MemoryQueue:
     _events: list[Event] = field(default_factory=list)
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
+    _reports: dict[str, Report] = field(default_factory=dict)
     _sums: dict[str, float] = field(default_factory=dict)
     _taken: Counter[str] = field(default_factory=Counter)
     _read: int = 0
@@ -67,20 +68,36 @@ class MemoryQueue:
 
     def leases(self) -> list[Lease]:
         return [
-            Lease(held.message.task_id, held.message.attempt, held.worker, held.key, str(held.beat), held.message)
-            for held in self._held.values()
+            Lease(held.message.task_id, held.message.attempt, held.key, str(held.beat)) for held in self._held.values()
         ]
+
+    def holder(self, lease: Lease) -> Holder:
+        held = self._held.get(lease.key)
+        return Holder(held.worker, held.message) if held else Holder("", None)
 
     def release(self, lease: Lease) -> None:
         self._held.pop(lease.key, None)
+        self._reports.pop(lease.task_id, None)
 
     def workers(self) -> list[WorkerBeat]:
         return list(self._workers.values())
 
-    def publish(self, event: Event) -> None:
+    def publish(self, *events: Event) -> None:
         with self._changed:
-            self._events.append(event)
+            self._events += events
+            self.forget_reports([event.task_id for event in events if event.kind.ends_attempt])
             self._changed.notify_all()
+
+    def report(self, task_id: str, report: Report) -> float:
+        self._reports[task_id] = report
+        return 0.0
+
+    def reports(self) -> dict[str, Report]:
+        return dict(self._reports)
+
+    def forget_reports(self, task_ids: Collection[str]) -> None:
+        for task in task_ids:
+            self._reports.pop(task, None)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with self._changed:

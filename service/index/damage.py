@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from sqlalchemy import delete, func, select
 
-from service.index.database import Database, upsert
+from service.index.bulk import upsert
+from service.index.database import Database
 from service.index.tables import damage
 from service.model.clock import timestamp
 

@@ -6,16 +6,15 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from alembic import command
 from alembic.config import Config
 from alembic.util import CommandError
-from sqlalchemy import Connection, Engine, Table, create_engine, event, make_url, text
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from service.index.metric_columns import add_missing
@@ -23,6 +22,7 @@ from service.index.sqlite_file import Identity, SqliteFile
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 _MIGRATIONS: Final = Path(__file__).parent / "migrations"
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
 _BUSY_TIMEOUT_S: Final = 20.0
@@ -144,24 +144,7 @@ class Database:
                 self._file.set_aside(self._identity)
 
 
-def upsert(
-    connection: Connection, table: Table, rows: Sequence[Mapping[str, Any]], *, keep: Sequence[str] = ()
-) -> None:
-    """Insert rows; where the primary key is there, update all columns given but those in `keep`."""
-    if not rows:
-        return
-    keys = [column.name for column in table.primary_key]
-    # One statement run for many rows: a statement that spells out a thousand rows takes longer to build than to run.
-    insert: Any = (postgresql if connection.dialect.name == "postgresql" else sqlite).insert(table)
-    changed = {name: insert.excluded[name] for name in rows[0] if name not in keys and name not in keep}
-    if changed:
-        statement = insert.on_conflict_do_update(index_elements=keys, set_=changed)
-    else:
-        statement = insert.on_conflict_do_nothing(index_elements=keys)
-    connection.execute(statement, list(rows))
-
-
-def chunks(ids: Sequence[str], size: int = 1000) -> Iterable[Sequence[str]]:
+def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
     """Ids in parts that a statement may name: databases bound the number of its parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
 

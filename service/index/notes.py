@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select
 
-from service.index.database import Database, upsert
+from service.index.bulk import upsert
+from service.index.database import Database
 from service.index.tables import notes
 from service.model.clock import timestamp
 

@@ -6,6 +6,7 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Final
 
@@ -24,7 +25,9 @@ from service.store.records import read_record
 
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
-
+#: Shards indexed in one transaction: others who write wait for it, a fraction of a second.
+_SHARDS_AT_ONCE: Final = 200
+_READERS: Final = 8
 
 _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
 
@@ -37,6 +40,7 @@ class Indexer:
         self._told: OrderedDict[str, State] = OrderedDict()
         self._deferrals: dict[str, int] = {}
         self._tally = Tally(parts.queue)
+        self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
         """Bring the index up to date. Applying an event twice changes nothing.
@@ -47,36 +51,61 @@ class Indexer:
         Raises:
             UnavailableError: another part is away; apply the same events again later.
         """
-        progress: dict[str, tuple[float, float, str]] = {}
-        made: list[ShardManifest] = []
+        started: dict[str, str] = {}
+        finished: list[int] = []
+        left: list[str] = []
         waiting: list[int] = []
         for place, event in enumerate(events):
-            if event.kind is EventKind.PROGRESS:
-                progress[event.task_id] = (event.done, event.total, event.message)
-                continue
-            progress.pop(event.task_id, None)
-            # What a store that is away keeps from being known must not hide what does not need it.
-            if waiting and event.kind in _NEEDS_STORE:
+            if event.kind is EventKind.STARTED:
+                if event.stage is not Stage.INGEST:
+                    started[event.task_id] = event.worker
+            elif event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
+                finished.append(place)
+            elif event.kind is EventKind.LEFT:
+                left.append(event.worker)
+            elif event.kind is not EventKind.JOB:
+                self._start(started)
+                # What a store that is away keeps from being known must not hide what does not need it.
+                if not (waiting and event.kind in _NEEDS_STORE) and self._apply(event):
+                    continue
                 waiting.append(place)
-                continue
-            try:
-                with _left_out(f"event {event.kind} of task {event.task_id}"):
-                    self._take_up(event, made)
-            except StoreUnavailable as error:
-                log.warning("%s; %d or more events wait for it", error, 1 + len(waiting))
+        self._start(started)
+        for first in range(0, len(finished), _SHARDS_AT_ONCE):
+            waiting += self._finish(events, finished[first : first + _SHARDS_AT_ONCE])
+        if left:
+            self._parts.index.live.forget_workers(left)
+        return sorted(waiting)
+
+    def _start(self, started: dict[str, str]) -> None:
+        """Tasks that workers took; those are taken off the list."""
+        if started:
+            with _left_out(f"the start of {len(started)} tasks"):
+                self.tell(self._parts.index.live.set_running(started))
+            started.clear()
+
+    def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
+        """Index what was made; returns the places of the events whose manifests the store does not give."""
+        made, waiting = [], []
+        for place, found in zip(places, self._readers.map(self._load, (events[at] for at in places)), strict=True):
+            if isinstance(found, ShardManifest):
+                self._deferrals.pop(events[place].task_id, None)
+                made.append(found)
+            elif isinstance(found, StoreUnavailable):
                 waiting.append(place)
+            else:
+                log.error("event finished of task %s is left out", events[place].task_id, exc_info=found)
+        if waiting:
+            log.warning("the store does not answer, and %d events wait for it", len(waiting))
         self._index(made)
-        if progress:
-            with _left_out(f"progress of {len(progress)} tasks"):
-                self._parts.index.live.set_progress(progress)
         return waiting
 
-    def _take_up(self, event: Event, made: list[ShardManifest]) -> None:
-        if event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
-            made.append(load_manifest(self._parts.store, event.stage, event.output))
-            self._deferrals.pop(event.task_id, None)
-        else:
-            self._apply(event)
+    def _load(self, event: Event) -> ShardManifest | Exception:
+        """The manifest of what was made. Many are read at once: most of the time the store is waited for."""
+        assert event.stage is not None
+        try:
+            return load_manifest(self._parts.store, event.stage, event.output)
+        except Exception as error:
+            return error
 
     def _index(self, made: list[ShardManifest]) -> None:
         """Shards in one transaction; where the index cannot hold one of them, each by itself."""
@@ -94,16 +123,20 @@ class Indexer:
 
     def tell(self, states: Mapping[str, State]) -> None:
         """Publish the states of jobs where they changed."""
-        for job, state in states.items():
-            if self._told.get(job) is not state:
-                self._parts.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job, message=state.value))
-                log.info("job is %s", state, extra={"job": job})
-                if state.is_final:
-                    self._tally.ended(state)
+        changed = {job: state for job, state in states.items() if self._told.get(job) is not state}
+        if changed:
+            now = timestamp()
+            told = (Event(kind=EventKind.JOB, at=now, job_id=job, message=s.value) for job, s in changed.items())
+            self._parts.queue.publish(*told)
+        for job, state in changed.items():
+            log.info("job is %s", state, extra={"job": job})
+            if state.is_final:
+                self._tally.ended(state)
             self._told[job] = state
+        for job in states:
             self._told.move_to_end(job)
-            if len(self._told) > _REMEMBERED_JOBS:
-                self._told.popitem(last=False)
+        while len(self._told) > _REMEMBERED_JOBS:
+            self._told.popitem(last=False)
 
     def finished(self, stage: Stage, output: str) -> None:
         """Index a shard, or what the check of an asset found."""
@@ -140,18 +173,21 @@ class Indexer:
         """Add what was counted since the last time to the sums that Prometheus reads."""
         self._tally.flush()
 
-    def _apply(self, event: Event) -> None:
-        if event.kind is EventKind.STARTED:
-            if event.stage is not Stage.INGEST and (
-                started := self._parts.index.live.set_running(event.task_id, event.worker)
-            ):
-                self.tell(dict([started]))
-        elif event.kind is EventKind.FINISHED:
+    def _apply(self, event: Event) -> bool:
+        """Take up one event by itself; False if it must wait for the store."""
+        try:
+            with _left_out(f"event {event.kind} of task {event.task_id}"):
+                self._take_up(event)
+        except StoreUnavailable as error:
+            log.warning("%s; events wait for it", error)
+            return False
+        return True
+
+    def _take_up(self, event: Event) -> None:
+        if event.kind is EventKind.FINISHED:
             self.finished(Stage.INGEST, event.output)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
-        elif event.kind is EventKind.LEFT:
-            self._parts.index.live.forget_worker(event.worker)
         elif event.kind is EventKind.DEFERRED:
             self._tally.handed_back(event.stage or "", event.kind.value)
             self._defer(event)

@@ -21,7 +21,9 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import queue_tasks
+from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
+from service.pipeline.reports import Reports
 from service.pipeline.scrubber import Scrubber
 from service.pipeline.sweeper import Sweeper
 from service.queue.port import Event, EventKind
@@ -29,11 +31,14 @@ from service.store.library import publish_builtins, stored_assets
 
 log = logging.getLogger(__name__)
 PART: Final = "keeper"
-_EVENTS_A_ROUND: Final = 1000
+#: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
+_EVENTS_A_ROUND: Final = 2000
 #: Events that wait for the store; while there are more, no further ones are taken from the stream.
 _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
+#: How often the progress of tasks is passed on: as often as pages ask for it.
+_REPORTS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _SWEEP_EVERY_S: Final = 5.0
 #: What a read of the store that is under way has to end, once the keeper stops [s].
@@ -53,10 +58,19 @@ class Keeper:
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
         self._news = False
-        """Whether anything but progress came in since the queue was looked after."""
+        """Whether anything came in since the queue was filled."""
         self._started = False
+        self._workers = 0
+        """Workers that were there when they were last counted."""
         self._clock = clock
-        self._look_again = self._plan_again = self._tell_again = self._sweep_again = -math.inf
+        self._reports = Reports(parts)
+        interval_s = parts.settings.keeper_interval_s
+        # Each lease is seen three times before it can be called lost.
+        self._looking = Pace(clock, interval_s, longest_s=parts.settings.lease_s / 3)
+        self._feeding = Pace(clock, 0.0)
+        self._reporting = Pace(clock, min(_REPORTS_EVERY_S, interval_s), share=0.1)
+        self._counting = Pace(clock, _WORKERS_EVERY_S, share=0.1)
+        self._plan_again = self._sweep_again = -math.inf
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
@@ -104,13 +118,19 @@ class Keeper:
             self._make_whole()
         away: list[UnavailableError] = []
         with _noted(away):
-            self._index_events(0.0 if self._has_plans else wait_s)
+            self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
         now = self._clock()
-        if self._news or now >= self._look_again:
+        if self._looking.is_due:
             with _noted(away):
-                self._look_after_queue()
+                self._looking.run(self._look_after_queue)
                 self._news = False
-                self._look_again = now + self._parts.settings.keeper_interval_s
+        elif self._news and self._feeding.is_due:
+            with _noted(away):
+                self._feeding.run(self._feed)
+                self._news = False
+        if self._reporting.is_due:
+            with _noted(away):
+                self._reporting.run(self._reports.take_up)
         if self._has_plans or now >= self._plan_again:
             with _noted(away):
                 self._has_plans = self._planner.advance()
@@ -119,21 +139,22 @@ class Keeper:
             with _noted(away):
                 is_left = self._sweeper.advance() or self._sweeper.collect()
                 self._sweep_again = now if is_left else now + _SWEEP_EVERY_S
-        if now >= self._tell_again:
+        if self._counting.is_due:
             with _noted(away):
                 self._parts.queue.tidy()
             with _noted(away):
                 self._indexer.flush()
-                self._look_after_workers()
-                self._tell_again = now + _WORKERS_EVERY_S
+                self._counting.run(self._look_after_workers)
         if away:
             raise away[0]
 
     def _look_after_workers(self) -> None:
         self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
         # One that ended as it should says so, but its registration is gone a moment before that is read.
+        present = self._parts.queue.workers()
+        self._workers = len(present)
         self._parts.index.live.set_workers(
-            self._parts.queue.workers(),
+            present,
             lost_before=timestamp(self._parts.settings.lease_s),
             forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
         )
@@ -171,7 +192,7 @@ class Keeper:
         done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
         self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
         self._parts.queue.acknowledge([event_id for event_id, _ in done])
-        self._news |= any(event.kind is not EventKind.PROGRESS for _, event in done)
+        self._news |= any(event.kind is not EventKind.JOB for _, event in done)
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
@@ -185,6 +206,7 @@ class Keeper:
         # Waiting tasks are read before leases: one that a worker takes in between is then seen as held.
         waiting = self._parts.queue.waiting()
         leases = self._parts.queue.leases()
+        self._reports.sweep({lease.task_id for lease in leases})
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
         if stray := self._parts.index.feed.cancelled(present):
@@ -192,24 +214,31 @@ class Keeper:
         self._reaper.find_missing(present)
         self._feed(present)
 
-    def _feed(self, present: set[str]) -> None:
+    def _feed(self, present: set[str] | None = None) -> None:
+        """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
+        what the queue knows of a task keeps it from being queued twice."""
         depths = self._parts.queue.depths()
         now = time.time()
+        # Every worker finds a task waiting when it ends one.
+        window = max(self._parts.settings.queue_window, 2 * self._workers)
         for lane in Lane:
-            room = self._parts.settings.queue_window - sum(n for (of, _), n in depths.items() if of is lane)
+            room = window - sum(n for (of, _), n in depths.items() if of is lane)
             ready = self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
+            if present is None:
+                queue_tasks(self._parts, ready)
+                continue
             # After a rebuild the index does not know what is in the queue already.
             self._parts.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
             queue_tasks(self._parts, [task for task in ready if task.task.id not in present], again=True)
         self._feed_checks(present, now)
 
-    def _feed_checks(self, present: set[str], now: float) -> None:
+    def _feed_checks(self, present: set[str] | None, now: float) -> None:
         for check in self._parts.index.feed.ready_checks(now=now, limit=self._parts.settings.queue_window):
             self._parts.index.live.set_asset_waiting([check.digest], queued=True)
             if self._parts.store.exists(names.asset_check(check.kind, check.digest)):
                 with _noted([]):
                     self._indexer.checked(check.kind, check.digest)
-            elif ingest_id(check.kind, check.digest) not in present:
+            elif ingest_id(check.kind, check.digest) not in (present or ()):
                 message = ingest_message(
                     check.kind,
                     check.name,
@@ -217,7 +246,7 @@ class Keeper:
                     attempt=check.last_attempt + 1,
                     max_attempt=self._parts.settings.task_attempts,
                 )
-                self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=True)
+                self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=present is not None)
 
 
 @contextmanager

@@ -124,13 +124,14 @@ class Reaper:
             self._parts.index.live.set_asset_waiting([digest], queued=False)
 
     def _lose(self, lease: Lease) -> None:
-        message = lease.message
-        log.warning("worker %s was lost with task %s (attempt %d)", lease.worker, lease.task_id, lease.attempt)
+        holder = self._parts.queue.holder(lease)
+        message = holder.message
+        log.warning("worker %s was lost with task %s (attempt %d)", holder.worker, lease.task_id, lease.attempt)
         try:
             if isinstance(message, TaskMessage):
-                self._lose_task(lease, message)
+                self._lose_task(holder.worker, message)
             elif isinstance(message, IngestMessage):
-                self._lose_check(lease, message)
+                self._lose_check(message)
         except UnavailableError:
             raise
         except Exception:  # anybody who writes to Redis can forge a lease: it must not hold up the others
@@ -138,7 +139,7 @@ class Reaper:
         # Only now: if the store was away, the next round finds the lease again.
         self._parts.queue.release(lease)
 
-    def _lose_task(self, lease: Lease, message: TaskMessage) -> None:
+    def _lose_task(self, worker: str, message: TaskMessage) -> None:
         if shard_exists(self._parts.store, message.stage, message.output):
             self._find(message.task_id, message.stage, message.output)
             return
@@ -148,8 +149,8 @@ class Reaper:
             stage=message.stage,
             number=message.attempt,
             kind="WorkerLost",
-            reason=f"worker {lease.worker} was lost: no sign of life for {self._parts.settings.lease_s:g} s",
-            worker=lease.worker,
+            reason=f"worker {worker} was lost: no sign of life for {self._parts.settings.lease_s:g} s",
+            worker=worker,
             ended=timestamp(),
             last=message.attempt >= message.max_attempt,
         )
@@ -163,7 +164,7 @@ class Reaper:
         # A first loss is the machine's fault more often than the task's, so there is no wait.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
-    def _lose_check(self, lease: Lease, message: IngestMessage) -> None:
+    def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
             reason = f"checking this {message.kind.value} ended its worker {message.attempt} times; it is not taken"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}

@@ -30,7 +30,6 @@ class EventKind(StrEnum):
     """What happened. Events of a task come from its worker, `job` events from the keeper and the API."""
 
     STARTED = "started"
-    PROGRESS = "progress"
     FINISHED = "finished"
     FAILED = "failed"
     """An attempt ended in an error and is recorded in the store."""
@@ -44,6 +43,11 @@ class EventKind(StrEnum):
     JOB = "job"
     """The job's state changed; `message` is the new state."""
 
+    @property
+    def ends_attempt(self) -> bool:
+        """Whether nobody works on the task after it."""
+        return self not in (EventKind.STARTED, EventKind.LEFT, EventKind.JOB)
+
 
 def _cut(value: object) -> object:
     return value[:_LONGEST_MESSAGE] if isinstance(value, str) else value
@@ -54,7 +58,7 @@ _LONGEST_MESSAGE: Final = 2000
 
 
 class Event(Model):
-    """One thing that happened to a task or a job. `total` is 0 where progress is unknown."""
+    """One thing that happened to a task or a job."""
 
     kind: EventKind
     at: Annotated[str, Field(max_length=32)]
@@ -64,8 +68,6 @@ class Event(Model):
     batch: Count = 0
     attempt: Count = 0
     worker: HostWord = ""
-    done: Amount = 0.0
-    total: Amount = 0.0
     message: Annotated[str, BeforeValidator(_cut)] = ""
     last: bool = False
     seconds: Amount = 0.0
@@ -76,17 +78,34 @@ class Event(Model):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
+class Report(Model):
+    """How far a running task is. `total` is 0 where that is unknown."""
+
+    attempt: Count = 0
+    done: Amount = 0.0
+    total: Amount = 0.0
+    message: Annotated[str, BeforeValidator(_cut)] = ""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
 @dataclass(frozen=True)
 class Lease:
     """A worker's hold on a task. `beat` changes with every sign of life; only its change has a meaning."""
 
     task_id: str
     attempt: int
-    worker: str
     key: str
     beat: str
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who holds a lease, and what was asked of it."""
+
+    worker: str
     message: Message | None
-    """What was asked of the worker; None if Redis no longer knows."""
+    """None if Redis no longer knows."""
 
 
 class Tasks(Protocol):
@@ -114,6 +133,9 @@ class Tasks(Protocol):
     def leases(self) -> list[Lease]:
         """Tasks held by workers, living or dead. Reading changes nothing."""
 
+    def holder(self, lease: Lease) -> Holder:
+        """Who holds a lease. Only of one that is lost is this asked: reading all leases stays one round trip."""
+
     def release(self, lease: Lease) -> None:
         """Forget a lease whose worker is lost; if it lives after all, it notices and stops."""
 
@@ -121,8 +143,21 @@ class Tasks(Protocol):
 class Events(Protocol):
     """A bounded stream of what happened: one keeper consumes it, any number of readers follow it."""
 
-    def publish(self, event: Event) -> None:
+    def publish(self, *events: Event) -> None:
         """Append to the bounded stream of events."""
+
+    def report(self, task_id: str, report: Report) -> float:
+        """Say how far a task is, in place of what was said before; gone with the event that ends the attempt.
+
+        Returns:
+            time after which more is welcome [s].
+        """
+
+    def reports(self) -> dict[str, Report]:
+        """The last report on each task."""
+
+    def forget_reports(self, task_ids: Collection[str]) -> None:
+        """Take reports away whose tasks nobody holds."""
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Next events for the keeper, oldest first; those never acknowledged come again after its restart."""

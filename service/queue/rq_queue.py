@@ -14,21 +14,23 @@ from typing import Any, Final
 
 from redis import Redis
 from redis.exceptions import RedisError, ResponseError
-from rq.exceptions import DuplicateJobError
 
 from service.model.domain import Lane, Stage
 from service.model.errors import QueueUnavailable
 from service.model.worker_beat import WorkerBeat
 from service.queue import entries
+from service.queue.adding import Appender
 from service.queue.address import redis_url
-from service.queue.allowed import FAILURE_TTL_S, TASK_FUNCTION, AllowedJob, AllowedQueue
+from service.queue.allowed import AllowedJob
 from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
-from service.queue.port import Event, Lease, Message, lane_order
+from service.queue.port import Event, Holder, Lease, Message, Report, lane_order
+from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
 from service.settings import Settings
 
 EVENTS: Final = "graspd:events"
-#: Events kept: two minutes of a hundred workers' progress, 20 MB at most. Those lost are made good from the store.
+#: Events kept, 20 MB at most: a minute of a keeper that is away and four hundred tasks a second. Those lost are made
+#: good from the store.
 EVENTS_KEPT: Final = 50_000
 WORKERS: Final = "graspd:workers"
 #: Sums for Prometheus, a few hundred fields.
@@ -46,6 +48,7 @@ class RqQueue:
 
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
+        self._appender = Appender(connection)
         self._unread = "0"
 
     def ping(self) -> float:
@@ -55,31 +58,12 @@ class RqQueue:
         return time.perf_counter() - start
 
     def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
-        added = 0
+        jobs = [(queue_name(lane, m.stage), rq_id(m.task_id, m.attempt), m) for m in messages]
+        stale = [cancel_key(message.task_id) for message in messages]
+        if again:
+            stale += [AllowedJob.key_for(job) for _, job, _ in jobs]
         with _mapped():
-            for message in messages:
-                queue = AllowedQueue.open(queue_name(lane, message.stage), self.connection)
-                self.connection.delete(cancel_key(message.task_id))
-                if again:
-                    self.connection.delete(AllowedJob.key_for(rq_id(message.task_id, message.attempt)))
-                added += self._enqueue(queue, message)
-        return added
-
-    def _enqueue(self, queue: AllowedQueue, message: Message) -> bool:
-        try:
-            queue.enqueue_call(
-                TASK_FUNCTION,
-                args=(message.model_dump(mode="json", by_alias=True),),
-                job_id=rq_id(message.task_id, message.attempt),
-                timeout=-1,  # the worker's own clock ends a task that takes too long: see `worker.process.main`
-                result_ttl=0,
-                failure_ttl=FAILURE_TTL_S,
-                description=f"{message.stage} {message.task_id}",
-                unique=True,
-            )
-        except DuplicateJobError:
-            return False
-        return True
+            return self._appender.append(jobs, stale=stale)
 
     def discard(self, task_ids: Collection[str]) -> None:
         wanted = set(task_ids)
@@ -109,27 +93,18 @@ class RqQueue:
 
     def leases(self) -> list[Lease]:
         # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
-        leases = []
-        with _mapped():
-            for lane, stage in product(Lane, Stage):
-                key = f"rq:wip:{queue_name(lane, stage)}"
-                for entry, score in self.connection.zrange(key, 0, -1, withscores=True):
-                    leases.append(self._lease(key, entry, score))
-        return leases
+        keys = [f"rq:wip:{queue_name(lane, stage)}" for lane, stage in product(Lane, Stage)]
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for key in keys:
+                pipe.zrange(key, 0, -1, withscores=True)
+            found = pipe.execute()
+        return [_lease(key, entry, score) for key, held in zip(keys, found, strict=True) for entry, score in held]
 
-    def _lease(self, key: str, entry: bytes, score: float) -> Lease:
-        job = entry.partition(b":")[0]
-        task, attempt = entries.task_of(entries.text(job))
-        (beat,) = entries.fields(self.connection, b"rq:execution:" + entry, "last_heartbeat")
-        worker, data = entries.fields(self.connection, _JOB + job, "worker_name", "data")
-        return Lease(
-            task_id=task,
-            attempt=attempt,
-            worker=entries.text(worker),
-            key=f"{key} {entry.hex()}",
-            beat=f"{score}/{entries.text(beat)}",
-            message=entries.message(data),
-        )
+    def holder(self, lease: Lease) -> Holder:
+        job = bytes.fromhex(lease.key.partition(" ")[2]).partition(b":")[0]
+        with _mapped():
+            worker, data = entries.fields(self.connection, _JOB + job, "worker_name", "data")
+        return Holder(entries.text(worker), entries.message(data))
 
     def release(self, lease: Lease) -> None:
         key, _, digits = lease.key.partition(" ")
@@ -138,6 +113,7 @@ class RqQueue:
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
             pipe.delete(b"rq:execution:" + entry, b"rq:executions:" + job, _JOB + job)
+            pipe.hdel(REPORTS, lease.task_id)
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
@@ -146,9 +122,25 @@ class RqQueue:
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
         return [beat for beat in map(entries.beat, found) if beat is not None]
 
-    def publish(self, event: Event) -> None:
+    def publish(self, *events: Event) -> None:
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for event in events:
+                pipe.xadd(EVENTS, encoded(event), maxlen=EVENTS_KEPT, approximate=True)
+                if event.kind.ends_attempt:
+                    pipe.hdel(REPORTS, event.task_id)
+            pipe.execute()
+
+    def report(self, task_id: str, report: Report) -> float:
         with _mapped():
-            self.connection.xadd(EVENTS, encoded(event), maxlen=EVENTS_KEPT, approximate=True)
+            return put_report(self.connection, task_id, report, WORKERS)
+
+    def reports(self) -> dict[str, Report]:
+        with _mapped():
+            return read_reports(self.connection)
+
+    def forget_reports(self, task_ids: Collection[str]) -> None:
+        with _mapped():
+            drop_reports(self.connection, task_ids)
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
@@ -163,14 +155,22 @@ class RqQueue:
 
     def _read_group(self, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         # First what an earlier keeper took and never acknowledged, then what is new.
-        if self._unread != ">":
+        while self._unread != ">":
             reply = self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: self._unread}, count=limit)
-            if pending := self._events(reply):
-                self._unread = pending[-1][0]
+            pending, last = self._readable(reply)
+            self._unread = last or ">"
+            if pending:
                 return pending
-            self._unread = ">"
         block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
-        return self._events(self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: ">"}, count=limit, block=block))
+        return self._readable(self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: ">"}, count=limit, block=block))[0]
+
+    def _readable(self, reply: Any) -> tuple[list[tuple[str, Event]], str]:
+        """Events of a reply, and the id of its last entry. What cannot be read is acknowledged: it is nobody's."""
+        found = self._events(reply)
+        known = {event_id for event_id, _ in found}
+        entries_of = [event_id.decode() for event_id, _ in _entries_of(reply)]
+        self.acknowledge([event_id for event_id in entries_of if event_id not in known])
+        return found, entries_of[-1] if entries_of else ""
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
@@ -212,8 +212,11 @@ class RqQueue:
         lists = [queue_name(lane, stage) for lane, stage in product(Lane, Stage)]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             entries.sweep(self.connection, _kinds(), EVENTS)
-            for name in self.connection.smembers(WORKERS):
-                if not self.connection.exists(_WORKER + name):
+            known = list(self.connection.smembers(WORKERS))
+            for name in known:
+                pipe.exists(_WORKER + name)
+            for name, lives in zip(known, pipe.execute(), strict=True):
+                if not lives:
                     key = b"rq:worker:" + name
                     pipe.delete(key)
                     for registry in ("rq:workers", *(f"rq:workers:{queue}" for queue in lists)):
@@ -228,14 +231,8 @@ class RqQueue:
 
     @staticmethod
     def _events(reply: Any) -> list[tuple[str, Event]]:
-        streams = reply.values() if isinstance(reply, dict) else [found for _, found in reply or []]
-        events = []
-        for found in streams:
-            for entry in found:
-                for event_id, fields in [entry] if isinstance(entry, tuple) else entry:
-                    if fields and (event := entries.event(fields.get(b"e"))):
-                        events.append((event_id.decode(), event))
-        return events
+        read = ((event_id, entries.event(fields.get(b"e"))) for event_id, fields in _entries_of(reply) if fields)
+        return [(event_id.decode(), event) for event_id, event in read if event is not None]
 
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
@@ -263,6 +260,18 @@ def cancel_key(task_id: str) -> str:
     return f"graspd:cancel:{task_id}"
 
 
+def _entries_of(reply: Any) -> list[tuple[bytes, dict[bytes, bytes] | None]]:
+    """Ids and fields of what a read of the stream gives; an entry that was trimmed has no fields."""
+    streams = reply.values() if isinstance(reply, dict) else [found for _, found in reply or []]
+    return [one for found in streams for entry in found for one in ([entry] if isinstance(entry, tuple) else entry)]
+
+
+def _lease(key: str, entry: bytes, score: float) -> Lease:
+    task, attempt = entries.task_of(entries.text(entry.partition(b":")[0]))
+    # Every sign of life moves the score, and an entry is of one execution only.
+    return Lease(task_id=task, attempt=attempt, key=f"{key} {entry.hex()}", beat=str(score))
+
+
 def worker_key(name: str) -> str:
     """Key that a living worker keeps alive."""
     return f"{_WORKER.decode()}{name}"
@@ -279,7 +288,14 @@ def _queue_keys() -> list[str]:
 
 def _kinds() -> Iterator[tuple[str, str]]:
     """Names of a fixed number, each with its type in Redis."""
-    yield from ((EVENTS, "stream"), (WORKERS, "set"), (METRICS, "hash"), ("rq:workers", "set"), ("rq:queues", "set"))
+    yield from (
+        (EVENTS, "stream"),
+        (WORKERS, "set"),
+        (METRICS, "hash"),
+        (REPORTS, "hash"),
+        ("rq:workers", "set"),
+        ("rq:queues", "set"),
+    )
     for lane, stage in product(Lane, Stage):
         name = queue_name(lane, stage)
         yield f"rq:queue:{name}", "list"

@@ -8,7 +8,7 @@ from benchmarks.large_index import fill
 from service.index.index import Index
 from service.model.clock import timestamp
 from service.model.domain import Lane
-from service.queue.port import Event, EventKind
+from service.queue.port import Event, EventKind, Report
 from service.queue.rq_queue import EVENTS, EVENTS_KEPT, RqQueue, cancel_key
 from service.store.store import open_store
 from tests.fakes import message_for
@@ -47,8 +47,8 @@ def test_a_waiting_task_takes_a_few_kilobytes_of_redis_and_gives_them_back(rq_qu
 
 def test_the_stream_of_events_takes_a_bounded_part_of_redis(rq_queue: RqQueue) -> None:
     event = Event(
-        kind=EventKind.PROGRESS, at=timestamp(), task_id="0" * 32, job_id="1" * 32, attempt=1,
-        worker="host-12345-abcdef", done=12.5, total=100.0, message="resolving penetration",
+        kind=EventKind.FINISHED, at=timestamp(), task_id="0" * 32, job_id="1" * 32, attempt=1,
+        worker="host-12345-abcdef", seconds=12.5, output="2" * 32, message="was there already",
     )  # fmt: skip
     for _ in range(1000):
         rq_queue.publish(event)
@@ -69,6 +69,8 @@ def test_everything_in_redis_that_is_not_of_a_fixed_number_has_an_end(rq_queue: 
     rq_queue.discard(["0" * 32])
     rq_queue.announce("keeper", 5)
     rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
+    rq_queue.report("a", Report(done=1.0, total=2.0))
+    rq_queue.publish(Event(kind=EventKind.FINISHED, at=timestamp(), task_id="a"))
     fixed = ("rq:queue", "rq:job", "rq:unique", EVENTS, "graspd:workers", "graspd:tally")
     without_end = [key.decode() for key in rq_queue.connection.keys("*") if rq_queue.connection.ttl(key) < 0]
     assert [key for key in without_end if not key.startswith(fixed)] == []

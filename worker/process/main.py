@@ -28,7 +28,7 @@ from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob, AllowedQueue
-from service.queue.port import Event, EventKind, Events
+from service.queue.port import Event, Events, Report
 from service.queue.rq_queue import RqQueue, open_queue, queue_names, worker_key
 from service.settings import Settings
 from service.store.store import Store, open_store
@@ -112,7 +112,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """One task under a lease; its outcome is told after RQ has closed its books on it."""
         self._outcome = None
         self.prepare_execution(job)
-        self._context = self._surroundings.context(_raw(job), self._queue, self.name)
+        self._context = self._surroundings.context(_raw(job), self._queue)
         self._heart.hold(
             Hold.of(
                 job.id.rpartition("-")[0],
@@ -243,27 +243,16 @@ class Surroundings:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
-    def context(self, raw: Mapping[str, Any], events: Events, worker: str) -> TaskContext:
-        """The context of a task, which tells its progress as events."""
+    def context(self, raw: Mapping[str, Any], events: Events) -> TaskContext:
+        """The context of a task, which reports how far it is."""
 
-        def tell(done: float, total: float, message: str) -> None:
-            event = Event(
-                kind=EventKind.PROGRESS,
-                at=timestamp(),
-                task_id=raw["task_id"],
-                job_id=raw.get("job_id", ""),
-                stage=raw["stage"],
-                batch=raw.get("batch", 0),
-                attempt=raw["attempt"],
-                worker=worker,
-                done=done,
-                total=total,
-                message=message[:200],
-            )
+        def tell(done: float, total: float, message: str) -> float | None:
             try:
-                events.publish(event)
+                report = Report(attempt=raw["attempt"], done=done, total=total, message=message[:200])
+                return events.report(raw["task_id"], report)
             except QueueUnavailable:
                 log.debug("nobody could be told about the progress of %s", raw["task_id"])
+                return None
 
         device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
         return TaskContext(self.store, device=device, threads=self.settings.threads, tell=tell)

@@ -26,13 +26,12 @@ from redis.exceptions import RedisError
 
 from service.model.clock import timestamp
 from service.queue.connection import connect
+from service.queue.rates import beat_every_s
 
 #: How long Redis keeps a lease without a beat [s]: much longer than the keeper, which watches beats, takes to act.
 LEASE_KEPT_S: Final = 3600
 #: Time a task has to notice that it must stop before its worker is ended [s].
 STUCK_AFTER_S: Final = 60.0
-#: A cancelled task must stop within two seconds, so the key that says so is read twice in that time.
-_LONGEST_INTERVAL_S: Final = 0.8
 #: News is not told more often than this [s].
 _SHORTEST_INTERVAL_S: Final = 0.1
 _ANSWER_S: Final = 3.0
@@ -64,7 +63,7 @@ class Pulse:
         self._clock = clock
         self._now_at: dict[str, Any] = {}
         self._since = clock()
-        self.interval_s = min(_LONGEST_INTERVAL_S, place["lease_s"] / 3)
+        self.interval_s = beat_every_s(1, place["lease_s"])
 
     def take(self, now_at: dict[str, Any]) -> None:
         """What the worker is at from now on."""
@@ -82,6 +81,7 @@ class Pulse:
         with self._connection.pipeline() as pipe:
             pipe.set(self._place["worker"], json.dumps(beat), ex=max(2, round(self._place["lease_s"])))
             pipe.sadd(self._place["workers"], beat["name"])
+            pipe.scard(self._place["workers"])
             if hold:
                 # Nothing is made that is not there: the task may be done, or taken away, by now.
                 pipe.zadd(hold["registry"], {hold["entry"]: time.time() + LEASE_KEPT_S}, xx=True)
@@ -90,6 +90,7 @@ class Pulse:
                 pipe.zscore(hold["registry"], hold["entry"])
                 pipe.exists(hold["cancel"])
             results = pipe.execute()
+        self.interval_s = beat_every_s(results[2], self._place["lease_s"])
         if hold and results[-1]:
             self._tell("cancelled", hold["entry"])
         elif hold and results[-2] is None:

@@ -12,8 +12,8 @@ from service.model.errors import TaskCancelled
 from service.store.store import Store
 from worker.run import Run
 
-#: Progress told per second at most: enough for a smooth bar, little for Redis.
-_PROGRESS_RATE: Final = 4.0
+#: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
+_REPORT_EVERY_S: Final = 0.25
 
 
 class StopReason(StrEnum):
@@ -34,22 +34,23 @@ class TaskContext:
         *,
         device: str = "cpu",
         threads: int = 0,
-        tell: Callable[[float, float, str], None] | None = None,
+        tell: Callable[[float, float, str], float | None] | None = None,
     ) -> None:
+        """`tell` takes done, total and a message, and may answer when it wants to hear more [s]."""
         self.store = store
         self.device = device
         self.threads = threads
         self._tell = tell
-        self._told = 0.0
+        self._tell_again = 0.0
         self._stop = threading.Event()
         self._reason: StopReason | None = None
 
     def progress(self, done: float, total: float, message: str) -> None:
         """Say how far the task is; most calls are dropped so that few are sent."""
         now = time.monotonic()
-        if self._tell is not None and (now - self._told >= 1.0 / _PROGRESS_RATE or (done >= total > 0)):
-            self._told = now
-            self._tell(done, total, message)
+        if self._tell is not None and now >= self._tell_again:
+            self._tell_again = now + _REPORT_EVERY_S
+            self._tell_again = now + (self._tell(done, total, message) or _REPORT_EVERY_S)
 
     @property
     def run(self) -> Run:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, update
 
+from service.index.bulk import upsert
 from service.index.changes.rows import beside
-from service.index.database import Database, upsert
+from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import delete, update
+from sqlalchemy import Connection, delete, select, update
 
+from service.index.bulk import update_rows, upsert
 from service.index.changes.rows import clean
 from service.index.changes.states import settle
-from service.index.database import Database, chunks, upsert
+from service.index.database import Database, chunks
 from service.index.tables import assets, jobs, tasks, workers
 from service.model.domain import State
 from service.model.worker_beat import WorkerBeat
@@ -23,40 +24,36 @@ class Live:
 
     database: Database
 
-    def set_running(self, task_id: str, worker: str) -> tuple[str, State] | None:
-        """A worker took the task. Returns the job and its state, None if it makes no difference any more."""
+    def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
+        """Workers took tasks: the worker of each. Returns the states of the jobs to which it makes a difference."""
+        running = State.RUNNING.value
         with self.database.writing() as connection:
-            job = connection.scalar(
-                update(tasks)
-                .where(tasks.c.id == task_id, tasks.c.state == State.QUEUED.value)
-                .values(
-                    state=State.RUNNING.value,
-                    queued=True,
-                    worker=clean(worker, 128),
-                    progress_done=0.0,
-                    progress_total=0.0,
-                )
-                .returning(tasks.c.job_id)
-            )
-            if job is None:
-                return None
-            # A job that already runs stays so: no need to look at its other tasks.
-            connection.execute(
-                update(jobs)
-                .where(jobs.c.id == job, jobs.c.state == State.QUEUED.value)
-                .values(state=State.RUNNING.value)
-            )
-            return job, State.RUNNING
+            jobs_of: dict[str, str] = {}
+            for some in chunks(list(workers)):
+                waiting = tasks.c.id.in_(some) & (tasks.c.state == State.QUEUED.value)
+                found = connection.execute(select(tasks.c.id, tasks.c.job_id).where(waiting))
+                jobs_of |= {row.id: row.job_id for row in found}
+            rows = [
+                {"id": task, "state": running, "queued": True, "worker": clean(workers[task], 128)}
+                | {"progress_done": 0.0, "progress_total": 0.0}
+                for task in jobs_of
+            ]
+            update_rows(connection, tasks, rows, state=State.QUEUED.value)
+            touched = sorted(set(jobs_of.values()))
+            for some in chunks(touched):
+                # A job that already runs stays so: no need to look at its other tasks.
+                waiting = jobs.c.id.in_(some) & (jobs.c.state == State.QUEUED.value)
+                connection.execute(update(jobs).where(waiting).values(state=running))
+            return dict.fromkeys(touched, State.RUNNING)
 
     def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
         """How far running tasks are: done, total, and what they do."""
+        rows = [
+            {"id": task, "progress_done": done, "progress_total": total, "progress_message": clean(message)}
+            for task, (done, total, message) in progress.items()
+        ]
         with self.database.writing() as connection:
-            for task_id, (done, total, message) in progress.items():
-                connection.execute(
-                    update(tasks)
-                    .where(tasks.c.id == task_id, tasks.c.state == State.RUNNING.value)
-                    .values(progress_done=done, progress_total=total, progress_message=clean(message))
-                )
+            update_rows(connection, tasks, rows, state=State.RUNNING.value)
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
         """Tasks that were put into the queue."""
@@ -109,15 +106,23 @@ class Live:
         ]
         with self.database.writing() as connection:
             upsert(connection, workers, rows)
-            gone = workers.c.name.not_in([beat.name for beat in beats])
-            lost = update(workers).where(gone, workers.c.seen < lost_before)
-            connection.execute(lost.values(state="lost", task_id=None, reason=""))
-            connection.execute(delete(workers).where(gone, workers.c.seen < forget_before))
+            living = {beat.name for beat in beats}
+            known = connection.execute(select(workers.c.name, workers.c.seen, workers.c.state)).all()
+            gone = [row for row in known if row.name not in living]
+            lost = [row.name for row in gone if row.seen < lost_before and row.state != "lost"]
+            for some in chunks(lost):
+                of_lost = update(workers).where(workers.c.name.in_(some))
+                connection.execute(of_lost.values(state="lost", task_id=None, reason=""))
+            self._forget(connection, [row.name for row in gone if row.seen < forget_before])
 
-    def forget_worker(self, name: str) -> None:
-        """A worker that ended as it should."""
+    def forget_workers(self, names: Sequence[str]) -> None:
+        """Workers that ended as they should."""
         with self.database.writing() as connection:
-            connection.execute(delete(workers).where(workers.c.name == name))
+            self._forget(connection, names)
+
+    def _forget(self, connection: Connection, names: Sequence[str]) -> None:
+        for some in chunks(names):
+            connection.execute(delete(workers).where(workers.c.name.in_(some)))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
         """A check that ended without a finding."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, select, update
 
+from service.index.bulk import upsert
 from service.index.changes.rows import asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
-from service.index.changes.states import settle
-from service.index.database import Database, chunks, upsert
+from service.index.changes.states import settle, settle_batches
+from service.index.database import Database, chunks
 from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
 from service.model.domain import Asset, State
 from service.model.records import AttemptRecord, JobEvent, JobRecord
@@ -36,11 +38,8 @@ class Changes:
         Returns:
             the states of the jobs concerned.
         """
-        states: dict[str, State] = {}
         with self.database.writing(within) as connection:
-            for manifest in manifests:
-                states |= self._add_manifest(connection, manifest)
-        return states
+            return self._add_manifests(connection, list(manifests))
 
     def add_manifest(self, manifest: ShardManifest) -> dict[str, State]:
         """One shard."""
@@ -84,17 +83,20 @@ class Changes:
                 found[row["id"]] = _outcome(row["worker"], row["device"], row["seconds"], row["created"])
         return found
 
-    def _add_manifest(self, connection: Connection, manifest: ShardManifest) -> dict[str, State]:
-        upsert(connection, shards, [shard_row(manifest)])
-        upsert(connection, grasps, grasp_rows(manifest))
-        outcome = _outcome(manifest.worker, manifest.device, manifest.seconds, manifest.created)
-        touched = connection.execute(
-            update(tasks)
-            .where(tasks.c.shard_id == manifest.shard_id)
-            .values(**outcome)
-            .returning(tasks.c.job_id, tasks.c.batch)
-        ).all()
-        return {job: settle(connection, job, [batch]) for job, batch in touched}
+    def _add_manifests(self, connection: Connection, manifests: Sequence[ShardManifest]) -> dict[str, State]:
+        upsert(connection, shards, [shard_row(manifest) for manifest in manifests])
+        upsert(connection, grasps, [row for manifest in manifests for row in grasp_rows(manifest)])
+        touched: defaultdict[str, set[int]] = defaultdict(set)
+        for some in chunks([manifest.shard_id for manifest in manifests]):
+            done = (
+                update(tasks)
+                .where(tasks.c.shard_id == shards.c.id, shards.c.id.in_(some))
+                .values(_outcome(*_OUTCOME))
+                .returning(tasks.c.job_id, tasks.c.batch)
+            )
+            for job, batch in connection.execute(done):
+                touched[job].add(batch)
+        return settle_batches(connection, touched)
 
     def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
         if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
@@ -134,8 +136,8 @@ class Changes:
 _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created)
 
 
-def _outcome(worker: str, device: str, seconds: float, created: str) -> dict[str, Any]:
-    """What a task row takes from its shard's manifest."""
+def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
+    """What a task row takes from its shard: values, or columns."""
     return {
         "done": True,
         "worker": worker,

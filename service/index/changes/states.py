@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
-from typing import Any
+from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, bindparam, exists, func, select, update
+from sqlalchemy import ColumnElement, Connection, exists, func, select, tuple_, update
 
+from service.index.database import chunks
 from service.index.tables import attempts, jobs, tasks
 from service.model.domain import State
 from service.model.errors import SceneError
 from service.model.planning import TaskFacts, batch_ready, batch_states, job_state
 
+#: Jobs whose states are derived in one go.
+_JOBS_AT_ONCE: Final = 200
 _FACTS = (
     tasks.c.id,
     tasks.c.batch,
@@ -29,44 +33,67 @@ _FACTS = (
 def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
     """Derive the states of a job's tasks, of some batches or all, then the job's own.
 
-    Where the first batch found no grasp in its scenes, the job's other batches are not made: they end as if cancelled.
-
     Returns:
         the job's state.
     """
-    facts = connection.execute(select(jobs.c.cancelled, _hopeless(job_id)).where(jobs.c.id == job_id)).first()
-    cancelled = facts is not None and any(facts)
-    if facts is not None and facts.hopeless:
-        batches = None
-    query = select(*_FACTS).where(tasks.c.job_id == job_id).order_by(tasks.c.batch, tasks.c.position)
-    if batches is not None:
-        query = query.where(tasks.c.batch.in_(sorted(set(batches))))
-    changes = []
-    for _, chain in groupby(connection.execute(query).mappings().all(), key=lambda row: row["batch"]):
-        changes += _changes(list(chain), cancelled=cancelled)
-    if changes:
-        statement = (
-            update(tasks)
-            .where(tasks.c.id == bindparam("task"))
-            .values(state=bindparam("new_state"), ready=bindparam("new_ready"))
-        )
-        connection.execute(statement, changes)
-    return _settle_job(connection, job_id)
+    return settle_batches(connection, {job_id: batches})[job_id]
 
 
-def _hopeless(job_id: str) -> ColumnElement[bool]:
+def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
+    """The same for some batches, or all (None), of many jobs at once.
+
+    Where the first batch found no grasp in its scenes, the job's other batches are not made: they end as if cancelled.
+
+    Returns:
+        the states of these jobs.
+    """
+    states: dict[str, State] = {}
+    for some in chunks(list(touched), _JOBS_AT_ONCE):
+        _settle_tasks(connection, {job: touched[job] for job in some})
+        states |= _settle_jobs(connection, some)
+    return states
+
+
+def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> None:
+    query = select(jobs.c.id, jobs.c.cancelled, _hopeless()).where(jobs.c.id.in_(list(touched)))
+    facts = {row.id: row for row in connection.execute(query)}
+    cancelled = {job for job, row in facts.items() if row.cancelled or row.hopeless}
+    whole = [job for job, batches in touched.items() if batches is None or (job in facts and facts[job].hopeless)]
+    pairs = [
+        (job, batch) for job, batches in touched.items() if job not in whole for batch in sorted(set(batches or ()))
+    ]
+    rows: list[Any] = []
+    for wanted in (
+        *(tasks.c.job_id.in_(some) for some in chunks(whole)),
+        *(tuple_(tasks.c.job_id, tasks.c.batch).in_(some) for some in chunks(pairs)),
+    ):
+        query = select(tasks.c.job_id, *_FACTS).where(wanted).order_by(tasks.c.job_id, tasks.c.batch, tasks.c.position)
+        rows += connection.execute(query).mappings()
+    changes: defaultdict[tuple[str, bool], list[str]] = defaultdict(list)
+    for (job, _), chain in groupby(rows, key=lambda row: (row["job_id"], row["batch"])):
+        for task, state, ready in _changes(list(chain), cancelled=job in cancelled):
+            changes[state, ready].append(task)
+    for (state, ready), ids in changes.items():
+        for some in chunks(ids):
+            connection.execute(update(tasks).where(tasks.c.id.in_(some)).values(state=state, ready=ready))
+
+
+def _hopeless() -> ColumnElement[bool]:
     """Whether the first batch of a job ended because of its scenes."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
+    first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)
     return (
         exists()
-        .select_from(tasks)
-        .where(tasks.c.job_id == job_id, tasks.c.batch == 0, *failed, last, attempts.c.kind == SceneError.__name__)
+        .select_from(tasks.join(attempts, last))
+        .where(*first, *failed, attempts.c.kind == SceneError.__name__)
+        .correlate(jobs)
         .label("hopeless")
     )
 
 
-def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[dict[str, Any]]:
+def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
+    """Tasks of a batch whose state, or whether they may start, is not what follows from the facts; with both."""
     facts = [
         TaskFacts(
             stage=row["stage"],
@@ -80,24 +107,32 @@ def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[dict[str, Any]]:
     ]
     states = batch_states(facts, job_cancelled=cancelled)
     return [
-        {"task": row["id"], "new_state": state.value, "new_ready": ready}
+        (row["id"], state.value, ready)
         for row, state, ready in zip(chain, states, batch_ready(states), strict=True)
         if (row["state"], row["ready"]) != (state.value, ready)
     ]
 
 
-def _settle_job(connection: Connection, job_id: str) -> State:
-    of_job = tasks.c.job_id == job_id
+def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
     # Five probes of an index; to collect the distinct states would read every task of the job.
+    of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
-    found = connection.execute(select(*probes)).mappings().one()
-    states = [state for state in State if found[state.value]]
-    state = job_state(states)
-    values: dict[str, Any] = {"state": state.value, "finished": None, "reason": None}
-    if state.is_final:
-        values["finished"] = connection.scalar(select(func.max(tasks.c.finished)).where(of_job))
-    if State.FAILED in states:
-        first = select(tasks.c.reason).where(of_job, tasks.c.state == State.FAILED.value)
-        values["reason"] = connection.scalar(first.order_by(tasks.c.batch, tasks.c.position).limit(1))
-    connection.execute(update(jobs).where(jobs.c.id == job_id).values(**values))
-    return state
+    query = select(jobs.c.id, jobs.c.state.label("now"), jobs.c.finished, jobs.c.reason, *probes)
+    known = {row["id"]: row for row in connection.execute(query.where(jobs.c.id.in_(ids))).mappings()}
+    states: dict[str, State] = {}
+    for job in ids:
+        row = known.get(job)
+        found = [state for state in State if row is not None and row[state.value]]
+        state = states[job] = job_state(found)
+        if row is None:
+            continue
+        values: dict[str, Any] = {"state": state.value, "finished": None, "reason": None}
+        if state.is_final:
+            values["finished"] = connection.scalar(select(func.max(tasks.c.finished)).where(tasks.c.job_id == job))
+        if State.FAILED in found:
+            first = select(tasks.c.reason).where(tasks.c.job_id == job, tasks.c.state == State.FAILED.value)
+            values["reason"] = connection.scalar(first.order_by(tasks.c.batch, tasks.c.position).limit(1))
+        # Most often a job goes on as it was: then its row is left alone.
+        if values != {"state": row["now"], "finished": row["finished"], "reason": row["reason"]}:
+            connection.execute(update(jobs).where(jobs.c.id == job).values(**values))
+    return states

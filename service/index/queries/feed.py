@@ -76,7 +76,9 @@ class Feed:
             .limit(limit)
         )
         with self.database.reading() as connection:
-            return [_ready(row) for row in connection.execute(query).mappings()]
+            rows = connection.execute(query).mappings().all()
+        record = _record(rows[0]) if rows else None
+        return [_ready(row, record) for row in rows if record is not None]
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
         """Uploads to be checked, oldest first."""
@@ -144,8 +146,8 @@ def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
     return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
 
-def _ready(row: Any) -> ReadyTask:
-    record = JobRecord(
+def _record(row: Any) -> JobRecord:
+    return JobRecord(
         id=row["job_id"],
         request=row["request"],
         revisions=row["revisions"],
@@ -155,6 +157,9 @@ def _ready(row: Any) -> ReadyTask:
         lane=row["lane"],
         created=row["created"],
     )
+
+
+def _ready(row: Any, record: JobRecord) -> ReadyTask:
     task = PlannedTask(
         row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
     )

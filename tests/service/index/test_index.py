@@ -126,7 +126,7 @@ def test_a_database_that_cannot_be_opened_is_one_clear_line(tmp_path: Path) -> N
 def test_a_job_shows_progress_by_stage(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request(grasps=64, scenes=1))
     task = parts.index.jobs.tasks(job=job.id).items[0]
-    parts.index.live.set_running(task.id, "w")
+    parts.index.live.set_running({task.id: "w"})
     parts.index.live.set_progress({task.id: (1.0, 4.0, "descending")})
     shown = parts.index.jobs.get(job.id)
     assert shown.state is State.RUNNING
@@ -338,7 +338,7 @@ def build_a_history(parts: Parts) -> None:
     job_actions.cancel(parts, again.id)
     job_actions.retry(parts, again.id)
     running, _ = job_actions.submit(parts, request(seed=6))
-    parts.index.live.set_running(parts.index.jobs.tasks(job=running.id).items[0].id, "w")
+    parts.index.live.set_running({parts.index.jobs.tasks(job=running.id).items[0].id: "w"})
     shared, _ = job_actions.submit(parts, request(seed=2))
     run_all(parts, shared.id)
 
@@ -481,7 +481,7 @@ def test_text_that_a_database_would_refuse_stops_nothing(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request())
     task = parts.index.jobs.tasks(job=job.id).items[0]
     long = "w" * 200 + "\0"
-    parts.index.live.set_running(task.id, long)
+    parts.index.live.set_running({task.id: long})
     parts.index.live.set_progress({task.id: (1.0, 2.0, "half\0way")})
     assert parts.index.jobs.task(task.id).message == "halfway"
     attempt = AttemptRecord(

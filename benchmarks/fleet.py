@@ -1,0 +1,249 @@
+"""How many workers one keeper serves: real Redis, PostgreSQL, store and keeper, and workers that do no work.
+
+usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000] [--sqlite] [--json FILE]
+
+For each number of workers, two runs. First all of them hold tasks that end at --rate a second in all, beat and tell
+their progress: how old is the oldest event that is not in the index, and how long does it take to read all leases? Then
+their tasks take no time: how many a second come through keeper and index? Everything shares this machine, the workers
+too; the processor time of each part is counted beside its clock. What the workers do is in `benchmarks.fleet_workers`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import func, select
+
+from benchmarks.service_load import cpu_s, say
+from service.index.tables import tasks
+from service.model.domain import Lane, State
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.queue.rq_queue import EVENTS, RqQueue
+from service.run.embedded import server_command
+from service.settings import Settings
+from tests.fakes import add_assets, request
+from tests.servers import PostgresServer
+
+#: Batches of a job, as a dataset's cell of 3,200 grasps has them.
+_BATCHES_A_JOB: Final = 100
+_LOOK_EVERY_S: Final = 0.1
+#: A fleet that takes longer than this is not measured [s].
+_PATIENCE_S: Final = 240.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one number of workers came to."""
+
+    workers: int
+    lag_s: float
+    """Age of the oldest event that was not in the index: 95th of 100 looks."""
+    worst_lag_s: float
+    sweep_ms: float
+    """Median time in which all leases are read."""
+    tasks_per_s: float
+    keeper_ms: float
+    """Processor time of the keeper for a task."""
+    database_ms: float
+    redis_ms: float
+
+
+class Machine:
+    """The parts of a service without workers, each a process of its own."""
+
+    def __init__(self, settings: Settings, parts: Parts, pids: dict[str, int]) -> None:
+        self.settings, self.parts, self._pids = settings, parts, pids
+        self._seed = 0
+
+    @property
+    def queue(self) -> RqQueue:
+        assert isinstance(self.parts.queue, RqQueue)
+        return self.parts.queue
+
+    def submit(self, tasks: int) -> None:
+        """Jobs of so many tasks in all."""
+        while tasks > 0:
+            some = min(tasks, _BATCHES_A_JOB)
+            self._seed += 1
+            job_actions.submit(self.parts, request(grasps=32 * some, seed=self._seed), lane=Lane.BULK)
+            tasks -= some
+
+    def cpu(self) -> dict[str, float]:
+        """Processor time of each part so far, with its children [s]."""
+        return {name: _tree_cpu(pid) for name, pid in self._pids.items()}
+
+    def lag_s(self) -> float:
+        """Age of the oldest event that the keeper has not acknowledged."""
+        connection = self.queue.connection
+        groups = connection.xinfo_groups(EVENTS)
+        if not groups:
+            return 0.0
+        pending = connection.xpending(EVENTS, groups[0]["name"])
+        oldest = pending["min"]
+        if oldest is None:
+            after = connection.xrange(EVENTS, b"(" + groups[0]["last-delivered-id"], count=1)
+            oldest = after[0][0] if after else None
+        seconds, micros = connection.time()
+        return 0.0 if oldest is None else max(0.0, seconds + micros / 1e6 - int(oldest.split(b"-")[0]) / 1000)
+
+    def sweep_s(self) -> float:
+        """Time in which all leases are read."""
+        begun = time.perf_counter()
+        self.queue.leases()
+        return time.perf_counter() - begun
+
+
+@contextmanager
+def machine(*, sqlite: bool) -> Iterator[Machine]:
+    """A service of real processes that ends with the block."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspd-fleet-")))
+        options: dict[str, Any] = {"data_dir": folder, "log_level": "WARNING", "scrub_mb_per_s": 0.0, "lease_s": 20.0}
+        pids = {}
+        if not sqlite:
+            server = stack.enter_context(PostgresServer())
+            assert server.process is not None
+            options["index_url"], pids["database"] = server.url(), server.process.pid
+        settings = Settings(**options)
+        redis = _started(stack, server_command(settings), {})
+        parts = Parts.open(settings)
+        stack.callback(parts.close)
+        _wait(lambda: _answers(parts), "Redis answers")
+        add_assets(parts)
+        keeper = _started(stack, [sys.executable, "-m", "graspd", "keeper"], environment(settings))
+        _wait(lambda: parts.queue.announced("keeper"), "the keeper lives")
+        yield Machine(settings, parts, pids | {"redis": redis, "keeper": keeper})
+
+
+@contextmanager
+def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
+    """Workers that live for the block."""
+    with ExitStack() as stack:
+        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s)]
+        _started(stack, command, environment(settings))
+        yield
+
+
+def environment(settings: Settings) -> dict[str, str]:
+    """The settings as a process of its own takes them."""
+    given = {name: getattr(settings, name) for name in settings.model_fields_set}
+    plain = {name: value.get_secret_value() if hasattr(value, "get_secret_value") else str(value)
+             for name, value in given.items()}  # fmt: skip
+    return {f"GRASPD_{name.upper()}": value for name, value in plain.items()}
+
+
+def measure(workers: int, given: argparse.Namespace) -> Result:
+    """Both runs with one number of workers."""
+    with machine(sqlite=given.sqlite) as at:
+        task_s = workers / given.rate
+        at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
+        with fleet(at.settings, workers, task_s):
+            held = at.queue.connection
+            lists = [f"rq:wip:{lane.value}-synthesize" for lane in Lane]
+            _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
+            time.sleep(given.seconds / 2)
+            lags, sweeps = _looks(at, given.seconds)
+    with machine(sqlite=given.sqlite) as at:
+        at.submit(given.tasks)
+        before = at.cpu()
+        begun = time.perf_counter()
+        with fleet(at.settings, workers, 0.0):
+            _wait(lambda: _finished(at.parts) >= given.tasks, "all tasks are in the index")
+            seconds = time.perf_counter() - begun
+            spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
+    return Result(
+        workers=workers,
+        lag_s=statistics.quantiles(lags, n=20)[-1],
+        worst_lag_s=max(lags),
+        sweep_ms=1000 * statistics.median(sweeps),
+        tasks_per_s=given.tasks / seconds,
+        keeper_ms=spent["keeper"],
+        database_ms=spent.get("database", 0.0),
+        redis_ms=spent["redis"],
+    )
+
+
+def _looks(at: Machine, seconds: float) -> tuple[list[float], list[float]]:
+    lags, sweeps = [], []
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        for _ in range(9):
+            lags.append(at.lag_s())
+            time.sleep(_LOOK_EVERY_S)
+        sweeps.append(at.sweep_s())
+    return lags, sweeps
+
+
+def _finished(parts: Parts) -> int:
+    with parts.index.database.reading() as connection:
+        done = select(func.count()).select_from(tasks).where(tasks.c.state == State.SUCCEEDED.value)
+        return int(connection.scalar(done) or 0)
+
+
+def _answers(parts: Parts) -> bool:
+    try:
+        parts.queue.ping()
+    except Exception:
+        return False
+    return True
+
+
+def _started(stack: ExitStack, command: Sequence[str], environment: dict[str, str]) -> int:
+    # The benchmark itself may be run politely; what it measures must not be.
+    process = subprocess.Popen(command, env=os.environ | environment, stdout=subprocess.DEVNULL)
+    stack.callback(process.wait)
+    stack.callback(process.terminate)
+    return process.pid
+
+
+def _wait(met: Any, what: str) -> None:
+    end = time.monotonic() + _PATIENCE_S
+    while not met():
+        if time.monotonic() > end:
+            raise TimeoutError(f"after {_PATIENCE_S:g} s still not: {what}")
+        time.sleep(0.05)
+
+
+def _tree_cpu(pid: int) -> float:
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return cpu_s(pid) + sum(cpu_s(int(child)) for child in children)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workers", type=int, nargs="+", default=[64, 512, 4096])
+    parser.add_argument("--seconds", type=float, default=20.0, help="how long the lag is watched")
+    parser.add_argument("--rate", type=float, default=100.0, help="tasks that end a second while it is watched")
+    parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
+    parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
+    parser.add_argument("--json", type=Path, help="keep the figures there")
+    given = parser.parse_args()
+    say("| workers | lag of events, p95 | worst | lease sweep | tasks/s | keeper, of a task | database | Redis |")
+    say("| --: | --: | --: | --: | --: | --: | --: | --: |")
+    results = []
+    for workers in given.workers:
+        one = measure(workers, given)
+        results.append(one)
+        say(
+            f"| {workers:,} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
+            f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.database_ms:.1f} ms | {one.redis_ms:.1f} ms |"
+        )
+    if given.json:
+        given.json.write_text(json.dumps([asdict(one) for one in results], indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

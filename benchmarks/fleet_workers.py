@@ -1,0 +1,216 @@
+"""N workers in one process that do no work: Redis sees from them what it sees from real ones, at the same rates.
+
+usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the environment, as a worker has them)
+
+A worker that holds a task beats, tells its progress, and after `TASK_S` seconds puts the manifest of its shard and says
+that it finished. Manifests are those of one true shard under other names; the shard's own file, which no keeper reads,
+is not put. Commands of many workers share a pipeline: a thousand interpreters do not fit a machine that is to be
+measured, and Redis is asked as much.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import random
+import signal
+import sys
+import time
+import uuid
+import zlib
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Final
+
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import Lane, Stage, TaskMessage
+from service.model.version import PACKAGE_VERSION
+from service.queue.port import Event, EventKind, Report
+from service.queue.rates import beat_every_s, report_every_s
+from service.queue.reports import REPORTS
+from service.queue.rq_queue import (
+    EVENTS,
+    EVENTS_KEPT,
+    WORKERS,
+    RqQueue,
+    cancel_key,
+    encoded,
+    open_queue,
+    queue_name,
+    worker_key,
+)
+from service.settings import Settings
+from service.store.store import Store, open_store
+from tests.fakes import make_shard
+from worker.process.pulse import LEASE_KEPT_S
+
+_TICK_S: Final = 0.02
+_QUEUES: Final = tuple(queue_name(lane, Stage.SYNTHESIZE) for lane in Lane)
+
+
+@dataclass
+class Held:
+    """A task in hand."""
+
+    worker: str
+    message: dict[str, Any]
+    queue: str
+    entry: str
+    begun: float
+    ends: float
+
+    @property
+    def job_key(self) -> str:
+        return f"rq:job:{self.entry.partition(':')[0]}"
+
+
+class Fleet:
+    """Workers that take tasks from Redis and end them after a while."""
+
+    def __init__(self, queue: RqQueue, store: Store, *, workers: int, task_s: float, lease_s: float) -> None:
+        self._queue, self._store, self._connection = queue, store, queue.connection
+        self._task_s, self._lease_s = task_s, lease_s
+        self._beat_s, self._report_s = beat_every_s(workers, lease_s), report_every_s(workers)
+        self._idle = deque(f"fake-{number:05d}" for number in range(workers))
+        self._held: dict[str, Held] = {}
+        self._ends: list[tuple[float, str]] = []
+        now = time.monotonic()
+        self._beats = [(now + random.random() * self._beat_s, name) for name in self._idle]
+        heapq.heapify(self._beats)
+        self._news: list[tuple[float, str]] = []
+        self._template = ""
+        self._names: tuple[str, ...] = ()
+        self._pool = ThreadPoolExecutor(8)
+        self._first = True
+
+    def tick(self) -> None:
+        """All that is due."""
+        now = time.monotonic()
+        with self._connection.pipeline(transaction=False) as pipe:
+            self._end_due(pipe, now)
+            pipe.execute()
+            self._take(pipe, now)
+            self._beat_due(pipe, now)
+            self._tell_due(pipe, now)
+            pipe.execute()
+
+    def _end_due(self, pipe: Any, now: float) -> None:
+        due = []
+        while self._ends and self._ends[0][0] <= now:
+            due.append(self._held.pop(heapq.heappop(self._ends)[1]))
+        list(self._pool.map(self._publish, (held.message for held in due)))
+        for held in due:
+            pipe.zrem(f"rq:wip:{held.queue}", held.entry)
+            pipe.delete(f"rq:execution:{held.entry}", f"rq:executions:{held.entry.partition(':')[0]}", held.job_key)
+            self._say(pipe, held, EventKind.FINISHED, seconds=self._task_s, output=held.message["output"])
+            self._idle.append(held.worker)
+
+    def _take(self, pipe: Any, now: float) -> None:
+        for queue in _QUEUES:
+            if not self._idle or not (jobs := self._connection.lpop(f"rq:queue:{queue}", len(self._idle))):
+                continue
+            with self._connection.pipeline(transaction=False) as read:
+                for job in jobs:
+                    read.hget(b"rq:job:" + job, "data")
+                found = read.execute()
+            for job, data in zip(jobs, found, strict=True):
+                if data is not None:
+                    self._hold(pipe, job.decode(), json.loads(zlib.decompress(data))[2][0], queue, now)
+        self._first = self._first and not self._held
+
+    def _hold(self, pipe: Any, job: str, message: dict[str, Any], queue: str, now: float) -> None:
+        # The first tasks end evenly over the time of one: workers of a fleet do not work in step.
+        length = self._task_s * (random.random() if self._first else 1.0)
+        held = Held(self._idle.popleft(), message, queue, f"{job}:{uuid.uuid4().hex}", now, now + length)
+        self._held[held.worker] = held
+        heapq.heappush(self._ends, (held.ends, held.worker))
+        heapq.heappush(self._news, (now + random.random() * self._report_s, held.worker))
+        execution = f"rq:execution:{held.entry}"
+        pipe.hset(execution, mapping={"id": held.entry, "last_heartbeat": time.time(), "worker_name": held.worker})
+        pipe.expire(execution, LEASE_KEPT_S)
+        pipe.zadd(f"rq:executions:{job}", {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.zadd(f"rq:wip:{queue}", {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.hset(held.job_key, mapping={"status": "started", "worker_name": held.worker})
+        self._say(pipe, held, EventKind.STARTED)
+
+    def _beat_due(self, pipe: Any, now: float) -> None:
+        while self._beats[0][0] <= now:
+            name = heapq.heappop(self._beats)[1]
+            heapq.heappush(self._beats, (now + self._beat_s, name))
+            held = self._held.get(name)
+            pipe.set(worker_key(name), json.dumps(_beat(name, held)), ex=max(2, round(self._lease_s)))
+            pipe.sadd(WORKERS, name)
+            pipe.scard(WORKERS)
+            if held is not None:
+                pipe.zadd(f"rq:wip:{held.queue}", {held.entry: time.time() + LEASE_KEPT_S}, xx=True)
+                pipe.expire(f"rq:execution:{held.entry}", LEASE_KEPT_S)
+                pipe.expire(f"rq:executions:{held.entry.partition(':')[0]}", LEASE_KEPT_S)
+                pipe.zscore(f"rq:wip:{held.queue}", held.entry)
+                pipe.exists(cancel_key(held.message["task_id"]))
+
+    def _tell_due(self, pipe: Any, now: float) -> None:
+        while self._news and self._news[0][0] <= now:
+            name = heapq.heappop(self._news)[1]
+            if (held := self._held.get(name)) is not None:
+                report = Report(attempt=1, done=now - held.begun, total=self._task_s, message="pretending")
+                pipe.hset(REPORTS, held.message["task_id"], report.model_dump_json())
+                pipe.scard(WORKERS)
+                heapq.heappush(self._news, (now + self._report_s, name))
+
+    def _say(self, pipe: Any, held: Held, kind: EventKind, **facts: Any) -> None:
+        message = held.message
+        event = Event(
+            kind=kind,
+            at=timestamp(),
+            task_id=message["task_id"],
+            job_id=message["job_id"],
+            stage=message["stage"],
+            batch=message["batch"],
+            attempt=message["attempt"],
+            worker=held.worker,
+            **facts,
+        )
+        pipe.xadd(EVENTS, encoded(event), maxlen=EVENTS_KEPT, approximate=True)
+        if kind.ends_attempt:
+            pipe.hdel(REPORTS, held.message["task_id"])
+
+    def _publish(self, message: dict[str, Any]) -> None:
+        """Put the manifest of a task's shard."""
+        if not self._template:
+            task = TaskMessage.model_validate(message)
+            manifest = make_shard(open_store("memory://"), task)
+            self._template = manifest.model_dump_json()
+            self._names = (task.output, f'"batch":{task.batch},', f'"seed":{task.request.seed},')
+        output, batch, seed = self._names
+        text = self._template.replace(output, message["output"]).replace(batch, f'"batch":{message["batch"]},')
+        text = text.replace(seed, f'"seed":{message["request"]["seed"]},')
+        self._store.put(names.shard_manifest(Stage.SYNTHESIZE, message["output"]), text.encode())
+
+
+def _beat(name: str, held: Held | None) -> dict[str, Any]:
+    now = timestamp()
+    task = held.message["task_id"] if held else ""
+    return {"name": name, "host": "fleet", "pid": 1, "device": "cpu", "device_name": "none", "stages": ["synthesize"],
+            "version": PACKAGE_VERSION, "state": "busy" if held else "idle", "task_id": task, "started": now,
+            "seen": now}  # fmt: skip
+
+
+def main() -> None:
+    workers, task_s = int(sys.argv[1]), float(sys.argv[2])
+    settings = Settings()
+    fleet = Fleet(
+        open_queue(settings), open_store(settings.resolved_store_url), workers=workers, task_s=task_s,
+        lease_s=settings.lease_s,
+    )  # fmt: skip
+    ended: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
+    while not ended:
+        begun = time.monotonic()
+        fleet.tick()
+        time.sleep(max(0.0, _TICK_S - (time.monotonic() - begun)))
+
+
+if __name__ == "__main__":
+    main()
