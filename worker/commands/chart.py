@@ -118,6 +118,8 @@ def _in_scenes(
     from worker.studies.chart.scenes import scene_chart
 
     spec = parse_scene(scene)
+    if spec.neighbours:
+        raise InputError(f"{scene} has neighbours; the chart compares methods among supports alone: leave them out")
     # Every stable face of an object, where it is dropped.
     spec = spec if spec.target is not None else parse_scene(scene, faces="all")
 

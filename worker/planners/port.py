@@ -61,7 +61,7 @@ class Method:
     planner: Callable[[Any], Planner]
     """From the options to the planner."""
     in_scenes: bool = False
-    """Whether it plans grasps for the scenes they are in, or around floating objects only."""
+    """Whether it plans grasps for the scenes they are in, or around free objects only."""
     options: type[Options] = Options
     """The options it takes."""
     uses: tuple[str, ...] = ()

@@ -62,7 +62,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
     known = method(name)
     if in_scenes and not known.in_scenes:
         able = ", ".join(one for one in method_names() if method(one).in_scenes)
-        raise InputError(f"method {name} plans around floating objects only; in scenes choose {able}, or scene free")
+        raise InputError(f"method {name} plans around free objects only; in scenes choose {able}, or scene free")
     return known.planner(_options(name, options))
 
 

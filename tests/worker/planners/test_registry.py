@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import pytest
 
+from service.model.domain import FREE_ONLY_METHODS
 from service.model.errors import InputError
 from worker.planners import PLANNERS, method, method_names, planner, registry
 from worker.planners.port import Method
@@ -99,7 +100,8 @@ def test_the_page_names_every_method_with_all_its_options_and_defaults(name: str
         assert f"`{option}` ({field.default:g}" in row
 
 
-def test_a_method_that_plans_around_free_objects_is_refused_in_scenes() -> None:
-    with pytest.raises(InputError, match="autograsp plans around floating objects only; in scenes choose fast_graspd"):
-        planner("autograsp", in_scenes=True)
+@pytest.mark.parametrize("name", FREE_ONLY_METHODS)
+def test_a_method_that_plans_around_free_objects_is_refused_in_scenes(name: str) -> None:
+    with pytest.raises(InputError, match=f"{name} plans around free objects only; in scenes choose fast_graspd"):
+        planner(name, in_scenes=True)
     assert callable(planner("fast_graspd", in_scenes=True))

@@ -117,4 +117,4 @@ def test_a_method_for_free_objects_says_so(tmp_path: Path) -> None:
          str(tmp_path / "g.h5")],
     )  # fmt: skip
     assert result.exit_code == 2
-    assert "floating objects only" in result.output
+    assert "free objects only" in result.output
