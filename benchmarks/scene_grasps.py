@@ -38,6 +38,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.lifting import judge_lifts
 from worker.scenes.clearance import MARGIN_M
 from worker.scenes.kinds import rest_poses, supports_of
+from worker.scenes.trial import lift_trial
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 
@@ -64,10 +65,11 @@ def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, least: int, p
     count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
     wanted, run = Wanted(count, FIDELITY, SEED), Run(threads=1)
+    trial = lift_trial(hand, obj, lambda: pieces)
     # What a pair is made ready with once is none of a grasp's cost, on either side.
     for where in (placed.take(slice(0, 1)), None):
-        synthesize(hand, obj, Wanted(1, FIDELITY, SEED, placed=where), run)
-    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed), run))
+        synthesize(hand, obj, Wanted(1, FIDELITY, SEED, placed=where, trial=trial), run)
+    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, trial=trial), run))
     free, free_seconds = _timed(lambda: synthesize(hand, obj, wanted, run))
     found = _judged(hand, obj, planned, placed, pieces)
     filtered = _judged(hand, obj, free, placed, pieces)

@@ -21,7 +21,7 @@ from service.model.domain import BATCH_SIZE, JobOptions
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import Wanted, fitting_pairs, synthesize
+from worker.planners import Trial, Wanted, fitting_pairs, synthesize
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
@@ -32,6 +32,7 @@ from worker.quality.referee.protocol import DIRECTIONS
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
 from worker.run import ALONE, Run
+from worker.scenes.trial import lift_trial
 from worker.scenes.verdicts import lift_level, scene_verdicts
 from worker.simulation.surroundings import Scenes
 
@@ -176,6 +177,7 @@ class _Work:
         self.pieces: Future[ConvexPieces] | None = None
         self.scenes: Scenes | None = None
         self.tried = 0
+        self._trials: Trial | None = None
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
         self._run = run
         self._round_run = run.part(0.0, 1.0)
@@ -233,11 +235,21 @@ class _Work:
     def _level(self) -> Any:
         return self.request.referee
 
+    def _trial(self) -> Trial | None:
+        """What candidates go through in scenes, where there is a referee; the same one in all rounds."""
+        if self.scenes is None or self.pieces is None:
+            return None
+        if self._trials is None:
+            threads = self._run.cores if self._run.device.startswith("cuda") else 1
+            self._trials = lift_trial(self.hand, self.obj, self.pieces.result, threads=threads)
+        return self._trials
+
     def _round(self, number: int, size: int) -> _Round:
         request = self.request
         index = None if self.scenes is None else (self.tried + np.arange(size)) % len(self.scenes.object_pose)
         placed = self.scenes.placed(index) if self.scenes is not None and index is not None else None
-        wanted = Wanted(size, request.knobs, request.seed, self.batch + number * ROUND_STRIDE, placed)
+        number_of_batch = self.batch + number * ROUND_STRIDE
+        wanted = Wanted(size, request.knobs, request.seed, number_of_batch, placed, self._trial())
         planned = synthesize(
             self.hand, self.obj, wanted, self._part(0), method=request.method, options=request.options
         )  # fmt: skip

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from service.model.domain import Fidelity
@@ -14,6 +16,10 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.run import Run
 from worker.simulation.surroundings import Placed
+
+#: Scores (N,) of N grasps in their scenes: the smaller the better, below 1 good enough to look at no other candidate.
+#: Called by several threads at once.
+Trial = Callable[[GraspSet, Placed], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,9 @@ class Wanted:
     """Number of the batch among those of one seed."""
     placed: Placed | None = None
     """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
+    trial: Trial | None = None
+    """What several candidates of a grasp in a scene go through before one is chosen; None: the planner's own merit
+    chooses."""
 
 
 class Planner(Protocol):

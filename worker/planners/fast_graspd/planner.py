@@ -11,18 +11,18 @@ import warp as wp
 from numpy.typing import NDArray
 
 from service.model.domain import Fidelity
-from worker.grasps import GraspSet
+from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.candidates import tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.scene_starts import sample_scene_starts
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
-from worker.planners.fast_graspd.selection import best_of_each, merits, posture_of
+from worker.planners.fast_graspd.selection import best_of_each, merits, ranked
 from worker.planners.fast_graspd.starts import Probe, sample_starts
 from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.planners.port import Wanted
+from worker.planners.port import Trial, Wanted
 from worker.planners.threads import Steps, cut, run_parts
-from worker.quality.postures import pregrasp, squeeze
 from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.launches import Launches
@@ -47,6 +47,8 @@ class Part:
     state: HandState | None = None
     loss: Floats | None = None
     curve: list[float] | None = None
+    grasps: GraspSet | None = None
+    """With the postures around them, where a trial needed these."""
 
 
 def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
@@ -121,9 +123,22 @@ def _work(pair: Pair, part: Part, wanted: Wanted, steps: Steps) -> None:
     # Without iterations this only tells how deep each hand is.
     state, depths = Projection(fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
     if finalists > 1:
-        winners = best_of_each(merits(hand, obj, state, losses, depths), n, 1)
+        merit = merits(hand, obj, state, losses, depths)
+        if placed is not None and wanted.trial is not None:
+            trial = _stoppable(wanted.trial, steps)
+            winners, part.grasps = tried(hand, obj, state, losses, ranked(merit, n), placed, trial)
+        else:
+            winners = best_of_each(merit, n, 1)
         state, losses = state[winners], losses[winners]
     part.state, part.loss = state, losses
+
+
+def _stoppable(trial: Trial, steps: Steps) -> Trial:
+    def asked(grasps: GraspSet, placed: Placed) -> Floats:
+        steps(0, "trial")
+        return trial(grasps, placed)
+
+    return asked
 
 
 def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:
@@ -164,16 +179,14 @@ def grasps_of(
     hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float, placed: Placed | None = None
 ) -> GraspSet:
     """The parts of a batch as grasps with the postures around them."""
-    states = [part.state for part in parts if part.state is not None]
-    pivot, rotation, q = (np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q"))
-    grasp = posture_of(hand, obj, HandState(pivot, rotation, q))
     curves = [part.curve for part in parts if part.curve]
     curve = np.mean(curves, axis=0).round(5).tolist() if curves else []
-    return GraspSet(
-        grasp=grasp,
-        pregrasp=pregrasp(hand, obj, grasp, placed),
-        squeeze=squeeze(hand, obj, grasp),
-        stability_loss=np.concatenate([part.loss for part in parts if part.loss is not None]),
-        seconds=seconds,
-        info={"loss_curve": curve, "chunk": CHUNK},
-    )
+    known = [part.grasps for part in parts if part.grasps is not None]
+    if len(known) == len(parts):
+        grasps = joined(known)
+    else:
+        states = [part.state for part in parts if part.state is not None]
+        state = HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
+        loss = np.concatenate([part.loss for part in parts if part.loss is not None])
+        grasps = with_postures(hand, obj, state, loss, placed)
+    return replace(grasps, seconds=seconds, info={"loss_curve": curve, "chunk": CHUNK})

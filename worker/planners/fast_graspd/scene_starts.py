@@ -88,7 +88,7 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
         InputError: a scene leaves no way to the object, or not one draw of any start came within 10 mm of being clear.
     """
     hand, obj = model.hand.model, model.obj.model
-    probe = Probe(model, len(indices) * each * len(RETREATS), room=ROOM)
+    probe = Probe(model, len(indices) * each, room=ROOM)
     ways = [free_ways(scene, obj) for scene in placed.scenes]
     openings = [Openings.of(oppositions_of(hand), obj, scene) for scene in placed.scenes]
     scene = np.repeat(placed.index, each)
@@ -106,8 +106,7 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
             break
         reach = reaching[rows] & (number < REACHES)
         states = around.draws(uniform[rows, number], normal[rows, number], scene[rows], reach)
-        probe.data.set_scenes(np.repeat(scene[rows], len(RETREATS)))
-        found = probe.depths(states).reshape(len(rows), len(RETREATS))
+        found = _depths(probe, states, scene[rows])
         # The nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
@@ -127,6 +126,22 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
             "around it leaves no room"
         )
     return best
+
+
+def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp]) -> Floats:
+    """(n, len(RETREATS)) depths [m] of hands in scenes (n,), from the farthest distance inwards for as long as it is
+    clear; inf nearer than that.
+
+    Most draws fail for what no retreat mends, and hardly any can be clear nearer than where it is not.
+    """
+    found, left = np.full((len(scene), len(RETREATS)), np.inf), np.arange(len(scene))
+    for k in reversed(range(len(RETREATS))):
+        probe.data.set_scenes(scene[left])
+        found[left, k] = probe.depths(states[left * len(RETREATS) + k])
+        left = left[found[left, k] <= CLEAR]
+        if not len(left):
+            break
+    return found
 
 
 @dataclass(frozen=True)

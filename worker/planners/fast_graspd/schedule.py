@@ -40,15 +40,21 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
 
 
 def in_scene(fidelity: Fidelity) -> Fidelity:
-    """The fidelity of grasps in scenes: obstacles leave fewer good approaches, so more hands set out, a shorter way
-    each, and only the best goes on. Coarse iterations are cheap against what follows them."""
+    """The fidelity of grasps in scenes: obstacles leave fewer good approaches, and how well a hand balances is hard to
+    tell before it is seated, so more hands set out and more go on, a shorter way each."""
     return fidelity.model_copy(
         update={
-            "starts": min(4 * fidelity.starts, 64),
-            "finalists": 1,
-            "coarse_iterations": -(-3 * fidelity.coarse_iterations // 5),
+            "starts": min(3 * fidelity.starts, 64),
+            "finalists": min(3 * fidelity.finalists, 64),
+            "coarse_iterations": _share(fidelity.coarse_iterations, 0.5),
+            "fine_iterations": _share(fidelity.fine_iterations, 0.375),
+            "polish_iterations": _share(fidelity.polish_iterations, 0.6),
         }
     )
+
+
+def _share(iterations: int, share: float) -> int:
+    return int(np.ceil(share * iterations))
 
 
 def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats:

@@ -41,9 +41,13 @@ def merits(hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, 
     return merit
 
 
-def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
-    """Rows of the `keep` best hands of each grasp; the hands of a grasp lie side by side."""
+def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
+    """(grasps, each) rows of the hands of each grasp, the best first; the hands of a grasp lie side by side."""
     each = merit.reshape(grasps, -1)
     # A stable sort: hands of equal merit are taken in the order in which they set out.
-    order = np.sort(np.argsort(each, axis=1, kind="stable")[:, :keep], axis=1)
-    return (order + np.arange(grasps)[:, None] * each.shape[1]).ravel()
+    return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]
+
+
+def best_of_each(merit: Floats, grasps: int, keep: int) -> NDArray[np.intp]:
+    """Rows of the `keep` best hands of each grasp, in the order in which they set out."""
+    return np.sort(ranked(merit, grasps)[:, :keep], axis=1).ravel()

@@ -26,11 +26,12 @@ from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners import Wanted, method, synthesize
+from worker.planners import Trial, Wanted, method, synthesize
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.lifting import judge_lifts
 from worker.scenes.kinds import rest_poses, supports_of
+from worker.scenes.trial import lift_trial
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 from worker.studies.bench import device_name
@@ -135,9 +136,10 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: Place) -> Row:
     used, note = 0.0, ""
     counts = dict.fromkeys(SHARES, 0)
     try:
-        _planned(setting, hand, obj, _first(placed), way, warm=True)
+        trial = lift_trial(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
+        _planned(setting, hand, obj, _first(placed), trial, warm=True)
         began = time.process_time()
-        grasps = _planned(setting, hand, obj, placed, way)
+        grasps = _planned(setting, hand, obj, placed, trial)
         used = time.process_time() - began
         counts = _judged(hand, place, grasps, placed)
     except InputError as error:
@@ -152,11 +154,12 @@ def _first(placed: Placed) -> Placed:
 
 
 def _planned(
-    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, way: str, *, warm: bool = False
+    setting: Setting, hand: HandModel, obj: ObjectModel, placed: Placed, trial: Trial | None, *, warm: bool = False
 ) -> GraspSet:
+    """Grasps that are planned in the scenes with a trial, or around a free object without."""
     options = {**setting.options, **(setting.warm if warm else {})}
     wanted = Wanted(
-        len(placed.index), setting.knobs, WARM_SEED if warm else SEED, placed=placed if way == IN_SCENE else None
+        len(placed.index), setting.knobs, WARM_SEED if warm else SEED, placed=placed if trial else None, trial=trial
     )
     return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
 
