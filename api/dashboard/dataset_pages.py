@@ -16,6 +16,7 @@ from api.access.auth import NotYours
 from api.catalog.assets import Assets
 from api.catalog.datasets import Datasets
 from api.catalog.jobs import Jobs
+from api.dashboard.expected import listed
 from api.dashboard.figures import matrix
 from api.dashboard.form_uploads import asset_choices
 from api.dashboard.forms import first_message
@@ -32,6 +33,16 @@ MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 _MAX_FIELDS: Final = 4000
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
+
+#: Fields of the form of a dataset, and what stands there at first.
+_MAKE: Final = {
+    "name": "",
+    "grasps": "320",
+    "fidelity": "standard",
+    "scene": "free",
+    "faces": "drawn",
+    "neighbours": "",
+}
 
 router = APIRouter(prefix="/datasets", include_in_schema=False)
 
@@ -118,10 +129,11 @@ def act(request: Request, name: str, action: str, datasets: DatasetsOf) -> Redir
 
 
 def _create(request: Request, datasets: Datasets, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
-    form = {key: str(fields[key]) for key in ("name", "grasps", "fidelity") if fields.get(key)}
+    form = {key: str(fields[key]) for key in _MAKE if fields.get(key)}
     wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
+    beside = {"neighbours": listed(form.get("neighbours", ""))}
     try:
-        dataset = datasets.create(DatasetRequest.model_validate(wanted))
+        dataset = datasets.create(DatasetRequest.model_validate(wanted | beside))
     except (ValidationError, InputError) as error:
         message = first_message(error) if isinstance(error, ValidationError) else str(error)
         return _overview(request, datasets, assets, problem=message, form=wanted, status=422)
@@ -239,7 +251,7 @@ def _overview(
         hands=hands,
         objects=objects,
         fidelities=OFFERED,
-        form={"name": "", "grasps": "320", "fidelity": "standard", "hands": [], "objects": []} | (form or {}),
+        form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
         did=_did(request),
     )

@@ -111,6 +111,13 @@ def _making(contents: Contents, tally: Tally) -> Row:
         "levels": _said(tally, "verdict_level"),
         "verdict_keys": len(tally.values.get("verdict_key", {})),
         "scenes": sorted({str(_knobs(text).get("kind", "")) for text in _said(tally, "scene")} - {"", "free"}),
+        "neighbours": sorted(
+            {
+                str(one.get("object", ""))
+                for text in _said(tally, "scene")
+                for one in _knobs(text).get("neighbours") or ()
+            }
+        ),
         "wants": _said(tally, "want"),
         "seeds": _said(tally, "seed"),
         "friction": _said(tally, "mu"),

@@ -88,7 +88,8 @@ def _summary(card: Row, plots: Mapping[str, str]) -> str:
 
 
 def _places(making: Row) -> str:
-    return f" in scenes ({' and '.join(making['scenes'])})" if making["scenes"] else ""
+    beside = f" beside {', '.join(making['neighbours'])}" if making.get("neighbours") else ""
+    return f" in scenes ({' and '.join(making['scenes'])}{beside})" if making["scenes"] else ""
 
 
 def _composition(card: Row) -> str:
@@ -153,9 +154,9 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
         f"penetration at most {gates.MAX_PENETRATION_MM:g} mm, self-penetration at most "
         f"{gates.MAX_SELF_PENETRATION_MM:g} mm, at least {gates.MIN_CONTACT_LINKS} links in contact"
     )
-    if (scenes := card["making"]["scenes"]) and card["making"]["levels"]:
+    if card["making"]["scenes"] and card["making"]["levels"]:
         text = (
-            f"Grasps were planned in scenes ({' and '.join(scenes)}) and are valid there: MuJoCo brings the hand in "
+            f"Grasps were planned{_places(card['making'])} and are valid there: MuJoCo brings the hand in "
             "along its approach, where it must touch nothing, closes it, lifts the object 10 cm out of the scene and "
             "holds it. "
             f"They also pass the geometric gate: {gate}.{_hard(card)}"

@@ -100,6 +100,16 @@ def test_a_dataset_without_a_hand_is_explained_and_what_was_typed_stays(http: Te
     assert 'value="7"' in answer.text
 
 
+def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, parts: Parts) -> None:
+    form = {"name": "clutter", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], "neighbours": "block, bottle"}
+    page = http.post("/datasets", data=form | {"scene": "table"}).text
+    assert "on a table beside block, bottle" in page
+    assert [one.object for one in parts.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
+    wrong = http.post("/datasets", data=form | {"name": "afloat"})
+    assert wrong.status_code == 422 and "neighbours stand in a scene" in wrong.text
+    assert 'value="block, bottle"' in wrong.text
+
+
 def test_cells_of_one_state_are_a_list(http: TestClient, parts: Parts) -> None:
     wanted = DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug", "block"]})
     actions.create(parts, wanted)

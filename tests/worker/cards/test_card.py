@@ -157,11 +157,11 @@ def test_a_dataset_without_scenes_has_a_card(tmp_path: Path) -> None:
 
 
 def test_the_card_of_a_dataset_in_scenes_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
-    made = case(tmp_path, drawn=False, scene="bin", views=0)
+    made = case(tmp_path, drawn=False, scene="bin", neighbours=("mug",), views=0)
     try:
-        assert made.card["making"]["scenes"] == ["bin"]
+        assert (made.card["making"]["scenes"], made.card["making"]["neighbours"]) == (["bin"], ["mug"])
         assert made.card["validity"]["lift_hard"]["share"] == pytest.approx(0.5, abs=0.02)
-        assert "valid grasps in scenes (bin) of 2 robot hands" in made.page
+        assert "valid grasps in scenes (bin beside mug) of 2 robot hands" in made.page
         assert "At half the friction 50 % of them lift too." in made.page
         # What is said of free grasps is not said of these.
         assert "planned around a free object" not in made.page and "clearance of the table (no scenes)" not in made.page
