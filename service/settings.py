@@ -65,6 +65,9 @@ class Settings(BaseSettings):
         1.0, ge=0, description="how fast the keeper reads through the store for damage [MiB/s]; 0: never"
     )
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
+    heartbeat_file: Path | None = Field(
+        None, description="file that a keeper or worker touches while it lives, for health checks; unset: none"
+    )
     log_level: str = Field("INFO", description="DEBUG, INFO, WARNING or ERROR")
     log_format: Literal["auto", "json", "text"] = Field(
         "auto", description="log lines; auto: text on a terminal, else json"

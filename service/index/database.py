@@ -164,11 +164,28 @@ def _engine(url: str) -> Engine:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":
             return _sqlite_engine(url, parsed.database)
-        return create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
+        return _postgres_engine(url)
     except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
         raise InputError(
             f"the index URL cannot be used ({_line(error)}); give sqlite:///PATH or postgresql+psycopg://..."
         ) from None
+
+
+def _postgres_engine(url: str) -> Engine:
+    engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
+
+    # Before SQLAlchemy looks at the connection: it cannot read what a database of SQL_ASCII says, which comes as bytes.
+    @event.listens_for(engine, "connect", insert=True)
+    def _is_utf8(connection: Any, _record: Any) -> None:
+        info = getattr(connection, "info", None)
+        encoding = info.parameter_status("server_encoding") if info is not None else "UTF8"
+        if encoding != "UTF8":
+            raise InputError(
+                f"the database of the index has encoding {encoding}, and names need UTF-8; make one by "
+                f"`createdb --encoding UTF8 --template template0 {info.dbname}`"
+            )
+
+    return engine
 
 
 def _sqlite_engine(url: str, database: str | None) -> Engine:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from service.heartbeat_file import HeartbeatFile
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.clock import timestamp
@@ -60,6 +61,7 @@ class Keeper:
         self._news = False
         """Whether anything came in since the queue was filled."""
         self._started = False
+        self._alive = HeartbeatFile(parts.settings.heartbeat_file)
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
@@ -94,6 +96,8 @@ class Keeper:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
+            # Also while a part is away: a fresh keeper would wait for it just as long.
+            self._alive.touch()
             try:
                 self.round(wait_s=self._parts.settings.keeper_interval_s)
                 pause = 0.0
@@ -172,7 +176,7 @@ class Keeper:
 
     def _make_whole(self) -> None:
         log.warning("the index may lack what the store has: it is made from the store")
-        rebuild(self._parts.index, self._parts.store)
+        rebuild(self._parts.index, self._parts.store, progress=lambda *_: self._alive.touch())
 
     def _index_assets(self) -> None:
         for kind, digest in stored_assets(self._parts.store):

@@ -116,12 +116,29 @@ def test_the_engine_is_not_in_the_image_of_the_front_door() -> None:
     assert "all" not in re.findall(r"\.\[([\w,]+)\]", steps)[0].split(",")
 
 
-def test_the_sources_come_after_the_dependencies() -> None:
-    for name in ("build-api", "build-worker"):
-        body = stages()[name]
-        install = next(i for i, (_, rest) in enumerate(body) if "--constraint" in rest)
-        sources = [i for i, (keyword, rest) in enumerate(body) if keyword == "COPY" and "service" in rest]
-        assert all(i > install for i in sources)
+@pytest.mark.parametrize("room", ["api", "worker"])
+def test_dependencies_and_code_are_layers_of_their_own(room: str) -> None:
+    assert [keyword for keyword, rest in stages()[f"build-{room}"] if keyword == "COPY"] == [], "no code among them"
+    image = stages()["api" if room == "api" else "worker-cpu"]
+    layers = [rest for keyword, rest in image if keyword == "COPY"]
+    assert layers == [f"--from=build-{room} /opt/graspd /opt/graspd", f"--from=code-{room} /code /opt/graspd"]
+    version = re.search(r"python:(\d+\.\d+)", DOCKERFILE.read_text())
+    assert version is not None
+    assert dict(inherited(f"code-{room}"))["ENV"] == f"CODE=/code/lib/python{version[1]}/site-packages"
+
+
+def test_no_image_asks_a_hub_for_how_to_build_it() -> None:
+    assert not re.search(r"^#\s*syntax=", DOCKERFILE.read_text(), re.MULTILINE)
+
+
+def test_any_user_of_group_0_may_write_the_two_folders() -> None:
+    assert "-g 0 -m 0770 /var/lib/graspd /var/cache/graspd" in " ".join(rest for _, rest in stages()["base"])
+
+
+def test_a_health_check_starts_no_command_of_ours() -> None:
+    for image in IMAGES:
+        assert "graspd worker" not in last(image, "HEALTHCHECK") and '"graspd"' not in last(image, "HEALTHCHECK")
+    assert "GRASPD_HEARTBEAT_FILE=/tmp/graspd-alive" in " ".join(rest for _, rest in inherited("worker-cpu"))
 
 
 @pytest.mark.parametrize("name", sorted(name for name, service in SERVICES.items() if "build" in service))

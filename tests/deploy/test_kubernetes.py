@@ -23,7 +23,9 @@ from tests.deploy import keda
 from tests.deploy.composition import SERVICES, seconds
 
 FOLDER = REPOSITORY / "docker" / "kubernetes"
-VARIANTS = ("fixed-cpu", "keda-cpu", "keda-gpu")
+VARIANTS = ("fixed-cpu", "fixed-gpu", "keda-cpu", "keda-gpu")
+#: What health checks run: a look at the age of a file, no process of ours.
+AGE_OF_THE_FILE = 'test -n "$(find "$GRASPD_HEARTBEAT_FILE" -mmin -1)"'
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
 COMMANDS = {name for name, *_ in graspd.cli.COMMANDS}
 Document = dict[str, Any]
@@ -216,14 +218,44 @@ def test_the_probes_are_routes_and_checks_that_exist() -> None:
             probe = container.get(kind, {})
             if "httpGet" in probe:
                 assert probe["httpGet"]["path"] in routes
-            elif probe and probe["exec"]["command"][0] == "graspd":
-                assert probe["exec"]["command"][1:] in (["keeper", "--check"], ["worker", "--check"])
+            elif probe and container["image"].startswith("graspd-"):
+                assert probe["exec"]["command"][-1] == AGE_OF_THE_FILE
 
 
 def test_the_api_is_not_restarted_because_a_part_is_away() -> None:
     (api,) = [container for name, container in containers() if name == "api"]
     assert api["livenessProbe"]["httpGet"]["path"] == "/healthz"
     assert api["readinessProbe"]["httpGet"]["path"] == "/readyz"
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _ in pods()} - {"api", "redis"}))
+def test_a_keeper_or_worker_that_stands_still_is_started_again(name: str) -> None:
+    for found, container in containers():
+        if found == name:
+            assert container["livenessProbe"]["periodSeconds"] * container["livenessProbe"]["failureThreshold"] >= 60
+            assert container["startupProbe"]["failureThreshold"] * container["startupProbe"]["periodSeconds"] >= 300
+
+
+def test_every_kind_of_worker_has_a_disruption_budget() -> None:
+    budgets = [found["spec"] for found in documents("PodDisruptionBudget")]
+    for kind in ("Deployment", "ScaledJob"):
+        for found in documents(kind):
+            name = found["metadata"]["name"]
+            if not name.startswith("worker"):
+                continue
+            own = [b for b in budgets if b["selector"]["matchLabels"] == {"app.kubernetes.io/name": name}]
+            assert own
+            # Kubernetes takes no share of pods that have no size to take it of.
+            assert kind == "Deployment" or any(isinstance(budget.get("minAvailable"), int) for budget in own)
+
+
+def test_identities_of_the_cloud_are_opened_by_name_only() -> None:
+    policies = {found["metadata"]["name"]: found["spec"] for found in documents("NetworkPolicy")}
+    opened = policies["to-identity"]["egress"]
+    blocks = [to["ipBlock"]["cidr"] for rule in opened for to in rule["to"]]
+    assert all(block.startswith("169.254.") and block.endswith("/32") for block in blocks)
+    component = yaml.safe_load((FOLDER / "cloud-identity" / "kustomization.yaml").read_text())
+    assert component["kind"] == "Component", "nobody gets it unasked"
 
 
 def test_everything_is_shut_until_a_policy_opens_it() -> None:

@@ -9,6 +9,8 @@ import threading
 
 import warp as wp
 
+from worker.engines.kernel_cache import kernel_cache
+
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
 _lock = threading.Lock()
 _started = False
@@ -21,6 +23,8 @@ def start() -> None:
         if _started:
             return
         wp.config.log_level = 30
+        if folder := kernel_cache():
+            wp.config.kernel_cache_dir = str(folder)
         sys.stderr.flush()
         kept = os.dup(2)
         with tempfile.TemporaryFile() as caught:

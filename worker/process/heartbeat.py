@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from service.model.worker_beat import WorkerBeat
@@ -52,10 +53,10 @@ class Hold:
 class Heartbeat:
     """Keeps a worker's registration and the lease of its task alive, and listens for cancellation."""
 
-    def __init__(self, url: str, beat: WorkerBeat, *, lease_s: float) -> None:
-        """`url` is that of Redis."""
+    def __init__(self, url: str, beat: WorkerBeat, *, lease_s: float, alive: Path | None = None) -> None:
+        """`url` is that of Redis; `alive` a file that is touched with each beat."""
         self._beat = asdict(beat)
-        self._place = place_of(beat.name, lease_s) | {"url": url}
+        self._place = place_of(beat.name, lease_s) | {"url": url, "alive": str(alive or "")}
         self._hold: Hold | None = None
         self._limit: dict[str, Any] | None = None
         self._lock = threading.RLock()

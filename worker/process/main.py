@@ -285,7 +285,9 @@ def run_worker(
     device = Device(settings.device)
     store = open_store(settings.resolved_store_url)
     queue.ping()
-    heart = Heartbeat(redis_url(settings), _first_beat(name, device, stages), lease_s=settings.lease_s)
+    heart = Heartbeat(
+        redis_url(settings), _first_beat(name, device, stages), lease_s=settings.lease_s, alive=settings.heartbeat_file
+    )
     if table is None:
         table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
     fitness = Fitness(store, check)

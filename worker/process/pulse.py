@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from redis.exceptions import RedisError
 
+from service.heartbeat_file import HeartbeatFile
 from service.model.clock import timestamp
 from service.queue.connection import connect
 from service.queue.rates import beat_every_s
@@ -42,9 +43,9 @@ _WITHOUT_TASKS: Final = ("checking", "quarantined")
 class Pulse:
     """Beats for one worker.
 
-    `place` names the keys (`worker`, `workers`, `events`), `events_kept` and `lease_s`. What the worker is at: `beat`
-    is what its registration says; `limit` names a piece of work that must end (`id`, `seconds`); `hold` is the lease of
-    a task (`entry`, and the keys `registry`, `execution`, `executions`, `cancel`).
+    `place` names the keys (`worker`, `workers`, `events`), `events_kept`, `lease_s`, and the file `alive`, if there is
+    one. What the worker is at: `beat` is what its registration says; `limit` names a piece of work that must end (`id`,
+    `seconds`); `hold` is the lease of a task (`entry`, and the keys `registry`, `execution`, `executions`, `cancel`).
     """
 
     def __init__(
@@ -184,6 +185,7 @@ def run(parent: int) -> None:
     place, *found = found
     connection = connect(place["url"], patience=0, timeout_s=_ANSWER_S)
     pulse = Pulse(connection, place, tell=_say, end_worker=lambda why: _end(parent, why))
+    alive = HeartbeatFile(Path(place["alive"]) if place.get("alive") else None)
     last, due, away = -_SHORTEST_INTERVAL_S, 0.0, False
     while True:
         if found:
@@ -194,13 +196,13 @@ def run(parent: int) -> None:
         if time.monotonic() >= due:
             last = time.monotonic()
             due = last + pulse.interval_s
-            away = _beat(pulse, parent, away)
+            away = _beat(pulse, parent, alive, away)
         found = lines.read(due - time.monotonic())
     if pulse.leaves or pulse.is_without_tasks:
         pulse.leave()
 
 
-def _beat(pulse: Pulse, parent: int, was_away: bool) -> bool:
+def _beat(pulse: Pulse, parent: int, alive: HeartbeatFile, was_away: bool) -> bool:
     """One beat, unless the worker is stopped; returns whether Redis was away, which is said once."""
     if is_stopped(parent):
         return was_away
@@ -211,6 +213,7 @@ def _beat(pulse: Pulse, parent: int, was_away: bool) -> bool:
             _complain(f"no sign of life could be given: {error}")
         return True
     finally:
+        alive.touch()
         _say(".")
     return False
 

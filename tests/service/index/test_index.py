@@ -500,3 +500,10 @@ def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server:
     with pytest.raises(InputError, match="cannot hold"), index.database.writing() as connection:
         connection.execute(tables.workers.insert().values(name="x" * 999))
     index.close()
+
+
+@pytest.mark.postgres
+def test_a_database_of_another_encoding_is_refused_with_the_mend(postgres_server: PostgresServer) -> None:
+    postgres_server._ask("CREATE DATABASE plain ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C' TEMPLATE template0")
+    with pytest.raises(InputError, match=r"encoding SQL_ASCII.*createdb --encoding UTF8 --template template0 plain"):
+        Index(postgres_server.url("plain"))

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -204,3 +205,13 @@ def test_the_first_reason_to_stop_stands(context: TaskContext) -> None:
     context.stop(StopReason.SHUTDOWN)
     context.stop(StopReason.LEASE_LOST)
     assert context.stop_reason is StopReason.SHUTDOWN
+
+
+def test_a_worker_that_beats_touches_its_file(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> None:
+    file = tmp_path / "alive"
+    heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S, alive=file)
+    heart.start()
+    try:
+        until(file.exists, "the file is touched")
+    finally:
+        heart.stop()

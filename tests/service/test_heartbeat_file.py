@@ -1,0 +1,70 @@
+"""A file whose age tells health checks whether a keeper or a worker lives."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service.heartbeat_file import HeartbeatFile
+from service.model.errors import QueueUnavailable
+from service.pipeline.backends import Parts
+from service.pipeline.keeper import Keeper
+from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
+
+
+def is_healthy(file: Path) -> bool:
+    """What the health checks of the images say."""
+    command = ["sh", "-c", AGE_OF_THE_FILE]
+    done = subprocess.run(
+        command, env={**os.environ, "GRASPD_HEARTBEAT_FILE": str(file)}, capture_output=True, check=False
+    )
+    return done.returncode == 0
+
+
+def until(met: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20.0
+    while not met():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "alive"
+    assert not is_healthy(file)
+    HeartbeatFile(file).touch()
+    assert is_healthy(file)
+    long_ago = time.time() - 200
+    os.utime(file, (long_ago, long_ago))
+    assert not is_healthy(file)
+
+
+def test_a_keeper_lives_also_while_redis_is_away(parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: object) -> None:
+        raise QueueUnavailable("Redis does not answer")
+
+    file = tmp_path / "alive"
+    settings = parts.settings.model_copy(update={"heartbeat_file": file, "scrub_mb_per_s": 0.0})
+    monkeypatch.setattr(parts.queue, "depths", away)
+    stop = threading.Event()
+    thread = threading.Thread(target=Keeper(Parts(settings, parts.store, parts.index, parts.queue)).run, args=(stop,))
+    thread.start()
+    try:
+        until(file.exists)
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_a_file_that_cannot_be_touched_is_said_once_and_ends_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    alive = HeartbeatFile(tmp_path / "absent" / "alive")
+    alive.touch()
+    alive.touch()
+    assert len(caplog.records) == 1
