@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: gpu-check help install demo test test-slow check format browser screenshots docs pins audit clean
+.PHONY: dist gpu-check help install demo test test-slow check format browser screenshots docs pins audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
@@ -49,6 +49,10 @@ docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills (no GPU needed)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,gpu-check]'
 	$(BIN)/python -m benchmarks.gpu_check
+
+dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources; see docs/release.md
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,release]'
+	$(BIN)/python docker/dist.py dist
 
 pins: $(STAMP) ## versions that the images install: those of .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel]'
