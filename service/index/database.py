@@ -177,9 +177,8 @@ def _postgres_engine(url: str) -> Engine:
     # Before SQLAlchemy looks at the connection: it cannot read what a database of SQL_ASCII says, which comes as bytes.
     @event.listens_for(engine, "connect", insert=True)
     def _is_utf8(connection: Any, _record: Any) -> None:
-        info = getattr(connection, "info", None)
-        encoding = info.parameter_status("server_encoding") if info is not None else "UTF8"
-        if encoding != "UTF8":
+        info = getattr(connection, "info", None)  # other drivers than psycopg have none
+        if info is not None and (encoding := info.parameter_status("server_encoding")) != "UTF8":
             raise InputError(
                 f"the database of the index has encoding {encoding}, and names need UTF-8; make one by "
                 f"`createdb --encoding UTF8 --template template0 {info.dbname}`"
