@@ -1,20 +1,23 @@
-"""docs/python.md and the notebook, run as they are printed, beside a service."""
+"""docs/python.md, the notebook and what of docs/hands.md needs a service, run as they are printed, beside one."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.conftest import REPOSITORY
+from tests.worker.hands.my_hand import write_my_hand
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +50,25 @@ def test_the_notebook_runs(environment: dict[str, str], tmp_path: Path) -> None:
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     run("\n".join(["import matplotlib; matplotlib.use('Agg')", *cells]), environment, tmp_path)
     assert (tmp_path / "grasps.h5").is_file()
+
+
+def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[str, str], tmp_path: Path) -> None:
+    write_my_hand(tmp_path)
+    page = (REPOSITORY / "docs" / "hands.md").read_text()
+    lines = "".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL)).replace("\\\n", " ").splitlines()
+    for line in lines:
+        program, *arguments = shlex.split(line, comments=True) or ["", ""]
+        if program != "graspd" or arguments[:2] == ["hands", "check"]:
+            continue
+        done = subprocess.run(
+            [sys.executable, "-m", "graspd", *arguments], capture_output=True, text=True, check=False, env=environment,
+            cwd=tmp_path,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr[-2000:]
+    (curl,) = [shlex.split(line) for line in lines if line.startswith("curl ")]
+    url = next(part for part in curl if part.startswith("http"))
+    body = json.loads(curl[curl.index("-d") + 1])
+    with httpx.Client(base_url=environment["GRASPD_API_URL"], trust_env=False) as http:
+        answer = http.post(httpx.URL(url).path, json=body)
+        assert answer.status_code == 202, answer.text
+        assert http.get("/v1/jobs", params={"hand": "my_hand"}).json()["items"][0]["state"] == "succeeded"

@@ -1,43 +1,70 @@
-"""Every command of "Hands as they come" in docs/hands.md does what it says."""
+"""Every `graspd hands check` of docs/hands.md does what it says; tests/front/test_docs.py runs what needs a service."""
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import shlex
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from tests.worker.hands.mjcfs import FOUR_BAR
-from tests.worker.hands.test_packages import package
-from tests.worker.hands.test_roots import humanoid
+from tests.conftest import REPOSITORY
+from tests.worker.hands.my_hand import asset_json_of, write_all
+from worker.rendering.pages import portraits
+from worker.studies import hand_self_test
 
-DOCS = Path(__file__).parents[3] / "docs" / "hands.md"
-SECTION = DOCS.read_text().partition("## Hands as they come")[2].partition("\n## ")[0]
-COMMANDS = re.findall(r"^graspd (hands check [^#\n]*)", SECTION, re.MULTILINE)
+PAGE = (REPOSITORY / "docs" / "hands.md").read_text()
+BLOCKS = "".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).replace("\\\n", " ")
+LINES = [line for line in BLOCKS.splitlines() if line.strip()]
+COMMANDS = [line for line in LINES if line.startswith("graspd hands check ")]
+#: Pictures are as large, and self-tests as long, as it takes to see that they are made.
+SMALL = (68, 72)
+FEW = 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("reader")
+    write_all(made)
+    return made
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_documented_command_accepts_its_hand(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    urdf = package(tmp_path / "my_description", "../meshes/finger.stl", manifest=True, urdf="urdf/my_hand.urdf")
-    (urdf.parent / "my_hand.urdf.xacro").write_text(
-        urdf.read_text().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ', 1).replace(
-            '<link name="palm">', '<link name="$(arg side)_frame"/><joint name="f" type="fixed"><parent link="'
-            '$(arg side)_frame"/><child link="palm"/></joint><link name="palm">',
-        )
-    )  # fmt: skip
-    (urdf.parent / "other.urdf").write_text("<robot/>")
-    (tmp_path / "my_model").mkdir()
-    (tmp_path / "my_model" / "hand.xml").write_text(FOUR_BAR)
-    (tmp_path / "my_robot.urdf").write_bytes(humanoid("left", "right"))
-    told = CliRunner().invoke(build(), [*shlex.split(command), "--json"])
+def test_a_documented_command_accepts_its_hand(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(portraits, "SIZE", SMALL)
+    monkeypatch.setattr(hand_self_test, "self_test", functools.partial(hand_self_test.self_test, grasps=FEW))
+    arguments = shlex.split(command, comments=True)[1:]
+    told = CliRunner().invoke(build(), [*arguments, "--json"])
     report = json.loads(told.stdout.splitlines()[-1])
     assert told.exit_code == 0 and report["verdict"] == "accept", report["message"]
+    if "--picture" in arguments:
+        with Image.open(folder / arguments[arguments.index("--picture") + 1]) as picture:
+            assert picture.width == 3 * SMALL[0]
+    if "--self-test" in arguments:
+        assert report["self_test"]["n"] == FEW and report["self_test"]["gsr"] > 0
+    if "--root" in arguments:
+        assert report["facts"]["root"] == arguments[arguments.index("--root") + 1]
+    if "--palm" in arguments:
+        assert report["facts"]["preshape"]["joint_12.0"] == 1.2 and "palm" not in report["facts"]["guessed"]
 
 
-def test_the_section_has_its_commands() -> None:
-    assert len(COMMANDS) >= 5
+def test_the_page_has_its_commands_and_all_of_them_are_run() -> None:
+    with_a_service = ("graspd hands add ", "graspd submit ", "curl ", "benchmarks/first_grasp.sh ")
+    assert len(COMMANDS) >= 9
+    assert [line for line in LINES if line not in COMMANDS and not line.startswith(with_a_service)] == []
+
+
+def test_what_is_written_and_the_example_of_asset_json_have_the_same_keys(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(folder)
+    command = ["hands", "check", "my_hand/my_hand.urdf", "--write", str(tmp_path / "asset.json")]
+    assert CliRunner().invoke(build(), command).exit_code == 0
+    written = json.loads((tmp_path / "asset.json").read_text())
+    assert set(written) - {"root"} <= set(asset_json_of(PAGE))
