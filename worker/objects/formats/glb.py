@@ -1,4 +1,4 @@
-"""GLB (binary glTF 2.0): triangles of all meshes of the scene, in the scene's frame and metres."""
+"""GLB (binary glTF 2.0): triangles of all meshes of the scene, in the scene's frame and metres, and their colours."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from service.model.errors import MeshError
 from service.model.transforms import quat_to_matrix
+from worker.objects.formats.glb_colours import material_colour
 from worker.objects.formats.soup import Soup, check_face_count
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
@@ -22,20 +23,26 @@ def read(data: bytes) -> Soup:
     document, binary = _chunks(data)
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
+    colours: list[np.ndarray] = []
+    looks: dict[tuple[int, int], np.ndarray] = {}
     total = 0
     for mesh, matrix in _instances(document):
-        for primitive in _list(document, "meshes")[mesh]["primitives"]:
+        for part, primitive in enumerate(_list(document, "meshes")[mesh]["primitives"]):
             points, triangles = _primitive(document, binary, primitive)
             if np.linalg.det(matrix[:3, :3]) < 0:
                 triangles = triangles[:, ::-1]
             faces.append(triangles + sum(map(len, vertices)))
             vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+            if (mesh, part) not in looks:
+                looks[mesh, part] = material_colour(document, binary, primitive)
+            colours.append(np.tile(looks[mesh, part], (len(triangles), 1)))
             total += len(triangles)
             check_face_count(total)
             check_face_count(sum(map(len, vertices)) // 3)
     if not faces:
         raise MeshError("the mesh has no faces; export a scene with a mesh")
-    return Soup(np.concatenate(vertices), np.concatenate(faces))
+    known = np.concatenate(colours)
+    return Soup(np.concatenate(vertices), np.concatenate(faces), None if np.isnan(known).all() else known)
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: positions and polygons; texture, normals, groups and materials are passed over."""
+"""Wavefront OBJ: positions, colours of vertices, polygons; textures, normals, groups, materials are passed over."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ import numpy as np
 from service.model.errors import MeshError
 from worker.objects.formats.soup import Soup, check_face_count, fan
 
+_SHADES = 8
+_NO_COLOUR = [b"nan", b"nan", b"nan"]
+
 
 def read(data: bytes) -> Soup:
-    """Polygons cut into fans; negative indices count from the latest vertex."""
+    """Polygons cut into fans; negative indices count from the latest vertex. A face has its corners' mean colour."""
     vertices: list[list[bytes]] = []
+    shades: list[list[bytes]] = []
     corners: list[int] = []
     counts: list[int] = []
     for line in _lines(data):
         if line.startswith(b"v "):
-            vertices.append(line.split(None, 4)[1:4])
-            if len(vertices[-1]) < 3:
+            numbers = line.split(None, 7)[1:7]
+            vertices.append(numbers[:3])
+            shades.append(numbers[3:] if len(numbers) == 6 else _NO_COLOUR)
+            if len(numbers) < 3:
                 raise MeshError(f"vertex {len(vertices)} has fewer than three coordinates")
         elif line.startswith(b"f "):
             # OBJ counts from 1, backwards from the end where the index is negative.
@@ -28,7 +34,17 @@ def read(data: bytes) -> Soup:
             if len(counts) % 65536 == 0:
                 check_face_count(len(corners) - 2 * len(counts))
     points = np.array(vertices, dtype="S40").astype(float).reshape(-1, 3)
-    return Soup(points, fan(np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64)))
+    faces = fan(np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64))
+    return Soup(points, faces, _face_colours(shades, faces))
+
+
+def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | None:
+    """(F, 3), NaN where a corner has none. In a few steps: each colour is a part to be drawn."""
+    if all(shade is _NO_COLOUR for shade in shades) or (faces >= len(shades)).any() or (faces < 0).any():
+        return None
+    known = np.array(shades, dtype="S40").astype(float).reshape(-1, 3)
+    mean = known[faces].mean(axis=1)
+    return np.where(np.isfinite(mean), np.clip(np.round(_SHADES * mean) / _SHADES, 0, 1), np.nan)
 
 
 def _index(text: bytes, count: int) -> int:
