@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.selection import posture_of, ranked
 from worker.planners.port import Trial
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
+
+#: Hands of each grasp that are seated and tried before the others are: seating costs as much as a trial.
+FIRST: Final = 2
+#: Score of what has none.
+HOPELESS: Final = 1e9
 
 
 def with_postures(
@@ -25,40 +34,81 @@ def with_postures(
     return GraspSet(grasp, pregrasp(hand, obj, grasp, placed), squeeze(hand, obj, grasp), losses)
 
 
+@dataclass(frozen=True)
+class Seated:
+    """Hands after the fine phase, those of a grasp side by side."""
+
+    state: HandState
+    losses: Floats
+    """L_stable of each."""
+    merit: Floats
+    """The smaller the better."""
+
+
+Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Seated]
+"""Seats the hands of some grasps (n,): rows (n, each) of the hands that set out."""
+
+
+@dataclass
+class Taken:
+    """What is taken of each of n grasps so far; nothing where `score` is inf."""
+
+    state: HandState
+    losses: Floats
+    score: Floats
+    grasps: dict[int, GraspSet]
+
+    @classmethod
+    def none(cls, count: int, dofs: int) -> Taken:
+        empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
+        return cls(empty, np.zeros(count), np.full(count, np.inf), {})
+
+    def joined(self) -> GraspSet:
+        """The grasps in their order."""
+        return joined([self.grasps[k] for k in range(len(self.score))])
+
+
 def tried(
-    hand: HandModel,
-    obj: ObjectModel,
-    state: HandState,
-    losses: Floats,
-    order: NDArray[np.intp],
-    placed: Placed,
-    trial: Trial,
-) -> tuple[NDArray[np.intp], GraspSet]:
+    hand: HandModel, obj: ObjectModel, order: NDArray[np.intp], seat: Seat, placed: Placed, trial: Trial
+) -> Taken:
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
+
+    The first `FIRST` of each grasp are seated and tried in the order of their merit, then, of grasps that have none
+    yet, the others.
 
     Args:
         hand: the hand.
         obj: the object.
-        state: all hands.
-        losses: L_stable of each.
-        order: (n, each) rows of the hands of each grasp, the first to be tried first.
+        order: (n, each) rows of the hands of each grasp, the most promising first.
+        seat: seats hands.
         placed: scenes of the n grasps.
         trial: gives the scores.
-
-    Returns:
-        Rows (n,) of the hands that were taken, and their grasps.
     """
-    count = len(order)
-    least, taken = np.full(count, np.inf), np.array(order[:, 0])
-    kept: dict[int, GraspSet] = {}
-    left = np.arange(count)
-    for rows in order.T:
-        found = with_postures(hand, obj, state[rows[left]], losses[rows[left]], placed.take(left))
-        score = trial(found, placed.take(left))
-        for k in np.flatnonzero(score < least[left]):
-            grasp = int(left[k])
-            kept[grasp], least[grasp], taken[grasp] = found.take(slice(k, k + 1)), score[k], rows[grasp]
-        left = left[~(least[left] < 1.0)]
-        if not len(left):
+    taken, left = Taken.none(len(order), hand.dofs), np.arange(len(order))
+    for wave in np.split(order, [FIRST], axis=1):
+        if not len(left) or not wave.shape[1]:
             break
-    return taken, joined([kept[grasp] for grasp in range(count)])
+        seated = seat(wave[left], left)
+        for rows in ranked(seated.merit, len(left)).T:
+            open_ = ~(taken.score[left] < 1.0)
+            if not open_.any():
+                break
+            _try(hand, obj, seated, rows[open_], left[open_], placed, trial, taken)
+        left = left[~(taken.score[left] < 1.0)]
+    return taken
+
+
+def _try(
+    hand: HandModel, obj: ObjectModel, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp],
+    placed: Placed, trial: Trial, taken: Taken,
+) -> None:  # fmt: skip
+    """One hand each (k,) of the grasps `which` (k,)."""
+    state, losses, scenes = seated.state[rows], seated.losses[rows], placed.take(which)
+    found = with_postures(hand, obj, state, losses, scenes)
+    score = np.nan_to_num(trial(found, scenes), nan=HOPELESS, posinf=HOPELESS)
+    for k in np.flatnonzero(score < taken.score[which]):
+        grasp = int(which[k])
+        taken.grasps[grasp] = found.take(slice(k, k + 1))
+        taken.score[grasp], taken.losses[grasp] = score[k], losses[k]
+        for name in ("pivot", "rotation", "q"):
+            getattr(taken.state, name)[grasp] = getattr(state, name)[k]

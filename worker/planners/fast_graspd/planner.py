@@ -14,7 +14,7 @@ from service.model.domain import Fidelity
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.candidates import tried, with_postures
+from worker.planners.fast_graspd.candidates import Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.scene_starts import sample_scene_starts
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
@@ -26,6 +26,7 @@ from worker.planners.threads import Steps, cut, run_parts
 from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.launches import Launches
+from worker.simulation.model import Model
 from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.projection import Projection, ProjectionOptions
 from worker.simulation.state import HandState
@@ -107,30 +108,55 @@ def _work(pair: Pair, part: Part, wanted: Wanted, steps: Steps) -> None:
     launches = pair.iteration(coarse, data, fidelity.optimizer, patience=0)
     state = _descend(launches, data, n * fidelity.starts, fidelity.coarse_iterations, steps, "coarse", part.curve)
     losses = _losses(data, state)
+    order = np.arange(n * fidelity.starts).reshape(n, -1)
     if finalists < fidelity.starts:
         merit = merits(hand, obj, state, losses)
         if placed is not None:
             merit += hindrance(coarse, state, np.repeat(placed.index, fidelity.starts))
-        chosen = best_of_each(merit, n, finalists)
-        state, losses = state[chosen], losses[chosen]
-    data = _in_scenes(Data(fine, n * finalists), placed, finalists)
-    data.set_schedule(fine_schedule(fidelity))
-    data.set_state(state)
-    launches = pair.iteration(fine, data, fidelity.optimizer, patience=fidelity.patience)
-    state = _descend(launches, data, n * finalists, fidelity.fine_iterations, steps, "fine", part.curve)
-    if fidelity.fine_iterations:
-        losses = _losses(data, state)
-    # Without iterations this only tells how deep each hand is.
-    state, depths = Projection(fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
-    if finalists > 1:
-        merit = merits(hand, obj, state, losses, depths)
-        if placed is not None and wanted.trial is not None:
-            trial = _stoppable(wanted.trial, steps)
-            winners, part.grasps = tried(hand, obj, state, losses, ranked(merit, n), placed, trial)
-        else:
-            winners = best_of_each(merit, n, 1)
-        state, losses = state[winners], losses[winners]
-    part.state, part.loss = state, losses
+        order = ranked(merit, n)[:, :finalists]
+    seats = _Seats(pair, fine, fidelity, state, losses, placed, steps, part.curve)
+    if finalists > 1 and placed is not None and wanted.trial is not None:
+        taken = tried(hand, obj, order, seats.seated, placed, _stoppable(wanted.trial, steps))
+        part.state, part.loss, part.grasps = taken.state, taken.losses, taken.joined()
+        return
+    seated = seats.seated(np.sort(order, axis=1), np.arange(n))
+    winners = best_of_each(seated.merit, n, 1) if finalists > 1 else np.arange(n)
+    part.state, part.loss = seated.state[winners], seated.losses[winners]
+
+
+@dataclass
+class _Seats:
+    """The fine phase and the projection of hands that set out."""
+
+    pair: Pair
+    fine: Model
+    fidelity: Fidelity
+    state: HandState
+    losses: Floats
+    placed: Placed | None
+    steps: Steps
+    curve: list[float]
+    """Goes on with the loss of the first that are seated."""
+
+    def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Seated:
+        """Hands `rows` (k, each) of the grasps `which` (k,) of this part."""
+        fidelity, flat = self.fidelity, rows.ravel()
+        state, losses = self.state[flat], self.losses[flat]
+        placed = self.placed.take(which) if self.placed is not None else None
+        data = _in_scenes(Data(self.fine, len(flat)), placed, rows.shape[1])
+        data.set_schedule(fine_schedule(fidelity))
+        data.set_state(state)
+        launches = self.pair.iteration(self.fine, data, fidelity.optimizer, patience=fidelity.patience)
+        curve, self.curve = self.curve, []
+        state = _descend(launches, data, len(flat), fidelity.fine_iterations, self.steps, "fine", curve)
+        if fidelity.fine_iterations:
+            losses = _losses(data, state)
+        # Without iterations this only tells how deep each hand is.
+        state, depths = Projection(self.fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
+        if rows.shape[1] == 1:
+            return Seated(state, losses, np.zeros(len(flat)))
+        hand, obj = self.pair.hand.model, self.pair.fine.obj.model
+        return Seated(state, losses, merits(hand, obj, state, losses, depths))
 
 
 def _stoppable(trial: Trial, steps: Steps) -> Trial:
