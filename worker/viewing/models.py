@@ -14,7 +14,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.probe import Probe, probe_of
-from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
+from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids, without_visuals
 from worker.scenes.neighbours import Neighbours
 
 #: Points of the hand whose distance from the object is shown, where it is less than this [m].
@@ -43,16 +43,31 @@ class Models:
         self.thing = scene.add_frame("/grasp/object", show_axes=False)
         scene.add_mesh_simple("/grasp/object/mesh", obj.vertices, obj.faces, color=_OBJECT, flat_shading=True)
         self._drawn = drawn_bodies(hand)
-        self.bodies = [self._body(k, body) for k, body in enumerate(self._drawn)]
+        self.bodies = self._nodes(hand, "hand")
+        bare = without_visuals(hand)
+        #: The hand as the engine sees it, where it looks otherwise.
+        self._bare = drawn_bodies(bare) if hand.visuals.meshes else []
+        self.collisions = self._nodes(bare, "collision") if self._bare else []
+        self.show_collision(False)
         self.contacts: Any = None
         self._around: list[Any] = []
 
-    def _body(self, number: int, body: int) -> Any:
-        solid = hand_solids(self._hand)[number]
-        colour = tuple(round(255 * _srgb(part)) for part in hand_looks(self._hand)[number].base)
-        return self._scene.add_mesh_simple(
-            f"/grasp/hand/{number}", solid.vertices, solid.faces, color=colour, flat_shading=True
-        )
+    def _nodes(self, hand: HandModel, name: str) -> list[Any]:
+        nodes = []
+        for number, (solid, look) in enumerate(zip(hand_solids(hand), hand_looks(hand), strict=True)):
+            colour = tuple(round(255 * _srgb(part)) for part in look.base)
+            path = f"/grasp/{name}/{number}"
+            nodes.append(
+                self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
+            )
+        return nodes
+
+    def show_collision(self, on: bool) -> None:
+        """Whether the hand is drawn by its collision shapes, where it has other looks."""
+        if self.collisions:
+            for nodes, shown in ((self.bodies, not on), (self.collisions, on)):
+                for node in nodes:
+                    node.visible = shown
 
     def surround(self, supports: Supports, object_pose: Floats, neighbours: Neighbours | None, number: int) -> None:
         """Build the scene anew around an object at a pose (7,); `number` is the scene's, of the neighbours' poses."""
@@ -87,7 +102,7 @@ class Models:
     def pose(self, point: Waypoint, *, contacts: bool) -> Floats:
         """Take a posture; the distances (P,) of the hand's points from the object [m], at most the probe's reach."""
         (bodies,) = body_poses(self._hand, point.hand_pose[None], point.joint_positions[None])
-        for node, body in zip(self.bodies, self._drawn, strict=True):
+        for node, body in zip([*self.bodies, *self.collisions], [*self._drawn, *self._bare], strict=True):
             _place(node, bodies[body])
         self.thing.position = point.carried
         # The probe's object stays where it rests.

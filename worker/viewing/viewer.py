@@ -119,6 +119,7 @@ class Viewer:
             place = float(self.slider.value)
             distance = self.models.pose(point_at(self._way, place), contacts=bool(self._contacts.value))
             self.models.show_scene(bool(self._scene.value))
+            self.models.show_collision(bool(self._collision.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())
             self._said.content = f"**{_doing(self._way, place)}**: {touching} points of the hand within 1 mm, " + (
                 f"deepest {-least:.2f} mm inside"
@@ -159,11 +160,12 @@ class Viewer:
         self._said = gui.add_markdown("")
         self._contacts = gui.add_checkbox("contacts", True)
         self._scene = gui.add_checkbox("scene", True, visible=bool(self._supports))
+        self._collision = gui.add_checkbox("collision shapes", False, visible=bool(self.models.collisions))
         self._figures = gui.add_markdown("")
         turn.on_click(lambda event: self.step(1 if event.target.value == "next" else -1))
         choice.on_update(lambda event: self.choose(str(event.target.value)))
         play.on_click(lambda _: self.play())
-        for control in (self.slider, self._contacts, self._scene):
+        for control in (self.slider, self._contacts, self._scene, self._collision):
             control.on_update(lambda _: self.show())
 
     def _load(self) -> None:

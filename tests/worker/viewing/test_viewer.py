@@ -19,9 +19,10 @@ from typer.testing import CliRunner
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import quat_from_axis_angle
 from service.store.shards import Shard, json_attribute, write_shard
+from tests.worker.hands.urdfs import BOX, joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.hands.kinematics import body_poses
-from worker.hands.load import hand_from_path
+from worker.hands.load import hand_from_path, load_hand
 from worker.objects.prepare import object_from_path
 from worker.rendering.hands import drawn_bodies
 
@@ -182,3 +183,27 @@ def test_the_file_that_is_no_shard_is_one_line(tmp_path: Path):
     result = CliRunner().invoke(app, [str(file)])
     assert result.exit_code == 2
     assert "grasps.h5 is not a readable HDF5 file" in result.output
+
+
+def test_collision_shapes_take_the_place_of_what_the_hand_looks_like() -> None:
+    from worker.viewing.viewer import Shown, Viewer
+
+    seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'
+    hand = load_hand(
+        {"h.urdf": robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))}, name="h", digest=""
+    )
+    block = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
+    made = Viewer(
+        Shown(Shard("base", {"hand": "h", "object": "block", "scene": SCENE}, arrays(1)), hand, block), port=0
+    )
+    try:
+        assert [node.visible for node in made.models.bodies] == [True, True]
+        assert [node.visible for node in made.models.collisions] == [False, False]
+        made._collision.value = True
+        made.show()
+        assert [node.visible for node in made.models.bodies] == [False, False]
+        assert [node.visible for node in made.models.collisions] == [True, True]
+        for looks, shape in zip(made.models.bodies, made.models.collisions, strict=True):
+            np.testing.assert_allclose(looks.position, shape.position)
+    finally:
+        made.close()
