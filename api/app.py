@@ -9,7 +9,6 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from fastapi.routing import iter_route_contexts
 from fastapi.staticfiles import StaticFiles
 
 from api import problems
@@ -74,23 +73,17 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     problems.install(app, problem_page)
-    for routes in (jobs, grasps, shards, system, hand_corrections):
-        app.include_router(routes.router)
-    for router in (*map(asset_router, AssetKind), *datasets.routers):
-        app.include_router(router)
+    plain = (jobs, grasps, shards, system, hand_corrections)
+    routers = [*(routes.router for routes in plain), *map(asset_router, AssetKind)]
     pages.install(app, opened)
+    for router in (*routers, *datasets.routers, *pages.routers):
+        # As they were built when imported: `include_router` would build each of them again, at the first request, and
+        # silence warnings meanwhile, for the whole process and so not safely where two applications build at once.
+        app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    _build_routes(app)
     _add_middleware(app, settings, keys, rates)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
-
-
-def _build_routes(app: FastAPI) -> None:
-    """Build what FastAPI would build at the first request. It silences warnings meanwhile, for the whole process and so
-    not safely where two applications build at once; and the first request should wait for nothing."""
-    for _ in iter_route_contexts(app.routes):
-        pass
 
 
 def check_exposure(host: str, keys: KeyFile) -> None:

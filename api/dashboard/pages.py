@@ -19,16 +19,18 @@ from service.model.errors import ERRORS
 from service.pipeline.backends import Parts
 
 router = APIRouter(include_in_schema=False)
+#: Those of all pages, in the order in which they are asked.
+routers: Final = (
+    *(part.router for part in (service_pages, job_pages, grasp_pages, hand_pages, dataset_pages, forms, session)),
+    router,
+)
 
 
 def install(app: FastAPI, parts: Parts) -> None:
-    """Add the pages to the application."""
+    """What the pages need of the application, besides their routes."""
     app.state.templates = environment()
     app.state.pictures = Pictures(parts.store)
     app.state.expectations = Expectations(parts.index)
-    for part in (service_pages, job_pages, grasp_pages, hand_pages, dataset_pages, forms, session):
-        app.include_router(part.router)
-    app.include_router(router)
 
 
 @router.get("/events", dependencies=[Depends(may_read)], response_class=EventSourceResponse)

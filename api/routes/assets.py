@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from threading import BoundedSemaphore
 from typing import Annotated, Final
 
@@ -29,6 +30,7 @@ _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 
+@cache
 def asset_router(kind: AssetKind) -> APIRouter:
     """The routes of one kind of asset."""
     router = APIRouter(prefix=f"/v1/{kind.value}s", tags=[f"{kind.value}s"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,15 +24,26 @@ __all__ = ["redis_server", "rq_queue"]
 BASE_URL = "http://127.0.0.1:8000"
 
 
+@pytest.fixture(scope="session")
+def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with the built-in hands and objects in store and index; each test gets a copy."""
+    folder = tmp_path_factory.mktemp("furnished") / "data"
+    made = Settings(data_dir=folder)
+    opened = Parts(made, open_store(made.resolved_store_url), Index(made.resolved_index_url), MemoryQueue())
+    add_builtins(opened)
+    opened.close()
+    return folder
+
+
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     return Settings(data_dir=tmp_path / "data")
 
 
 @pytest.fixture
-def parts(settings: Settings) -> Iterator[Parts]:
+def parts(settings: Settings, furnished: Path) -> Iterator[Parts]:
+    shutil.copytree(furnished, settings.data_dir, dirs_exist_ok=True)
     opened = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
-    add_builtins(opened)
     yield opened
     opened.close()
 

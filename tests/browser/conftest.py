@@ -17,9 +17,9 @@ from fastapi import FastAPI
 from api.server import bind
 from service.run.supervisor import Supervisor
 from service.settings import Settings
-from tests.api.conftest import app, parts, settings
+from tests.api.conftest import app, furnished, parts, settings
 
-__all__ = ["app", "parts", "settings"]
+__all__ = ["app", "furnished", "parts", "settings"]
 
 #: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
 ARGUMENTS = (

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from service.index.index import Index
 from service.model.errors import QueueUnavailable
 from service.pipeline.backends import Parts
 from service.queue.address import redis_url
@@ -19,6 +18,7 @@ from service.run.embedded import server_command
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 
 
@@ -61,7 +61,7 @@ def rq_queue(redis_server: str) -> Iterator[RqQueue]:
 def parts(tmp_path: Path) -> Iterator[Parts]:
     """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`."""
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
-    index = Index(settings.resolved_index_url)
+    index = empty_index(settings.resolved_index_url)
     made = Parts(settings, open_store("memory://"), index, MemoryQueue())
     add_assets(made)
     yield made

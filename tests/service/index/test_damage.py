@@ -28,6 +28,7 @@ from service.store.records import add_job_event, put_record, read_record
 from service.store.store import open_store
 from tests.damage import overwrite
 from tests.fakes import add_assets, make_shard, message_for, request
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 
 GOOD = 3
@@ -38,7 +39,7 @@ DAMAGED = b'{"x": 1}'
 def parts(tmp_path: Path) -> Iterator[Parts]:
     """A service on files with some jobs."""
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
-    index = Index(settings.resolved_index_url)
+    index = empty_index(settings.resolved_index_url)
     made = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
     add_assets(made)
     for seed in range(GOOD):

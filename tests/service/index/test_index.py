@@ -35,6 +35,7 @@ from service.settings import Settings
 from service.store.records import put_record, read_record
 from service.store.store import Store, open_store
 from tests.fakes import add_assets, make_shard, request
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 
@@ -50,7 +51,7 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture
 def index(index_url: str) -> Iterator[Index]:
-    made = Index(index_url)
+    made = empty_index(index_url)
     yield made
     made.close()
 

@@ -13,6 +13,7 @@ from sqlalchemy import insert
 from service.index.filters import GraspFilter
 from service.index.index import Index
 from service.index.tables import METRICS, grasps, shards
+from tests.indexes import empty_index
 
 COUNT = 500
 BINS = 12
@@ -25,7 +26,7 @@ def values() -> np.ndarray:
 
 @pytest.fixture
 def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
-    opened = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    opened = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     plain = dict.fromkeys(METRICS) | {
         "shard_id": "a" * 32,
         "hand": "h",

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from service.index.index import Index
 from service.index.rebuild import differences
 from service.model import names
 from service.model.domain import State
@@ -24,6 +23,7 @@ from service.store.manifests import ShardManifest, load_manifest, load_shard
 from service.store.store import open_store
 from tests.damage import cut, flip, overwrite, remove
 from tests.fakes import add_assets, fake_stages, request
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
@@ -35,7 +35,7 @@ SHARDS = 6
 def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
     url = request.getfixturevalue("s3_url") if request.param == "s3" else (tmp_path / "store").as_uri()
     settings = Settings(data_dir=tmp_path, store_url=url, retry_backoff_s=0.0)
-    made = Parts(settings, open_store(url), Index(settings.resolved_index_url), MemoryQueue())
+    made = Parts(settings, open_store(url), empty_index(settings.resolved_index_url), MemoryQueue())
     add_assets(made)
     yield made
     made.close()

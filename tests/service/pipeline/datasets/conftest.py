@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from pydantic import SecretStr
 
-from service.index.index import Index
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 from tests.service.pipeline.datasets.makers import add_asset
@@ -36,7 +36,7 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
 
 def _service(folder: Path, url: str) -> Iterator[Parts]:
     settings = Settings(data_dir=folder, retry_backoff_s=0.0, index_url=SecretStr(url))
-    made = Parts(settings, open_store("memory://"), Index(url), MemoryQueue())
+    made = Parts(settings, open_store("memory://"), empty_index(url), MemoryQueue())
     add_assets(made)
     for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
         add_asset(made, kind, name)
