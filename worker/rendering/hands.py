@@ -11,12 +11,12 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from service.model.colours import hexadecimal, linear
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.hands.robot import Ints
 from worker.hands.visuals import NO_VISUALS, VisualMesh
 from worker.objects.normals import corner_normals
-from worker.rendering.palette import hexadecimal, linear
 from worker.rendering.scenery import Look, Solid
 
 _HAND: Final = Look(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from service.model.colours import Colour, linear
 from worker.hands.check import model_facts
 from worker.hands.model import Floats, HandModel, JointType
 from worker.hands.pads import pads_of
@@ -21,9 +22,6 @@ from worker.hands.visuals import VisualMesh, lighter
 from worker.objects.glb_document import Document, plain
 from worker.objects.model import ObjectModel
 from worker.objects.normals import corner_normals
-from worker.rendering.palette import linear
-
-Colour = tuple[float, float, float]
 
 #: Points on the hand from which a viewer measures its distance to the object.
 SURFACE_POINTS: Final = 3000

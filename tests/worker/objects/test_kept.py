@@ -19,7 +19,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 
 #: Two balls in one another: a repair to remember.
-BALLS = stl(join(sphere(), sphere(at=(0.02, 0.0, 0.0))))
+BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +63,7 @@ def test_whatever_it_follows_from_makes_another_entry(made: list[float], monkeyp
     load(stl(box()))
     load(stl(box()), error=1e-3)
     load(stl(box()), scale_to=0.08)
-    load(stl(sphere()))
+    load(stl(sphere(segments=24)))
     monkeypatch.setattr(kept, "revision", lambda: "another")
     load(stl(box()))
     assert len(made) == 5

@@ -32,7 +32,7 @@ UPLOAD_BYTES = 64 * 2**20
 BOUND_S = 30.0
 #: Children at a time: as many as the smallest machine has cores.
 TOGETHER = 2
-BALL = stl(sphere())
+BALL = stl(sphere(segments=24))
 PLY_POINT = "property float x\nproperty float y\nproperty float z\n"
 PLY_FACE = "property list uchar int vertex_indices\n"
 

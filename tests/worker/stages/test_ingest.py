@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -136,3 +137,12 @@ def test_a_cancelled_check_ends_its_child(context: TaskContext, monkeypatch: pyt
     with pytest.raises(TaskCancelled):
         ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
     assert not Path(f"/proc/{pids[0]}").exists()
+
+
+def test_a_check_loads_no_engine() -> None:
+    """It would cost four seconds of computing for every upload, and memory of the child's limit."""
+    code = "import sys, worker.stages.ingest, worker.hands.check, worker.objects.check, worker.stages.models\n"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}print(*sys.modules)"], capture_output=True, text=True, check=True
+    )
+    assert not {"warp", "newton", "mujoco"} & set(done.stdout.split())

@@ -19,7 +19,7 @@ from worker.stages import prepared
 from worker.stages.prepared import prepared_object
 
 #: Two balls in one another: a repair to remember.
-FILES = {"asset.json": b'{"file": "m.stl"}', **stl(join(sphere(), sphere(at=(0.02, 0.0, 0.0))))}
+FILES = {"asset.json": b'{"file": "m.stl"}', **stl(join(sphere(segments=32), sphere(segments=32, at=(0.02, 0.0, 0.0))))}
 DIGEST = digest_files(AssetKind.OBJECT, FILES)
 
 

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.colours import hexadecimal
 from service.model.transforms import IDENTITY_POSE, apply, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -15,7 +16,6 @@ from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import Cameras, intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
 from worker.rendering.kernels import CATCHER
-from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
 from worker.rendering.tracer import Tracer
 

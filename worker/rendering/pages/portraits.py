@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from service.model.colours import hexadecimal
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_from_matrix
 from worker.hands.guess import posture
@@ -32,7 +33,6 @@ from worker.rendering.pages.pictures import (
     TOWARD_LAMP,
     fit_camera,
 )
-from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Look, Shot, Solid
 from worker.rendering.tracer import Tracer
 

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.colours import hexadecimal
 from service.model.scene_spec import HalfSpace
 from service.model.transforms import IDENTITY_POSE, apply, compose
 from service.readers.ways import Waypoint
@@ -29,7 +30,6 @@ from worker.rendering.pages.pictures import (
     hand_points,
     side_of,
 )
-from worker.rendering.palette import hexadecimal
 from worker.rendering.scenery import Box, Look, Shot, Solid
 from worker.rendering.standing import Supports, seen_share, slab_poses, slabs
 from worker.rendering.tracer import Tracer
