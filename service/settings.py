@@ -42,6 +42,9 @@ class Settings(BaseSettings):
     quota_grasps_in_flight: int = Field(0, ge=0, description="grasps in unfinished jobs of one key; 0: no limit")
     quota_jobs_per_day: int = Field(0, ge=0, description="new jobs of one key from midnight UTC on; 0: no limit")
     device: str = Field("auto", description="Warp device of a worker: cpu, cuda:0, or auto")
+    worker_number: int | None = Field(
+        None, ge=0, description="of a worker among those of its machine: with device auto, number k takes the k-th GPU"
+    )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
     keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")

@@ -1,4 +1,4 @@
-"""One child process of `graspd up`: started, watched, started again with a growing pause, stopped."""
+"""One child process of a supervisor: started, watched, started again with a growing pause, stopped."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 log = logging.getLogger(__name__)
 _FIRST_PAUSE_S: Final = 0.2
@@ -27,8 +28,8 @@ class Child:
     name: str
     command: Sequence[str]
     environment: Mapping[str, str]
-    folder: Path
-    """Data folder: pid files go to `run/`, output to `logs/`."""
+    folder: Path | None
+    """Data folder: pid files go to `run/`, output to `logs/`. None: no such files, and the output is the parent's."""
     process: subprocess.Popen[bytes] | None = None
     starts: int = 0
     _started: float = 0.0
@@ -36,27 +37,23 @@ class Child:
     _not_before: float = field(default=0.0)
 
     @property
-    def log_file(self) -> Path:
-        return self.folder / "logs" / f"{self.name}.log"
-
-    @property
-    def pid_file(self) -> Path:
-        return self.folder / "run" / f"{self.name}.pid"
+    def pid_file(self) -> Path | None:
+        return self.folder / "run" / f"{self.name}.pid" if self.folder is not None else None
 
     def start(self) -> None:
         """Start the process in a session of its own: Ctrl-C in the terminal is for the parent alone."""
-        for file in (self.log_file, self.pid_file):
-            file.parent.mkdir(parents=True, exist_ok=True)
-        with self.log_file.open("ab") as output:
+        with self._output() as output:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "service.run.launch", str(os.getpid()), *self.command],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
-                stderr=subprocess.STDOUT,
+                stderr=subprocess.STDOUT if output is not None else None,
                 env={**os.environ, **self.environment},
                 start_new_session=True,
             )
-        self.pid_file.write_text(f"{self.process.pid}\n")
+        if self.pid_file is not None:
+            self.pid_file.parent.mkdir(parents=True, exist_ok=True)
+            self.pid_file.write_text(f"{self.process.pid}\n")
         self.starts += 1
         self._started = time.monotonic()
 
@@ -93,7 +90,15 @@ class Child:
                 self.process.kill()
                 self.process.wait()
             self.process = None
-        self.pid_file.unlink(missing_ok=True)
+        if self.pid_file is not None:
+            self.pid_file.unlink(missing_ok=True)
+
+    def _output(self) -> AbstractContextManager[IO[bytes] | None]:
+        if self.folder is None:
+            return nullcontext()
+        file = self.folder / "logs" / f"{self.name}.log"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return file.open("ab")
 
 
 def end_leftovers(folder: Path) -> list[int]:

@@ -163,8 +163,8 @@ class Supervisor:
             **_stated(self._wanted),
         }
 
-        def child(name: str, *command: str) -> Child:
-            return Child(name, command, environment, self.settings.data_dir)
+        def child(name: str, *command: str, **more: str) -> Child:
+            return Child(name, command, {**environment, **more}, self.settings.data_dir)
 
         children = []
         if self._wanted.redis_url is None:
@@ -174,7 +174,10 @@ class Supervisor:
         children.append(child("keeper", *_PROGRAM, "keeper"))
         if self._api:
             children.append(child("api", *_PROGRAM, "api"))
-        children += [child(f"worker-{number}", *self._worker_command) for number in range(self._workers)]
+        children += [
+            child(f"worker-{number}", *self._worker_command, GRASPD_WORKER_NUMBER=str(number))
+            for number in range(self._workers)
+        ]
         return children
 
     def _run(self) -> None:

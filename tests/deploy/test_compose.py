@@ -41,6 +41,14 @@ def test_the_specification_refuses_a_gpu_without_capabilities(tmp_path: Any) -> 
     assert subprocess.run(command, capture_output=True, check=False).returncode == 1
 
 
+def test_gpu_workers_see_every_gpu_and_share_the_folder_that_tells_them_apart() -> None:
+    """With `count: 1` Docker gives each of them the first GPU."""
+    gpu = composition.load(FILLED | {"GRASPD_GPU_WORKERS": "4"})["services"]["worker-gpu"]
+    (devices,) = gpu["deploy"]["resources"]["reservations"]["devices"]
+    assert (gpu["deploy"]["replicas"], devices["count"]) == ("4", "all")
+    assert "cache:/var/cache/graspd" in gpu["volumes"] and "GRASPD_DEVICE" not in gpu["environment"]
+
+
 @pytest.mark.parametrize("name", sorted(SERVICES))
 def test_every_image_has_a_version(name: str) -> None:
     _, _, tag = SERVICES[name]["image"].partition(":")

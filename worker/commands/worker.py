@@ -20,11 +20,12 @@ from service.settings import Settings
 app = typer.Typer(no_args_is_help=True)
 
 
-@app.command(epilog="graspd worker --device cuda:0 --stages synthesize,render")
+@app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
 @reporting_errors
 def worker(
     device: Annotated[str | None, typer.Option(help="cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
     stages: Annotated[str | None, typer.Option(help="Stages to serve, with commas between; default: all.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; with device auto each takes the next GPU.")] = 1,
     threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
     burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
     once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
@@ -34,12 +35,17 @@ def worker(
     ] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
 ) -> None:
-    """One worker on one device: takes tasks from the queue until it is told to stop."""
+    """A worker on one device, or several: takes tasks from the queue until it is told to stop."""
     settings = load_settings(device=device, threads=threads, data_dir=data_dir)
     log_to_stderr(settings, "worker")
     keep_private(settings)
     if check:
         check_worker(settings)
+        return
+    if workers > 1:
+        if burst or once or max_tasks is not None:
+            raise InputError("--burst, --once and --max-tasks are for a single worker")
+        _run_several(workers, settings, stages)
         return
     from worker.process.main import run_worker
 
@@ -48,6 +54,16 @@ def worker(
         settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
     )
     _end(0 if ended_well else 1)
+
+
+def _run_several(count: int, settings: Settings, stages: str | None) -> None:
+    from service.run.commands import stop_on_signals
+    from worker.process.several import run_workers
+
+    _parse_stages(stages)
+    arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
+    arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
+    run_workers(count, arguments, settings, stop_on_signals())
 
 
 def _end(code: int) -> None:

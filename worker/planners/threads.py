@@ -1,11 +1,13 @@
 """A batch of grasps cut into parts, one per CPU thread: Warp releases the interpreter lock while a kernel runs.
 
-Warp's CPU backend runs a launch on the thread that asks for it, so threads use all cores. A grasp's result does not
-depend on the part it is in.
+Warp's CPU backend runs a launch on the thread that asks for it, so threads use all cores. On a GPU a batch is one part,
+and is halved where its memory does not suffice. A grasp's result does not depend on the part it is in.
 """
 
 from __future__ import annotations
 
+import gc
+import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,8 +17,10 @@ from typing import TypeVar
 import numpy as np
 import warp as wp
 
+from worker.engines.cuda_errors import is_out_of_memory
 from worker.run import Run
 
+log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
@@ -33,7 +37,8 @@ class Steps:
         self._run.check("the synthesis")
         with self._lock:
             self._done += work
-            self._run.progress(self._done, self._total, message)
+            # What is done again in halves counts twice.
+            self._run.progress(min(self._done, self._total), self._total, message)
 
 
 def cut(count: int, run: Run, *, least: int = 1) -> list[range]:
@@ -52,8 +57,30 @@ def cut(count: int, run: Run, *, least: int = 1) -> list[range]:
 
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
-    """`work` of every part, each in a thread of its own, in order."""
+    """`work` of every part, each in a thread of its own, in order.
+
+    A part for which a GPU has too little memory becomes two, one after the other, and so on down to single grasps: then
+    there are more results than parts.
+    """
     if len(parts) == 1:
-        return [work(parts[0])]
+        return _fitted(parts[0], work)
     with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
         return [future.result() for future in [pool.submit(work, part) for part in parts]]
+
+
+def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
+    """The work of a part, in as many launches as the memory of its GPU needs."""
+    try:
+        return [work(part)]
+    except RuntimeError as error:
+        if len(part) < 2 or not is_out_of_memory(error):
+            raise
+        log.warning(
+            "too little memory on the GPU for %d grasps in one launch; they are made in halves: %s",
+            len(part),
+            error,
+        )
+    # The error is gone by here, and with it the frames that held what was allocated already.
+    gc.collect()
+    middle = part.start + len(part) // 2
+    return [*_fitted(range(part.start, middle), work), *_fitted(range(middle, part.stop), work)]

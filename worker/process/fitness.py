@@ -12,11 +12,13 @@ one to start and check itself.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections.abc import Callable, Collection
 from typing import Final, Protocol
 
+from service import user_cache
 from service.model.domain import IngestMessage, Stage
 from service.model.errors import DamagedError, InputError, TaskRefused, UnavailableError
 from service.queue.port import Message
@@ -32,9 +34,20 @@ PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)
 #: So many tasks that failed here and were done elsewhere are no accident.
 _DONE_ELSEWHERE: Final = 2
 _REMEMBERED: Final = 16
+_LOSSES_BYTES: Final = 2**16
 _LOOK_S: Final = 0.1
 #: Errors that say nothing about the worker: the input is bad, or a record in the store.
 _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
+
+
+def first_loss(task: str) -> bool:
+    """Whether no GPU of this machine was lost over a task before. The first time nothing says that it is the task's
+    fault; one that takes every GPU down must use up its attempts, or it would go round for ever."""
+    file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
+    if user_cache.load(file) is not None:
+        return False
+    user_cache.keep(file, b"", limit_bytes=_LOSSES_BYTES)
+    return True
 
 
 class Listing(Protocol):

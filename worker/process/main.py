@@ -129,6 +129,10 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._context = None
         self._tell_outcome()
         self._surroundings.tasks_done += 1
+        if self._runner.device_lost:
+            log.error("this worker ends: %s", self._runner.device_lost)
+            self._heart.stopping()
+            self.gave_up = self._stop_requested = True
         if self._fitness.reason and not self._stop_requested:
             fit = self._fitness.sit_out(self._stages, self._heart, lambda: self._stop_requested)
             self.gave_up = not fit and not self._stop_requested
@@ -282,7 +286,7 @@ def run_worker(
     """
     queue = open_queue(settings, patience=_PATIENCE)
     name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
-    device = Device(settings.device)
+    device = Device(settings.device, number=settings.worker_number)
     store = open_store(settings.resolved_store_url)
     queue.ping()
     heart = Heartbeat(

@@ -22,7 +22,8 @@ from service.model.version import STAGE_REVISIONS, TASK_SCHEMA
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.records import put_record
-from worker.process.fitness import Fitness
+from worker.engines.cuda_errors import DeviceLost, check_device
+from worker.process.fitness import Fitness, first_loss
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.output import StageFunction, shard_of
 
@@ -42,12 +43,22 @@ class Runner:
     """Does tasks one after the other with a table of stages."""
 
     def __init__(
-        self, stages: Mapping[Stage, StageFunction], *, worker: str, publish: Publish, fitness: Fitness | None = None
+        self,
+        stages: Mapping[Stage, StageFunction],
+        *,
+        worker: str,
+        publish: Publish,
+        fitness: Fitness | None = None,
+        check_device: Callable[[str], None] = check_device,
     ) -> None:
+        """`check_device` raises DeviceLost once nothing runs on a device any more."""
         self._stages = stages
         self._worker = worker
         self._publish = publish
         self._fitness = fitness
+        self._check_device = check_device
+        self.device_lost = ""
+        """Why this process can do no more tasks on its device; "" while it can."""
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         """Do a task.
@@ -89,7 +100,10 @@ class Runner:
                 return self._event(
                     EventKind.DEFERRED, message, message=f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
                 )
-            if self._fitness is not None and (why := self._fitness.doubt(message, error)):
+            if (why := self._loss(error, context)) and first_loss(message.task_id):
+                log.error("the task is handed back: %s", why, exc_info=True)
+                return self._event(EventKind.RETURNED, message, message=why)
+            if not why and self._fitness is not None and (why := self._fitness.doubt(message, error)):
                 log.warning("the task is handed back; it failed because of this worker", exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             return self._failed(message, error, context, started)
@@ -107,6 +121,7 @@ class Runner:
         clock = time.perf_counter()
         lost = self._lost(message, context)
         made = self._stages[message.stage](message, context)
+        self._check_device(context.device)
         seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, TaskMessage):
             context.check()
@@ -122,6 +137,16 @@ class Runner:
         if self._fitness is not None:
             self._fitness.passed()
         return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
+
+    def _loss(self, error: Exception, context: TaskContext) -> str:
+        """What became of the device, if that is what the error comes from; "" if it works."""
+        try:
+            self._check_device(context.device)
+        except DeviceLost as lost:
+            error = lost
+        if isinstance(error, DeviceLost):
+            self.device_lost = str(error)
+        return self.device_lost
 
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):

@@ -1,0 +1,111 @@
+"""What a GPU's errors mean for the work at hand; the errors are put in where Warp would tell them."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from service.model.domain import FIDELITIES
+from worker.engines import cuda_errors
+from worker.engines.cuda_errors import DeviceLost, check_device, is_out_of_memory
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.planners.fast_graspd import planner
+from worker.planners.port import Wanted
+from worker.planners.threads import run_parts
+from worker.run import Run
+
+#: As Warp 1.19 says it.
+NO_MEMORY = "Failed to allocate 8589934592 bytes on device 'cuda:0'"
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (RuntimeError(NO_MEMORY), True),
+        (RuntimeError("CUDA error 2 detected on device cuda:1: out of memory"), True),
+        (RuntimeError("Failed to allocate 64 bytes on device 'cpu'"), False),
+        (RuntimeError("CUDA error 700 detected on device cuda:0: an illegal memory access was encountered"), False),
+        (RuntimeError("CUDA error 201 detected on device cuda:0: invalid device context"), False),
+        (ValueError(NO_MEMORY), False),
+    ],
+)
+def test_only_a_gpu_without_memory_is_out_of_memory(error: Exception, expected: bool) -> None:
+    assert is_out_of_memory(error) is expected
+
+
+@pytest.mark.parametrize(("code", "lost"), [(0, False), (2, False), (700, True), (719, True)])
+def test_a_device_is_lost_by_any_error_but_want_of_memory(
+    monkeypatch: pytest.MonkeyPatch, code: int, lost: bool
+) -> None:
+    monkeypatch.setattr(cuda_errors, "_pending_error", lambda device: code)
+    check_device("cpu")
+    if not lost:
+        check_device("cuda:1")
+        return
+    with pytest.raises(DeviceLost, match=f"CUDA error {code} on cuda:1"):
+        check_device("cuda:1")
+
+
+def work(room: int) -> tuple[list[range], object]:
+    """Work that fits up to `room` grasps, and the launches that were tried."""
+    tried: list[range] = []
+
+    def launch(part: range) -> list[int]:
+        tried.append(part)
+        if len(part) > room:
+            raise RuntimeError(NO_MEMORY)
+        return list(part)
+
+    return tried, launch
+
+
+@pytest.mark.parametrize("room", [1, 3, 8, 31, 32])
+def test_a_launch_that_does_not_fit_is_halved_until_it_does(room: int, caplog: pytest.LogCaptureFixture) -> None:
+    tried, launch = work(room)
+    with caplog.at_level(logging.WARNING):
+        found = run_parts([range(32)], launch)  # type: ignore[arg-type]
+    assert [index for part in found for index in part] == list(range(32))
+    assert len(caplog.messages) == len(tried) - len(found)
+    assert room == 32 or caplog.messages[0].startswith("too little memory on the GPU for 32 grasps in one launch")
+
+
+def test_a_single_grasp_that_does_not_fit_is_an_error() -> None:
+    _, launch = work(0)
+    with pytest.raises(RuntimeError, match="Failed to allocate"):
+        run_parts([range(4)], launch)  # type: ignore[arg-type]
+
+
+def test_other_errors_are_not_tried_again() -> None:
+    tried = []
+
+    def launch(part: range) -> None:
+        tried.append(part)
+        raise RuntimeError("CUDA error 700 detected on device cuda:0: an illegal memory access was encountered")
+
+    with pytest.raises(RuntimeError, match="700"):
+        run_parts([range(32)], launch)
+    assert tried == [range(32)]
+
+
+def test_grasps_made_in_halves_are_those_of_one_launch(monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, block = hand_from_path("barrett"), object_from_path("block")
+    fidelity = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 6, "fine_iterations": 6})
+    wanted = Wanted(count=4, fidelity=fidelity)
+    whole = synthesize(hand, block, wanted, Run(threads=1))
+
+    class Small(planner.Data):
+        """Of a device with room for two grasps."""
+
+        def __init__(self, model: object, batch: int) -> None:
+            if batch > 2 * fidelity.starts:
+                raise RuntimeError(NO_MEMORY)
+            super().__init__(model, batch)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(planner, "Data", Small)
+    halves = synthesize(hand, block, wanted, Run(threads=1))
+    assert np.array_equal(whole.grasp.hand_pose, halves.grasp.hand_pose)
+    assert np.array_equal(whole.grasp.joint_positions, halves.grasp.joint_positions)

@@ -1,0 +1,81 @@
+"""A GPU that breaks down under a task: the task goes back, and the process ends for a fresh one to start."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.model.domain import Lane, Stage, TaskMessage
+from service.queue.port import Event, EventKind
+from service.queue.rq_queue import RqQueue
+from service.settings import Settings
+from service.store.manifests import shard_exists
+from service.store.records import task_attempts
+from service.store.store import Store, open_store
+from tests.fakes import fake_synthesize, message_for
+from worker.engines.cuda_errors import DeviceLost
+from worker.process import main
+from worker.process.runner import Runner
+from worker.stages.context import TaskContext
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def broken(device: str) -> None:
+    raise DeviceLost("CUDA error 700 on cuda:0: nothing runs there any more in this process")
+
+
+def garbled(message: TaskMessage, context: TaskContext) -> Any:
+    """What a stage meets whose numbers no kernel has written."""
+    raise ArithmeticError("not a number")
+
+
+def run(store: Store, message: TaskMessage, stage: Any, check: Any = broken) -> tuple[Event | None, Runner]:
+    runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, check_device=check)
+    return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store, device="cuda:0")), runner
+
+
+@pytest.mark.parametrize("stage", [fake_synthesize, garbled])
+def test_the_task_goes_back_without_a_result_or_an_attempt(stage: Any) -> None:
+    store, message = open_store("memory://"), message_for()
+    event, runner = run(store, message, stage)
+    assert event is not None and event.kind is EventKind.RETURNED
+    assert "CUDA error 700" in event.message and "CUDA error 700" in runner.device_lost
+    assert not shard_exists(store, message.stage, message.output)
+    assert not list(task_attempts(store, message.task_id))
+
+
+def test_a_task_that_takes_down_one_gpu_after_the_other_uses_up_its_attempts() -> None:
+    store, message = open_store("memory://"), message_for()
+    run(store, message, fake_synthesize)
+    event, _ = run(store, message, fake_synthesize)
+    assert event is not None and event.kind is EventKind.FAILED
+    (attempt,) = task_attempts(store, message.task_id)
+    assert (attempt.kind, attempt.last) == ("DeviceLost", False)
+
+
+def test_a_device_that_works_is_not_blamed() -> None:
+    event, runner = run(open_store("memory://"), message_for(), garbled, lambda device: None)
+    assert event is not None and (event.kind, runner.device_lost) == (EventKind.FAILED, "")
+
+
+def test_the_worker_ends_and_leaves_the_other_tasks(
+    rq_queue: RqQueue, redis_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(main, "Runner", partial(Runner, check_device=broken))
+    rq_queue.enqueue([message_for(), message_for(seed=1)], Lane.BULK)
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
+    with caplog.at_level(logging.ERROR):
+        assert not main.run_worker(settings, table={Stage.SYNTHESIZE: fake_synthesize}), "its supervisor should know"
+    kinds = [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)]
+    assert kinds[:2] == [EventKind.STARTED, EventKind.RETURNED] and kinds.count(EventKind.STARTED) == 1
+    assert rq_queue.leases() == []
+    assert any(line.startswith("this worker ends: CUDA error 700") for line in caplog.messages)
