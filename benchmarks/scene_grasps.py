@@ -1,7 +1,8 @@
 """Grasps planned in scenes against grasps planned around free objects and filtered, per hand and object.
 
 usage: python -m benchmarks.scene_grasps DATA_DIR --work W [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
-           [--per-face 0] [--json OUT] [--page OUT.md]          DATA_DIR holds hands/ and objects/
+           [--per-face 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
+       DATA_DIR holds hands/ and objects/
 
 Scenes: each stable resting face of the object that at least 3 % of drops end on, on a table. Both ways get the same
 number of raw grasps in the same scenes, judged alike: `--grasps` a pair, or `--per-face` for each face if that is more.
@@ -23,7 +24,7 @@ import numpy as np
 
 from benchmarks.cells import HANDS
 from service.model.domain import FIDELITIES
-from service.model.scene_spec import SceneSpec
+from service.model.scene_spec import TOUCH, SceneSpec
 from service.model.version import PACKAGE_VERSION
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -58,13 +59,22 @@ TITLES = {
 }  # fmt: skip
 
 
-def study(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, least: int, per_face: int) -> dict[str, Any]:
+def study(
+    hand: HandModel,
+    obj: ObjectModel,
+    pieces: ConvexPieces,
+    least: int,
+    per_face: int,
+    *,
+    touch: float = TOUCH,
+    seed: int = SEED,
+) -> dict[str, Any]:
     """The numbers of one pair; shares are of all raw grasps."""
-    spec = SceneSpec(kind="table", faces="all")
-    poses = rest_poses(spec, obj, count=1, seed=SEED)["scene/object_pose"]
+    spec = SceneSpec(kind="table", faces="all", touch=touch)
+    poses = rest_poses(spec, obj, count=1, seed=seed)["scene/object_pose"]
     count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
-    wanted, run = Wanted(count, FIDELITY, SEED), Run(threads=1)
+    wanted, run = Wanted(count, FIDELITY, seed), Run(threads=1)
     trial = lift_trial(hand, obj, lambda: pieces)
     # What a pair is made ready with once is none of a grasp's cost, on either side.
     for where in (placed.take(slice(0, 1)), None):
@@ -179,6 +189,8 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+")
     parser.add_argument("--grasps", type=int, default=32)
     parser.add_argument("--per-face", type=int, default=0)
+    parser.add_argument("--touch", type=float, default=TOUCH, help="mm that fingertips keep from the table")
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--page", type=Path)
     said = parser.parse_args()
@@ -189,10 +201,19 @@ def main() -> None:
         for mesh in sorted((said.data / "objects").glob("*/clean.stl")):
             if said.objects and mesh.parent.name not in said.objects:
                 continue
-            kept = said.work / f"{name}-{mesh.parent.name}-{said.grasps}-{said.per_face}.json"
+            terms = f"{said.grasps}-{said.per_face}-{said.touch:g}-{said.seed}"
+            kept = said.work / f"{name}-{mesh.parent.name}-{terms}.json"
             if not kept.exists():
                 obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
-                found = study(hand, obj, decompose(obj, cache=said.work / "pieces"), said.grasps, said.per_face)
+                found = study(
+                    hand,
+                    obj,
+                    decompose(obj, cache=said.work / "pieces"),
+                    said.grasps,
+                    said.per_face,
+                    touch=said.touch,
+                    seed=said.seed,
+                )
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 kept.write_text(json.dumps(found))
             rows.append({"object": mesh.parent.name, **json.loads(kept.read_text())})

@@ -23,6 +23,7 @@ def synthesize(
     scene: str | Path = "free",
     scenes: int = 4,
     faces: Literal["drawn", "all"] = "drawn",
+    touch: float | None = None,
     beside: Sequence[str | Path] = (),
     want: Literal["valid", "raw"] = "valid",
     budget: float = 4.0,
@@ -49,6 +50,8 @@ def synthesize(
         scene: where they are used: free, table, bin, shelf, or a JSON or YAML file (docs/scenes.md).
         scenes: scenes that they are shared out to.
         faces: drawn: as drops fall; all: a scene for each stable face.
+        touch: distance that fingertips keep from supports [mm]: 2 as the rest of the hand; 0, the default: they may
+            touch; down to -1: they may press into it.
         beside: up to eight other objects, files or names, that are dropped around it.
         want: valid: that many valid grasps; raw: of any kind.
         budget: grasps tried for each one wanted, at most.
@@ -81,7 +84,7 @@ def synthesize(
     except ValidationError as error:
         raise InputError(validation_line(error)) from None
     request = request.model_copy(update={"fidelity": chosen_fidelity(fidelity)})
-    place = parse_scene(str(scene), faces=faces, beside=[str(one) for one in beside])
+    place = parse_scene(str(scene), faces=faces, touch=touch, beside=[str(one) for one in beside])
     made = synthesized(
         str(hand), str(object), request, place=place, scenes=scenes,
         mesh=object_options(units=units, scale_to=scale_to), device=device, threads=threads,

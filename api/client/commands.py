@@ -57,6 +57,9 @@ def submit(
         list[str] | None,
         typer.Option("--with", help="Another object in the scene: a name, or a mesh to upload; up to eight."),
     ] = None,
+    touch: Annotated[
+        float, typer.Option(help="mm that fingertips keep from supports: 2 as the hand; 0: they touch; to -1: press.")
+    ] = 0.0,
     scenes: Annotated[int, typer.Option(help="Scenes per batch of grasps; 4 where a scene is named.")] = 0,
     views: Annotated[int, typer.Option(help="Camera placements per scene.")] = 0,
     stereo: Annotated[bool, typer.Option("--stereo", help="A left and a right picture per placement.")] = False,
@@ -88,6 +91,7 @@ def submit(
                 "seed": seed,
                 "scene": scene_option(scene, named=as_object),
                 "faces": faces,
+                "touch": touch,
                 "neighbours": [as_object(one) for one in with_ or []],
                 "scenes": scenes,
                 "views": views,

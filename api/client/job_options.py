@@ -24,6 +24,7 @@ _HELP: Final = {
     "seed": "The same seed gives the same grasps.",
     "scene": "Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.",
     "neighbours": "Another object in each scene, by name; up to eight.",
+    "touch": "mm that fingertips keep from supports: 2 as the rest of the hand; 0: they touch; to -1: they press.",
     "faces": "In a scene: drawn, as drops fall, or all, a scene for each stable face.",
 }
 _SHORT: Final = {"grasps": "-n"}

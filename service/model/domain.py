@@ -21,7 +21,7 @@ from service.model.scene_options import (
     SceneOption,
     scene_of,
 )
-from service.model.scene_spec import MOST_NEIGHBOURS, SceneSpec
+from service.model.scene_spec import LEAST_TOUCH, MOST_NEIGHBOURS, MOST_TOUCH, TOUCH, SceneSpec
 
 BATCH_SIZE: Final = 32
 #: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
@@ -162,6 +162,15 @@ class JobOptions(Model):
         description="names of up to eight other objects, which are dropped around this one in its scenes; a document "
         "places its own",
     )
+    touch: float = Field(
+        TOUCH,
+        ge=LEAST_TOUCH,
+        le=MOST_TOUCH,
+        allow_inf_nan=False,
+        exclude_if=lambda value: value == TOUCH,
+        description="distance that fingertips keep from the supports of their scene [mm]. 2: as the rest of the hand; "
+        "0: they may touch; below: they may press into it, for what lies flat",
+    )
     scenes: int = Field(0, ge=0, le=64, description="scenes per batch of grasps")
     views: int = Field(0, ge=0, le=256, description="camera placements per scene")
     stereo: bool = Field(False, description="a left and a right picture per placement instead of one")
@@ -250,7 +259,7 @@ class JobOptions(Model):
     @property
     def place(self) -> SceneSpec:
         """The scene."""
-        return scene_of(self.scene, faces=self.faces, beside=self._dropped)
+        return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._dropped)
 
     @property
     def _dropped(self) -> tuple[NamedNeighbour, ...]:

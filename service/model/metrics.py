@@ -119,7 +119,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         bounds=(0, 1), digits=2, plot="whole",
     ),
     GraspMetric(
-        "clearance_m", "m", "least distance of the hand from supports: coming, closing and lifting",
+        "clearance_m", "m", "least room of the hand among supports: coming, closing and lifting",
         title="Clearance in its scene", short="Clearance", optional=True, indexed=Indexed.OFFERED,
         bounds=(-1, 1), digits=4,
     ),

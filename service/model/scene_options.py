@@ -15,11 +15,13 @@ from service.model.scene_spec import (
     MOST_NEIGHBOURS,
     MOST_SUPPORTS,
     SCENE_FILES,
+    TOUCH,
     NeighbourSpec,
     Part,
     Pose,
     SceneSpec,
     Supports,
+    Touch,
     check_quaternion,
     first_mistake,
     parse_scene,
@@ -64,6 +66,11 @@ class SceneDocument(Part):
         exclude_if=lambda value: not value,
         description="other objects: all with their poses, or all without, to be dropped around the target",
     )
+    touch: Touch = Field(
+        TOUCH,
+        exclude_if=lambda value: value == TOUCH,
+        description="distance that fingertips keep from the supports [mm], unless the request says so itself",
+    )
 
     @model_validator(mode="after")
     def _turned(self) -> Self:
@@ -87,20 +94,22 @@ def scene_of(
     option: str | SceneDocument,
     *,
     faces: Literal["drawn", "all"] = "drawn",
+    touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
     """The scene that a request means, with more neighbours than its document has.
 
     Raises:
-        ValueError: the faces or the neighbours do not go with it, in one line.
+        ValueError: the faces, the touch or the neighbours do not go with it, in one line.
     """
     try:
         if isinstance(option, SceneDocument):
+            touch = option.touch if touch == TOUCH else touch
             return SceneSpec(
-                kind="file", supports=option.supports, target=option.target, faces=faces,
+                kind="file", supports=option.supports, target=option.target, faces=faces, touch=touch,
                 neighbours=(*option.neighbours, *beside),
             )  # fmt: skip
-        return SceneSpec(kind=option, faces=faces, neighbours=tuple(beside))
+        return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
     except ValidationError as error:
         raise ValueError(first_mistake(error)) from None
 
@@ -130,6 +139,8 @@ def scene_option(
     is_file = Path(text).suffix.lower() in SCENE_FILES
     found = read_scene(Path(text) if beside is None else beside / text) if is_file else parse_scene(text)
     said = found.model_dump(mode="json", include={"supports", "target", "neighbours"}, exclude_none=True)
+    if found.touch != TOUCH:
+        said["touch"] = found.touch
     for one in said["neighbours"]:
         one["object"] = named(one["object"])
     return said if said["neighbours"] else {key: value for key, value in said.items() if key != "neighbours"}

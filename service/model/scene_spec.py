@@ -20,6 +20,10 @@ from service.model.labels import Digest
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
+#: Distance that fingertips keep from supports [mm]: least, that of the whole hand, and unless a user says otherwise.
+LEAST_TOUCH: Final = -1.0
+MOST_TOUCH: Final = 2.0
+TOUCH: Final = 0.0
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
 #: A scene is no larger than this [m].
@@ -30,6 +34,7 @@ MAX_FILE_BYTES: Final = 64 * 1024
 _Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]
 _Extent = Annotated[float, Field(gt=1e-4, le=2 * FARTHEST_M, allow_inf_nan=False)]
 _Number = Annotated[float, Field(ge=-2.0, le=2.0, allow_inf_nan=False)]
+Touch = Annotated[float, Field(ge=LEAST_TOUCH, le=MOST_TOUCH, allow_inf_nan=False)]
 Vector = tuple[_Metres, _Metres, _Metres]
 Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
 
@@ -104,6 +109,8 @@ class SceneSpec(Part):
     faces: Literal["drawn", "all"] = "drawn"
     """drawn: resting faces come as often as drops end on them; all: one scene for each stable face."""
 
+    touch: Touch = TOUCH
+    """Distance that fingertips keep from supports [mm]: 2, as the rest of the hand; 0: they may touch; below: press."""
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
     """Others than the object."""
 
@@ -116,6 +123,8 @@ class SceneSpec(Part):
             raise ValueError(f"a {self.kind} scene has its own supports; give them and a target with kind file")
         if self.kind == "free" and self.faces != "drawn":
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
+        if self.kind == "free" and self.touch != TOUCH:
+            raise ValueError("around a free object there is nothing to touch: choose table, bin or shelf")
         if self.target is not None:
             check_quaternion(self.target)
             if self.faces == "all":
@@ -140,9 +149,11 @@ class SceneSpec(Part):
             raise ValueError("neighbours without a pose are dropped with the target: give all of them poses")
 
 
-def parse_scene(text: str, *, faces: str = "drawn", beside: Sequence[str] = ()) -> SceneSpec:
-    """The scene that a user names: one of `KINDS`, or a JSON or YAML file; `faces` as in `SceneSpec`, and `beside`
-    objects that are dropped around the target.
+def parse_scene(
+    text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
+) -> SceneSpec:
+    """The scene that a user names: one of `KINDS`, or a JSON or YAML file; `faces` and `touch` as in `SceneSpec` (None:
+    as the file says), and `beside` objects that are dropped around the target.
 
     Raises:
         InputError: unknown kind, unreadable file, or nonsense in it, in one line.
@@ -153,12 +164,14 @@ def parse_scene(text: str, *, faces: str = "drawn", beside: Sequence[str] = ()) 
     if text not in KINDS and path.suffix.lower() not in SCENE_FILES:
         raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file")
     found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
-    if faces == found.faces and not beside:
+    touch = found.touch if touch is None else touch
+    if faces == found.faces and touch == found.touch and not beside:
         return found
     more = [{"object": name} for name in beside]
-    said = found.model_dump(exclude={"faces", "neighbours"})
+    said = found.model_dump(exclude={"faces", "touch", "neighbours"})
     try:
-        return SceneSpec(**said, faces=faces, neighbours=[*(one.model_dump() for one in found.neighbours), *more])
+        others = [*(one.model_dump() for one in found.neighbours), *more]
+        return SceneSpec(**said, faces=faces, touch=touch, neighbours=others)
     except ValidationError as error:
         raise InputError(f"scene {text}: {first_mistake(error)}") from None
 

@@ -62,6 +62,12 @@ def synth(
     ] = "free",
     scenes: Annotated[int, typer.Option(help="Scenes that the grasps are shared out to.", min=1, max=4096)] = 4,
     faces: Annotated[str, typer.Option(help="drawn: as drops fall; all: a scene for each stable face.")] = "drawn",
+    touch: Annotated[
+        float | None,
+        typer.Option(
+            help="mm that fingertips keep from supports: 2 as the hand; 0 (default): they touch; to -1: press."
+        ),
+    ] = None,
     with_: Annotated[
         list[str] | None, typer.Option("--with", help="Another object on the table: file or built-in; up to eight.")
     ] = None,
@@ -80,10 +86,11 @@ def synth(
         }
     )  # fmt: skip
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
+    place = parse_scene(scene, faces=faces, touch=touch, beside=with_ or [])
     with _bar(grasps, quiet=json) as report:
         made = synthesized(
-            hand, object_, request, place=parse_scene(scene, faces=faces, beside=with_ or []), scenes=scenes, mesh=mesh,
-            device=device, threads=threads, report=report,
+            hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
+            report=report,
         )  # fmt: skip
     out.write_bytes(write_shard("base", made.arrays, made.attributes))
     found = {"file": str(out), **made.summary()}

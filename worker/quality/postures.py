@@ -20,8 +20,9 @@ from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.jaw_squeeze import jaw_squeeze
 from worker.quality.probe import Distances, Probe, probe_of
+from worker.quality.raising import raised
 from worker.quality.squeeze import Contacts, Hold, balanced
-from worker.simulation.obstacles import body_distances
+from worker.simulation.obstacles import body_room
 from worker.simulation.surroundings import Placed
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
@@ -70,13 +71,14 @@ def pregrasp(hand: HandModel, obj: ObjectModel, grasp: Posture, placed: Placed |
 
     Every finger leaves the object along its contact normals until its points are `CLEARANCE_M` away, or as far as it
     can get without running into other fingers or, where the grasps are `placed`, an obstacle of their scene; then the
-    root moves back along the palm's approach if the hand is still in touch.
+    root moves back along the palm's approach if the hand is still in touch, and up where fingers would dip into what
+    they may touch.
     """
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     starts = range(0, len(grasp), _CHUNK)
     scenes = [placed.take(slice(i, i + _CHUNK)) if placed is not None else None for i in starts]
-    parts = [_pregrasp(probe, _rows(grasp, i), scene) for i, scene in zip(starts, scenes, strict=True)]
-    return _join(hand, parts)
+    found = _join(hand, [_pregrasp(probe, _rows(grasp, i), scene) for i, scene in zip(starts, scenes, strict=True)])
+    return found if placed is None else raised(hand, grasp, found, placed)
 
 
 def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Placed) -> Floats:
@@ -292,7 +294,7 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
 
 
 def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Placed) -> Floats:
-    """(B, fingers) least distance of each finger from the obstacles of its scene on paths (B, K, D); inf: no finger."""
+    """(B, fingers) least room of each finger, as `body_room` has it, on paths (B, K, D); inf: no finger."""
     count, steps, _ = paths.shape
     finger = _finger_of_body(hand)
     out = np.full((count, _fingers(hand)), np.inf)
@@ -301,7 +303,7 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
         if not len(rows):
             continue
         joints = hand.expand(paths[rows]).reshape(len(rows) * steps, -1)
-        found = body_distances(hand, Posture(np.repeat(hand_pose[rows], steps, axis=0), joints), scene)
+        found = body_room(hand, Posture(np.repeat(hand_pose[rows], steps, axis=0), joints), scene)
         found = found.reshape(len(rows), steps, -1).min(axis=1)
         for f in np.unique(finger[finger >= 0]):
             out[rows, f] = found[:, finger == f].min(axis=1)

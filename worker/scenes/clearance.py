@@ -14,10 +14,10 @@ from worker.grasps import Posture
 from worker.hands.model import Floats, HandModel
 from worker.scenes.neighbours import Neighbours, neighbour_clearance
 from worker.simulation.obstacles import PosedFeatures
-from worker.simulation.surroundings import UP, Obstacle
+from worker.simulation.surroundings import CLEAR_M, UP, Obstacle
 
 #: A grasp is kept if the hand stays at least this far above the table [m].
-MARGIN_M: Final = 0.002
+MARGIN_M: Final = CLEAR_M
 #: Postures checked on the straight way from pregrasp to grasp, both ends included.
 PATH_POSTURES: Final = 9
 _CHUNK: Final = 64

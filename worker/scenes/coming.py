@@ -14,7 +14,7 @@ from worker.hands.kinematics import body_poses
 from worker.quality.contact import finger_of_body
 from worker.quality.probe import Probe
 from worker.scenes.clearance import MARGIN_M
-from worker.simulation.obstacles import obstacle_distances
+from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import STANDOFF_M, Surroundings
 
 Floats = NDArray[np.float64]
@@ -78,7 +78,7 @@ def _seen(probe: Probe, pregrasp: Posture, opened: Floats, way: Floats, scene: S
     postures = Posture(poses.reshape(-1, 7), joints.reshape(len(share) * count, -1))
     bodies = body_poses(probe.hand, postures.hand_pose, postures.joint_positions)
     coming = np.tile(share == 0, count)
-    room = obstacle_distances(probe.hand, postures.take(np.flatnonzero(coming)), scene).reshape(count, looks)
+    room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), scene).reshape(count, looks)
     points = probe.posed_points(bodies)
     gap = probe.signed_distance(points.reshape(-1, 3))[0].reshape(count, len(share), -1)
     fingers = finger_of_body(probe.hand)[probe.points.body] >= 0

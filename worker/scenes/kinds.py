@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import SceneError
 from service.model.scene_kinds import BIN_SIZE, SHELF_SIZE, supports_in
-from service.model.scene_spec import Box, SceneSpec
+from service.model.scene_spec import MOST_TOUCH, Box, SceneSpec
 from service.model.transforms import compose, quat_from_axis_angle, quat_rotate
 from worker.objects.model import ObjectModel
 from worker.scenes.rest import lay_flat, resting_faces
@@ -28,10 +29,11 @@ SUNK: Final = 5e-4
 
 def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
     """Supports in the scene frame; none for a free object."""
-    return tuple(
+    found = (
         Obstacle.box(s.pose, s.size) if isinstance(s, Box) else Obstacle.half_space(s.normal, s.offset)
         for s in supports_in(spec)
     )
+    return tuple(found) if spec.touch >= MOST_TOUCH else tuple(replace(o, tips_m=1e-3 * spec.touch) for o in found)
 
 
 def room_in(spec: SceneSpec) -> tuple[float, float] | None:

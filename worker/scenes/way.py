@@ -1,7 +1,8 @@
 """The hand's way: from a standoff to the pregrasp, closing, the lift; and what it stays clear of.
 
 In a scene the lift goes against gravity. Around a free object it is the way back, as the hand came.
-Against half-spaces distances are exact. Against boxes and neighbours' pieces they are those of the hand's features from
+Distances are those of `body_room`: fingertips that may touch a support count as farther from it.
+Against half-spaces they are exact. Against boxes and neighbours' pieces they are those of the hand's features from
 the obstacle's planes: exact where a corner is nearest, else a lower bound of the features' distance.
 """
 
@@ -22,7 +23,7 @@ from worker.quality.postures import wide_open
 from worker.quality.probe import Probe, probe_of
 from worker.scenes.clearance import MARGIN_M, approach
 from worker.scenes.coming import LOOKS, OBJECT_MARGIN_M, WAYPOINTS, come_open
-from worker.simulation.obstacles import obstacle_distances
+from worker.simulation.obstacles import obstacle_room
 from worker.simulation.surroundings import RISE_M, STANDOFF_M, Placed, Surroundings
 
 Floats = NDArray[np.float64]
@@ -82,10 +83,10 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         if not len(rows):
             continue
         mine = grasps.take(rows)
-        between = obstacle_distances(hand, approach(mine.grasp, mine.pregrasp), scene).reshape(len(rows), -1)
+        between = obstacle_room(hand, approach(mine.grasp, mine.pregrasp), scene).reshape(len(rows), -1)
         path[rows], came[rows], coming[rows], touching[rows] = come_open(probe, mine.pregrasp, wide[rows], scene)
         opened = Posture(mine.pregrasp.hand_pose, came[rows])
-        before = obstacle_distances(hand, approach(mine.pregrasp, opened), scene).reshape(len(rows), -1)
+        before = obstacle_room(hand, approach(mine.pregrasp, opened), scene).reshape(len(rows), -1)
         contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
         rise = RISE_M * scene.up
         raised[rows, :3] += rise
@@ -93,7 +94,7 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise
         joints = np.repeat(mine.grasp.joint_positions, WAYPOINTS, axis=0)
         lifting[rows] = (
-            obstacle_distances(hand, Posture(lifted.reshape(-1, 7), joints), scene).reshape(len(rows), -1).min(axis=1)
+            obstacle_room(hand, Posture(lifted.reshape(-1, 7), joints), scene).reshape(len(rows), -1).min(axis=1)
         )
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
     return Way(path, came, lift, contact, closing, coming, lifting, touching)
@@ -161,7 +162,7 @@ def _coming(
         poses[..., :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
-        room = obstacle_distances(probe.hand, postures, scene).reshape(len(open_), looks).min(axis=1)
+        room = obstacle_room(probe.hand, postures, scene).reshape(len(open_), looks).min(axis=1)
         gap = _gaps(probe, postures).reshape(len(open_), looks)
         # The pregrasp itself may stand nearer than the margin: coming must not be nearer than it is.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4

@@ -19,7 +19,7 @@ from worker.hands.model import HandModel
 from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import obstacles as kernels
 from worker.simulation.kernels import solids as solid_kernels
-from worker.simulation.surroundings import Obstacle, Surroundings
+from worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
 
 Floats = NDArray[np.float64]
 
@@ -112,6 +112,23 @@ def obstacle_distances(hand: HandModel, postures: Posture, scene: Surroundings) 
     return np.asarray(body_distances(hand, postures, scene).min(axis=1))
 
 
+def body_room(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+    """(P, L) as `body_distances`, but fingertips count as farther from supports that they may come near: by what makes
+    `CLEAR_M` of the distance that they are to keep [m]. So a hand is clear where nothing of it is below `CLEAR_M`."""
+    tips = np.isin(np.arange(hand.bodies), hand.fingertips)
+    out = np.full((len(postures), hand.bodies), np.inf)
+    for tips_m in sorted({o.tips_m for o in scene.obstacles}, key=lambda value: (value is None, value or 0.0)):
+        alike = Surroundings(tuple(o for o in scene.obstacles if o.tips_m == tips_m), scene.up)
+        more = 0.0 if tips_m is None else CLEAR_M - tips_m
+        out = np.minimum(out, body_distances(hand, postures, alike) + more * tips)
+    return out
+
+
+def obstacle_room(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+    """(P,) least of the `body_room` of each posture [m]."""
+    return np.asarray(body_room(hand, postures, scene).min(axis=1))
+
+
 @dataclass(frozen=True)
 class DeviceObstacles:
     """Obstacles of S scenes, origin at the object's centre of mass, and the features of one hand."""
@@ -157,6 +174,7 @@ class DeviceObstacles:
             features.radius = wp.array(found.radius, dtype=wp.float32)
             features.margin = wp.array(kept, dtype=wp.float32)
             features.weight = wp.ones(len(found), dtype=wp.float32)
+            features.tip = wp.array(np.isin(found.body, hand.fingertips), dtype=wp.int32)
             features.first = wp.array(found.first, dtype=wp.int32)
             features.first_edge = wp.array(found.first_edge, dtype=wp.int32)
             features.start = wp.array(found.edges[:, 0], dtype=wp.vec3)
@@ -168,6 +186,7 @@ class DeviceObstacles:
             solids.first_solid = wp.array(first[:-1] + np.array(endless, np.int32), dtype=wp.int32)
             solids.first_plane = wp.array(_starts([len(o.planes) for o in obstacles]), dtype=wp.int32)
             solids.planes = wp.array(planes, dtype=wp.vec4)
+            solids.tips = wp.array([FAR_M if o.tips_m is None else o.tips_m for o in obstacles], dtype=wp.float32)
             spheres = [_sphere(o.corners - centre) for o in obstacles]
             solids.centre = wp.array(np.array([s[0] for s in spheres]).reshape(-1, 3), dtype=wp.vec3)
             solids.radius = wp.array(np.array([s[1] for s in spheres]), dtype=wp.float32)

@@ -25,6 +25,8 @@ UP: Final = np.array([0.0, 0.0, 1.0])
 #: Length of a hand's straight way to its pregrasp, and of the lift [m].
 STANDOFF_M: Final = 0.10
 RISE_M: Final = 0.10
+#: A hand is clear of what it stays so far away from [m]; fingertips may be nearer to a support that says so.
+CLEAR_M: Final = 0.002
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class Obstacle:
     """(V, 3) corners [m]; none where the body has no end, as a half-space."""
     edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
     """(E, 2) corners that an edge joins."""
+    tips_m: float | None = None
+    """Distance that fingertips keep from it, negative if they may press into it [m]; None: the rest of the hand's."""
 
     def __post_init__(self) -> None:
         if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
@@ -78,7 +82,7 @@ class Obstacle:
         """The obstacle carried along by `pose` (7,): its frame's coordinates in the outer frame."""
         normals = quat_rotate(pose[3:], self.planes[:, :3])
         planes = np.column_stack([normals, self.planes[:, 3] + normals @ pose[:3]])
-        return Obstacle(planes, quat_rotate(pose[3:], self.corners) + pose[:3], self.edges)
+        return replace(self, planes=planes, corners=quat_rotate(pose[3:], self.corners) + pose[:3])
 
     def seen_from(self, pose: Floats) -> Obstacle:
         """The obstacle, given in an outer frame, in the frame that stands at `pose` (7,) in it."""

@@ -18,6 +18,7 @@ from typing import Final
 
 from service.index.queries.costs import BatchCost
 from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.scene_spec import TOUCH
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def _stored_of(options: JobOptions) -> tuple[float, float, str]:
     """Stored seconds per try, yield and origin."""
     if options.in_scene:
         seconds, _, origin = _stored_of(
-            options.model_copy(update={"scene": "free", "faces": "drawn", "neighbours": ()})
+            options.model_copy(update={"scene": "free", "faces": "drawn", "touch": TOUCH, "neighbours": ()})
         )
         longer, share = STORED_IN_SCENE
         return longer * seconds, share, f"{origin}, in a scene"

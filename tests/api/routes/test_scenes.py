@@ -44,9 +44,9 @@ def test_the_document_offers_scenes_and_keeps_the_defaults(http: TestClient) -> 
     defaults = {name: field["default"] for name, field in fields.items() if "default" in field}
     assert defaults == {
         "grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scene": "free", "faces": "drawn",
-        "neighbours": [], "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240, "channels": [],
-        "friction": 1.0, "want": "valid", "budget": 4.0, "referee": "certificate", "audits": 8, "robustness": 0,
-        "target": "",
+        "neighbours": [], "touch": 0.0, "scenes": 0, "views": 0, "stereo": False, "width": 320, "height": 240,
+        "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0, "referee": "certificate",
+        "audits": 8, "robustness": 0, "target": "",
     }  # fmt: skip
 
 

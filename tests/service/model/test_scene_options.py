@@ -73,6 +73,7 @@ def test_a_job_in_a_scene_is_another_job_and_makes_its_scenes_first() -> None:
 @pytest.mark.parametrize(
     "changes",
     [{"scene": "bin"}, {"scene": {"supports": [PLANE]}}, {"scenes": 5}, {"faces": "all"}, {"seed": 1},
+     {"touch": 2}, {"touch": -0.5},
      {"fidelity": "draft"}],
 )  # fmt: skip
 def test_whatever_moves_scenes_gives_them_another_address(changes: dict[str, Any]) -> None:
@@ -94,6 +95,15 @@ def test_a_document_is_a_scene_and_comes_back_as_it_was() -> None:
     assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
 
 
+def test_fingertips_may_touch_unless_the_request_or_its_document_says_otherwise() -> None:
+    assert "touch" not in request(scene="table").model_dump()
+    assert record(request(scene="table", touch=0)).id == record(request(scene="table")).id
+    assert request(scene="table").place.touch == 0
+    document = {"supports": [PLANE], "touch": -0.5}
+    assert request(scene=document).place.touch == -0.5
+    assert request(scene=document, touch=2).place.touch == 2
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -108,6 +118,10 @@ def test_a_document_is_a_scene_and_comes_back_as_it_was() -> None:
         ({"scene": {"supports": [PLANE], "file": "/etc/passwd"}}, "Extra inputs"),
         ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0]}, "faces": "all"}, "lies on one face"),
         ({"faces": "all"}, "lies on no face"),
+        ({"touch": 1}, "nothing to touch"),
+        ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
+        ({"scene": "table", "touch": 2.5}, "less than or equal to 2"),
+        ({"scene": "table", "touch": float("nan")}, "finite number"),
         ({"scene": "table", "method": "dfc"}, "plans around free objects only"),
         ({"scene": "table", "robustness": 2}, "six pushes"),
         ({"scene": "table", "scenes": 65}, "less than or equal to 64"),

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from service.model.errors import InputError
+from service.model.scene_options import scene_option
 from service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene
 
 TABLE = {"supports": [{"kind": "half_space"}]}
@@ -74,6 +75,16 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, content: bytes, suffix: 
 def test_an_unknown_kind_lists_those_there_are() -> None:
     with pytest.raises(InputError, match="free, table, bin, shelf"):
         parse_scene("garden")
+
+
+def test_how_near_fingertips_come_is_said_by_the_file_or_over_it(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text("supports: [{kind: half_space}]\ntouch: -0.5\n")
+    assert (parse_scene(str(path)).touch, parse_scene(str(path), touch=1.0).touch) == (-0.5, 1.0)
+    assert scene_option(str(path))["touch"] == -0.5
+    path.write_text("supports: [{kind: half_space}]\ntouch: -3\n")
+    with pytest.raises(InputError, match="touch: Input should be greater than or equal to -1"):
+        parse_scene(str(path))
 
 
 def test_a_missing_file_is_told() -> None:

@@ -13,7 +13,7 @@ from tests.worker.simulation.rigs import ball
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
 from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd.across import ACROSS, Openings, across, crossings_of
+from worker.planners.fast_graspd.across import ACROSS, LOW_M, Openings, across, crossings_of
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.simulation.obstacles import DeviceObstacles
@@ -66,7 +66,7 @@ def test_hands_hold_the_middle_between_their_fingers_and_come_from_a_free_way(bl
     opening, known = Openings.of(oppositions_of(barrett), block, lying(block)), oppositions_of(barrett)
     uniform = rng.random((40, 6))
     uniform[:, 5] = 0.0
-    pivot, rotation, q, away = across(
+    pivot, rotation, q, away, _ = across(
         barrett, block, opening, uniform, np.zeros((40, barrett.dofs)), np.array([[0.0, 0, 1]])
     )
     # Without noise the dofs are those of one of the known postures, whose middle lies in that of a pair.
@@ -92,3 +92,17 @@ def test_a_hand_around_an_edge_is_hindered_and_one_before_it_is_not(block, barre
     lost = hindrance(model, states, np.zeros(2, int))
     assert lost[0] == 0.0
     assert lost[1] > 0.1
+
+
+def test_what_lies_low_is_told_only_where_fingertips_may_touch(block, barrett) -> None:
+    known, flat = oppositions_of(barrett), block.vertices * [1, 1, 0.2]
+    thin = replace(block, vertices=flat, centre_of_mass=block.centre_of_mass * [1, 1, 0.2], digest="7" * 64)
+    scene = lying(thin)
+    assert not Openings.of(known, thin, scene).low.any()
+    (table,) = scene.obstacles
+    opening = Openings.of(known, thin, replace(scene, obstacles=(replace(table, tips_m=0.0),)))
+    height = opening.pairs.middle[:, 2] - flat[:, 2].min()
+    assert np.array_equal(opening.low, height < LOW_M) and opening.low.any()
+    uniform, ways = np.random.default_rng(0).random((40, 6)), np.array([[0.0, 0, 1]])
+    *_, low = across(barrett, thin, opening, uniform, np.zeros((40, barrett.dofs)), ways)
+    assert np.array_equal(low, opening.low[np.searchsorted(opening.sums, uniform[:, 0])])

@@ -15,6 +15,7 @@ from worker.grasps import GraspSet, Posture
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
 from worker.quality.referee.model import MujocoOptions, build
+from worker.simulation.obstacles import obstacle_distances
 from worker.simulation.surroundings import Neighbour, Obstacle, Placed
 
 HALF, HEIGHT = 0.03, 0.05
@@ -79,6 +80,19 @@ def test_a_hand_that_comes_through_the_box_has_touched_it() -> None:
 
 def test_a_hand_that_comes_from_below_has_touched_the_table() -> None:
     assert lift_test().lift(grasp(0.05, np.array([0, 0, 1.0])), 0).outcome is LiftOutcome.TOUCHED_ON_THE_WAY
+
+
+@pytest.mark.parametrize(("tips_m", "touched"), [(None, True), (0.0, True), (-0.0005, True), (-0.001, False)])
+def test_fingertips_press_into_the_table_as_deep_as_it_says_and_no_deeper(tips_m: float | None, touched: bool) -> None:
+    """A way that ends with the pads 0.8 mm in the table."""
+    placed = Placed((dataclasses.replace(PLACED.supports[0], tips_m=tips_m),), PLACED.object_pose, PLACED.index)
+    given = grasp(0.05)
+    down = obstacle_distances(HAND, given.grasp, placed.scenes[0])[0] + 0.0008
+    assert given.approach is not None
+    for part in (given.grasp.hand_pose, given.pregrasp.hand_pose, given.squeeze.hand_pose, given.approach[0]):
+        part[:, 2] += down
+    found = Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports), placed).lift(given, 0)
+    assert (found.outcome is LiftOutcome.TOUCHED_ON_THE_WAY) == touched
 
 
 def test_the_letter_does_not_look_at_the_way() -> None:

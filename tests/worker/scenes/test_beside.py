@@ -17,7 +17,7 @@ from service.model.scene_spec import SceneSpec
 from service.store.shards import read_shard
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.test_solids import geom_distances
-from tests.worker.simulation.test_surroundings import mujoco_distances
+from tests.worker.simulation.test_surroundings import mujoco_room
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
@@ -114,7 +114,7 @@ def test_the_whole_way_between_neighbours_is_as_clear_as_it_says_by_mujocos_dist
         lifting = Posture(np.repeat(one.grasp.hand_pose, 30, axis=0), np.repeat(one.grasp.joint_positions, 30, axis=0))
         lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
         for part in (coming, closing, lifting):
-            found = [mujoco_distances(hand, part, scene.obstacles[0])]
+            found = [mujoco_room(hand, part, scene.obstacles[0])]
             found += [geom_distances(hand, part, solid) for solid in scene.obstacles[1:]]
             assert np.min(found) >= MARGIN_M - 5e-4
 

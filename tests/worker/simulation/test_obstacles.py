@@ -27,6 +27,7 @@ BALL = np.random.default_rng(5).normal(size=(300, 3))
 BALL = 0.04 * BALL / np.linalg.norm(BALL, axis=1, keepdims=True) + [0.33, 0.02, 0.02]
 SCENES = {
     "table": (Obstacle.half_space([0.1, -0.2, 1.0], -0.02),),
+    "a table to press into": (replace(Obstacle.half_space([0.1, -0.2, 1.0], -0.02), tips_m=-0.001),),
     "corner of two walls": (
         Obstacle.half_space([0, 0, 1], -0.03),
         Obstacle.box([0.327, 0.013, 0.011, 0.9, 0.1, 0.2, 0.3], [0.11, 0.6, 0.4]),
@@ -52,6 +53,12 @@ def distances(hand: HandModel, state: HandState, obstacle: Obstacle) -> np.ndarr
     return np.max(per_plane, axis=0)
 
 
+def kept(hand: HandModel, obstacle: Obstacle) -> np.ndarray:
+    """(F,) distance that features keep."""
+    tip = np.isin(hand.features.body, hand.fingertips)
+    return np.where(tip & (obstacle.tips_m is not None), obstacle.tips_m or 0.0, MARGIN)
+
+
 def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> tuple[Model, Data]:
     obj = ball()
     model, data = rig(hand, obj, capacity=1, options=LossOptions(simulate=False, leak=0.0, range_weight=0.0))
@@ -72,6 +79,7 @@ def reaching(hand: HandModel) -> HandState:
     ("name", "scene"),
     [
         *((name, "table") for name in ("allegro", "barrett", "shadow")),
+        ("barrett", "a table to press into"),
         ("barrett", "a stick and a board"),
         pytest.param("allegro", "corner of two walls", marks=pytest.mark.slow),
         pytest.param("shadow", "corner of two walls", marks=pytest.mark.slow),
@@ -84,7 +92,7 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
     state = reaching(hand)
 
     def energy(at: HandState) -> float:
-        short = [np.minimum(distances(hand, at, o) - MARGIN, 0.0) for o in obstacles]
+        short = [np.minimum(distances(hand, at, o) - kept(hand, o), 0.0) for o in obstacles]
         solids = [o for o in obstacles if len(o.corners)]
         short += [nearest_edges(hand, bodies_of(hand, at), o, MARGIN) - MARGIN for o in solids]
         return float(sum((s**2).sum() for s in short))
@@ -111,6 +119,16 @@ def test_the_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str) ->
     expected = max(0.0, MARGIN - distances(hand, reaching(hand), obstacles[0]).min())
     # float32 coordinates of 0.1 m.
     np.testing.assert_allclose(data.deepest(1)[0], expected, atol=1e-6)
+
+
+def test_a_start_keeps_a_quarter_of_its_room_under_fingertips_that_may_touch() -> None:
+    hand, (table,) = hand_from_path("barrett"), SCENES["a table to press into"]
+    model, data = simulation_in(hand, (table,))
+    data.set_state(reaching(hand))
+    record_placement(model, data, room=0.006).run()
+    tip = np.isin(hand.features.body, hand.fingertips)
+    lack = kept(hand, table) + np.where(tip, 0.0015, 0.006) - distances(hand, reaching(hand), table)
+    np.testing.assert_allclose(data.deepest(1)[0], max(0.0, float(lack.max())), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ from service.model.transforms import apply, quat_rotate
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
-from worker.simulation.obstacles import obstacle_distances
-from worker.simulation.surroundings import Obstacle, Placed, Surroundings
+from worker.hands.model import HandModel
+from worker.simulation.obstacles import body_distances, body_room, obstacle_distances, obstacle_room
+from worker.simulation.surroundings import CLEAR_M, Obstacle, Placed, Surroundings
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
@@ -78,6 +81,39 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
     found = obstacle_distances(hand, postures, Surroundings((plane,), plane.planes[0, :3]))
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
+
+
+def test_fingertips_have_more_room_over_what_they_may_touch_and_nothing_else_has() -> None:
+    hand = hand_from_path("barrett")
+    posture = Posture(np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(hand.preshape[None]))
+    table, wall = Obstacle.half_space([0, 0, 1], -0.3), Obstacle.half_space([1, 0, 0], -0.4)
+    up = np.array([0.0, 0, 1])
+    tips = np.isin(np.arange(hand.bodies), hand.fingertips)
+    alone, beside = (body_distances(hand, posture, Surroundings((one,), up))[0] for one in (table, wall))
+    to_touch = replace(table, tips_m=-0.0005)
+    found = body_room(hand, posture, Surroundings((to_touch, wall), up))[0]
+    np.testing.assert_array_equal(found, np.minimum(alone + np.where(tips, 0.0025, 0.0), beside))
+    assert obstacle_room(hand, posture, Surroundings((to_touch, wall), up))[0] == found.min()
+    pose = np.array([0.1, 0, 0, 0.6, 0, 0.8, 0])
+    assert to_touch.seen_from(pose).tips_m == -0.0005, "a support keeps what it says wherever it is seen from"
+
+
+def parted(hand: HandModel) -> tuple[HandModel, HandModel]:
+    """The hand's fingertips alone, and the rest of it."""
+    tip = [piece.body in hand.fingertips for piece in hand.pieces]
+    return tuple(
+        replace(hand, pieces=tuple(p for p, is_tip in zip(hand.pieces, tip, strict=True) if is_tip == wanted))
+        for wanted in (True, False)
+    )
+
+
+def mujoco_room(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
+    """As `obstacle_room` has it, by MuJoCo's distances."""
+    if obstacle.tips_m is None:
+        return mujoco_distances(hand, postures, obstacle)
+    tips, rest = parted(hand)
+    over = mujoco_distances(tips, postures, obstacle) + CLEAR_M - obstacle.tips_m
+    return np.minimum(mujoco_distances(rest, postures, obstacle), over)
 
 
 def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:

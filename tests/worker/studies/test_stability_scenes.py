@@ -14,7 +14,7 @@ from graspd.cli import build
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.model.stability import MapCell, Stability, StabilityMap, from_json
-from tests.worker.simulation.test_surroundings import mujoco_distances
+from tests.worker.simulation.test_surroundings import mujoco_room
 from worker.certified import Certified
 from worker.commands.stability import app
 from worker.engines import backend
@@ -38,7 +38,7 @@ def assert_valid_ones_are_clear(hand: HandModel, found: Certified, spec: SceneSp
     assert spec.target is not None
     for support in supports_of(spec) if len(rows) else ():
         seen = support.seen_from(np.asarray(spec.target, float))
-        assert mujoco_distances(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6
+        assert mujoco_room(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6
 
 
 def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> None:

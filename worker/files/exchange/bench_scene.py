@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.scene_spec import SceneSpec
 from service.model.transforms import compose, invert
 from worker.files.exchange.bench_mapping import HandMapping
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
-from worker.simulation.surroundings import Obstacle, Placed
+from worker.scenes.kinds import supports_of
+from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -58,12 +60,13 @@ def is_tabletop(row: Row) -> bool:
 
 
 def placed_of(obj_pose: Floats) -> Placed:
-    """The tables that N grasps are on, from their objects' poses (N, 7): equal ones are one scene."""
+    """The tables that N grasps are on, which fingertips may touch, from their objects' poses (N, 7): equal ones are one
+    scene."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     number = np.empty(len(order), np.intp)
     number[order] = np.arange(len(order))
-    return Placed((Obstacle.half_space([0, 0, 1], 0.0),), obj_pose[first[order]], number[index.reshape(-1)])
+    return Placed(supports_of(SceneSpec(kind="table")), obj_pose[first[order]], number[index.reshape(-1)])
 
 
 def with_way(

@@ -36,6 +36,9 @@ BESIDE_M: Final = 0.03
 FAR: Final = 0.02
 STEEP: Final = 0.5
 SELDOM: Final = 0.1
+#: A pair whose middle is nearer to a support than this lies low: pads that look at it would have their ends in the
+#: support, for fingertips reach 15 to 25 mm beyond the middle of their pads [m].
+LOW_M: Final = 0.02
 #: Noise of the posture as a share of each joint's range, ways that are compared, and differences of width that postures
 #: are taken from [m].
 NOISE: Final = 0.03
@@ -107,6 +110,8 @@ class Openings:
     pairs: Crossings
     sums: Floats
     """(P,) cumulative chance; empty: there is nothing."""
+    low: NDArray[np.bool_]
+    """(P,) whether a pair lies low over a support that fingertips may touch."""
     within_reach: bool
     """Whether a pair lies nearly level, clear of the obstacles, and is no wider than the hand opens: the geometric
     condition for a grasp between opposed fingers from above or from the side."""
@@ -116,23 +121,25 @@ class Openings:
         pairs = crossings_of(obj)
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
         if not fits.any():
-            return cls(pairs, np.zeros(0), False)
+            return cls(pairs, np.zeros(0), np.zeros(len(pairs), bool), False)
         aside = pairs.middle - obj.centre_of_mass
         aside = aside - (aside @ scene.up)[:, None] * scene.up
         chance = np.exp(-((np.linalg.norm(aside, axis=1) / BESIDE_M) ** 2)) + FAR
-        room = np.full(len(pairs), np.inf)
+        room, low = np.full(len(pairs), np.inf), np.zeros(len(pairs), bool)
         for obstacle in scene.obstacles:
+            if obstacle.tips_m is not None:
+                low |= obstacle.distance(pairs.middle) < LOW_M
             for end in pairs.ends():
                 room = np.minimum(room, obstacle.distance(end))
         easy = room >= MARGIN_M
         level = np.abs(pairs.axis @ scene.up) < STEEP
         chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
-        return cls(pairs, np.cumsum(chance) / chance.sum(), bool((fits & easy & level).any()))
+        return cls(pairs, np.cumsum(chance) / chance.sum(), low, bool((fits & easy & level).any()))
 
 
 def across(
     hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, normal: Floats, ways: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
     """Hands that reach across the object.
 
     Args:
@@ -144,7 +151,8 @@ def across(
         ways: (K, 3) free directions away from the object.
 
     Returns:
-        Palm centres (n, 3) from the centre of mass [m], rotations (n, 4), dofs (n, D), directions of retreat (n, 3).
+        Palm centres (n, 3) from the centre of mass [m], rotations (n, 4), dofs (n, D), directions of retreat (n, 3),
+        whether the pair lies low (n,).
     """
     known = oppositions_of(hand)
     pair = np.minimum(np.searchsorted(opening.sums, uniform[:, 0]), len(opening.sums) - 1)
@@ -165,7 +173,7 @@ def across(
     # Between holding with the fingertips and with the palm against the object.
     deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
-    return pivot - obj.centre_of_mass, quat_from_matrix(turn), q, away
+    return pivot - obj.centre_of_mass, quat_from_matrix(turn), q, away, opening.low[pair]
 
 
 def _frames(first: Floats, second: Floats) -> Floats:

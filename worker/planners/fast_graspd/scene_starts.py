@@ -105,7 +105,8 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
         if not len(rows):
             break
         reach = reaching[rows] & (number < REACHES)
-        states = around.draws(uniform[rows, number], normal[rows, number], scene[rows], reach)
+        states, low = around.draws(uniform[rows, number], normal[rows, number], scene[rows], reach)
+        _raise(states, np.flatnonzero(low), placed, scene[rows], probe)
         found = _depths(probe, states, scene[rows])
         # The nearest clear distance, or else the least deep.
         clear = found <= CLEAR
@@ -144,6 +145,22 @@ def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp]) -> Floats:
     return found
 
 
+def _raise(states: HandState, rows: NDArray[np.intp], placed: Placed, scene: NDArray[np.intp], probe: Probe) -> None:
+    """Lift draws `rows` at all their distances, scenes (n,), by what the nearest lacks of its room from obstacles.
+
+    Steps of retreat are too coarse for what lies low: fingers would end above it, not beside it.
+    """
+    if not len(rows):
+        return
+    nearest = states[rows * len(RETREATS)]
+    probe.data.set_scenes(scene[rows])
+    probe.depths(nearest)
+    lack = probe.data.depths.obstacles.numpy()[: len(rows), None].astype(float)
+    up = np.array([placed.scenes[s].up for s in scene[rows]])
+    every = (rows[:, None] * len(RETREATS) + np.arange(len(RETREATS))).ravel()
+    states.pivot[every] += np.repeat(lack * up, len(RETREATS), axis=0)
+
+
 @dataclass(frozen=True)
 class _Around:
     """What draws of one hand around one object share."""
@@ -155,29 +172,33 @@ class _Around:
     """Free directions of each scene."""
     openings: list[Openings]
 
-    def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> HandState:
+    def draws(
+        self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
+    ) -> tuple[HandState, NDArray[np.bool_]]:
         """Candidates (n * len(RETREATS) hands), each at each distance, from random numbers (n, 7) and (n, 2 + D), in
-        scenes (n,); `reach` (n,): across the object."""
+        scenes (n,), and which of the n take hold of what lies low; `reach` (n,): across the object."""
         n, dofs = len(uniform), self.hand.dofs
         found = [np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))]
+        low = np.zeros(n, bool)
         for s in np.unique(scene):
             for rows in (np.flatnonzero((scene == s) & reach), np.flatnonzero((scene == s) & ~reach)):
                 if not len(rows):
                     continue
                 if reach[rows[0]]:
                     given = uniform[rows, :6], normal[rows, 2:], self.ways[s]
-                    parts = across(self.hand, self.obj, self.openings[s], *given)
+                    *parts, low[rows] = across(self.hand, self.obj, self.openings[s], *given)
                 else:
-                    parts = self._towards(uniform[rows], normal[rows], self.ways[s])
+                    parts = list(self._towards(uniform[rows], normal[rows], self.ways[s]))
                 for whole, part in zip(found, parts, strict=True):
                     whole[rows] = part
         pivot, rotation, q, away = found
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
         repeat = len(RETREATS)
-        return HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
+        states = HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
+        return states, low
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Hands that look at random points of the surface, as `across` gives them."""
+        """Hands that look at random points of the surface, as `across` gives them, without a pair."""
         hand, obj, surface = self.hand, self.obj, self.surface
         face = np.minimum(np.searchsorted(surface.sums, uniform[:, 0]), len(surface.sums) - 1)
         u, v = uniform[:, 1:2], uniform[:, 2:3]

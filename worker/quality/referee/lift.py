@@ -1,7 +1,8 @@
 """The lift test: the object stands in its scene, the hand closes, squeezes, lifts it and holds it.
 
 letter: DexGraspBench's tabletop test as published: from the pregrasp, 1 N downwards, 10 cm up in 0.4 s, no hold.
-lift: the hand comes from its standoff and must touch nothing on the way; after the lift it holds for 2 s, cut short as
+lift: the hand comes from its standoff and must touch nothing on the way, but that fingertips may touch supports, or
+press into them, as deep as the scene says; after the lift it holds for 2 s, cut short as
 the certificate's pushes are.
 Neighbours stand on the table as free bodies; at level lift they must not be moved 2 cm, nor toppled.
 The world of the simulation is the object frame: the scene lies under it as it stood when the object came to rest.
@@ -185,7 +186,9 @@ class Lift(Test):
         ours, support = self.scene.hand_geoms[geom], self.scene.support_geoms[geom]
         of_hand = ours.any(axis=1) & ~ours.all(axis=1)
         on_support = of_hand & support.any(axis=1)
-        return bool((distance[on_support] < 0).any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
+        tip = self.scene.tip_geoms[geom].any(axis=1)
+        allowed = np.where(tip, self.scene.pressing[geom].max(axis=1), 0.0)
+        return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int) -> None:
         squeeze = grasps.squeeze.take(slice(row, row + 1))

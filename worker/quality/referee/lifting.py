@@ -136,6 +136,8 @@ def lift_key(
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}
     physics = asdict(MujocoOptions().hardened() if hard else MujocoOptions())
     terms = [REVISION, pushes, level, physics, digest_bytes(supports), constants]
+    if any(support.tips_m is not None for support in placed.supports):
+        terms.append([support.tips_m for support in placed.supports])
     if placed.neighbours:
         corners = b"".join(np.round(piece, 9).tobytes() for one in placed.neighbours for piece in one.pieces)
         terms += [digest_bytes(corners), [DENSITY, protocol.NEIGHBOUR_MOVED_M, protocol.NEIGHBOUR_TILTED]]

@@ -16,7 +16,7 @@ from worker.grasps import Posture
 from worker.hands.model import ConvexPiece, HandModel, JointType
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.simulation.surroundings import Neighbour, Obstacle
+from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 Floats = NDArray[np.float64]
 
@@ -39,6 +39,8 @@ NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjt
 #: Inertia of a body without geometry: that of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
 _MIN_MASS: Final = 1e-3
+#: Fingertips that are told to touch a support are in it by as much at most, for the way is looked at in steps [m].
+TOUCH_ROUNDING_M: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,10 @@ class Scene:
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
     neighbours: tuple[FreeBody, ...]
     """The other objects of the scene."""
+    tip_geoms: NDArray[np.bool_]
+    """(G,) geoms of fingertips."""
+    pressing: Floats
+    """(G,) how deep fingertips that come may press into a geom [m]: above 0 of supports that say so."""
 
     def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
         """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
@@ -146,7 +152,17 @@ def build(
         centre=obj.centre_of_mass,
         support_geoms=np.asarray(support),
         neighbours=beside,
+        tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
+        pressing=_pressing(model, supports),
     )
+
+
+def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
+    out = np.zeros(model.ngeom)
+    for i, support in enumerate(supports):
+        if support.tips_m is not None and support.tips_m < CLEAR_M:
+            out[model.geom(f"support{i}").id] = max(0.0, -support.tips_m) + TOUCH_ROUNDING_M
+    return out
 
 
 def _free_body(model: Any, name: str, obj: ObjectModel) -> FreeBody:

@@ -10,6 +10,9 @@ from worker.simulation.kernels.projection import Residuals, emit
 
 wp.set_module_options({"enable_backward": False})
 
+#: Share of a start's room that fingertips keep from supports which they may come near.
+TIP_ROOM = wp.constant(wp.float32(0.25))
+
 
 @wp.struct
 class Features:
@@ -21,6 +24,7 @@ class Features:
     radius: wp.array(dtype=wp.float32)
     margin: wp.array(dtype=wp.float32)  # distance to keep [m]; negative: it may sink in
     weight: wp.array(dtype=wp.float32)
+    tip: wp.array(dtype=wp.int32)  # 1: of a fingertip
     first: wp.array(dtype=wp.int32)  # (P + 1,) features of a piece
     first_edge: wp.array(dtype=wp.int32)  # (P + 1,)
     start: wp.array(dtype=wp.vec3)  # (E,) ends of an edge, body frame
@@ -46,6 +50,7 @@ class Obstacles:
     first_solid: wp.array(dtype=wp.int32)  # (S,) first that has corners
     first_plane: wp.array(dtype=wp.int32)  # (O + 1,)
     planes: wp.array(dtype=wp.vec4)  # outward unit normal and offset
+    tips: wp.array(dtype=wp.float32)  # (O,) distance that fingertips keep, where that is less than their margin [m]
     centre: wp.array(dtype=wp.vec3)  # (O,) bounding sphere
     radius: wp.array(dtype=wp.float32)  # (O,)
     first_edge: wp.array(dtype=wp.int32)  # (O + 1,)
@@ -104,6 +109,15 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
     return wp.vec4(n[0], n[1], n[2], d)
 
 
+@wp.func
+def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, room: wp.float32):
+    """Distance that feature i keeps from obstacle k [m], with `room` besides."""
+    out = features.margin[i] + room
+    if features.tip[i] != 0:
+        out = wp.min(out, obstacles.tips[k] + TIP_ROOM * room)
+    return out
+
+
 @wp.kernel
 def clear(
     # Data in:
@@ -141,11 +155,10 @@ def penalty(
     if active_in[b] == 0 or scene_in[b] < 0:
         return
     f = posed(features_in, i, b, body_p_in, body_q_in)
-    margin = features_in.margin[i]
     weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
     for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
         nd = obstacle_distance(obstacles_in, k, f)
-        short = nd[3] - margin - room_in
+        short = nd[3] - kept(features_in, obstacles_in, i, k, room_in)
         if short < 0.0:
             n = wp.vec3(nd[0], nd[1], nd[2])
             if weight != 0.0:
@@ -176,9 +189,9 @@ def residuals(
     if active_in[b] == 0 or scene_in[b] < 0:
         return
     f = posed(features_in, i, b, body_p_in, body_q_in)
-    margin = features_in.margin[i]
     for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
         nd = obstacle_distance(obstacles_in, k, f)
+        margin = kept(features_in, obstacles_in, i, k, 0.0)
         if nd[3] < margin + near_in:
             n = wp.vec3(nd[0], nd[1], nd[2])
             emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, nd[3] - margin - target_in, 1.0)

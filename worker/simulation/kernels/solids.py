@@ -9,7 +9,7 @@ tangents that meet below it: where they meet is a lower bound, so that edges whi
 
 import warp as wp
 
-from worker.simulation.kernels.obstacles import Features, Obstacles, lowest_point, obstacle_distance, posed
+from worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
 from worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
 from worker.simulation.kernels.projection import Residuals, emit
 
@@ -245,9 +245,9 @@ def penalty(
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
-    keep = features_in.margin[first] + room_in
     weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[first]
     for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+        keep = kept(features_in, obstacles_in, first, k, room_in)
         if apart(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
             continue
         for i in range(first, features_in.first[piece + 1]):
@@ -292,9 +292,10 @@ def residuals(
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
-    keep = features_in.margin[first] + near_in
-    target = features_in.margin[first] + target_in
     for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+        margin = kept(features_in, obstacles_in, first, k, 0.0)
+        keep = margin + near_in
+        target = margin + target_in
         if apart(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
             continue
         for i in range(first, features_in.first[piece + 1]):
