@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from service.model.domain import BATCH_SIZE, JobOptions
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
+from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
 from worker.planners import Trial, Wanted, fitting_pairs, synthesize
 from worker.quality.gate import passes
@@ -110,10 +111,12 @@ def certified_grasps(
         run: told of the share that is done; asked often whether to stop. Its device is the planner's.
 
     Raises:
+        HandError: no two digits of the hand oppose each other.
         InputError: the object does not fit into the gripper.
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
+    require_opposing(hand)
     fitting_pairs(hand, obj)
     work = _Work(hand, obj, request, batch, run)
     work.scenes = scenes

@@ -52,15 +52,15 @@ class Assets:
         """
         return self._parts.store.get(names.asset_model(asset.kind, asset.digest))
 
-    def add(self, kind: AssetKind, name: str, files: Mapping[str, bytes]) -> AssetView:
-        """Keep an uploaded hand or object; the keeper queues its check.
+    def add(self, kind: AssetKind, name: str, files: Mapping[str, bytes], *, self_test: bool = False) -> AssetView:
+        """Keep an uploaded hand or object; the keeper queues its check, which ends with grasps if `self_test` says so.
 
         Raises:
             ConflictError: the name stands for other content, or the content has another name.
         """
         self._refuse_taken(kind, name, digest_files(kind, files))
         index, store = self._parts.index, self._parts.store
-        asset = library.store_files(store, kind, name, files, owner=caller_id())
+        asset = library.store_files(store, kind, name, files, owner=caller_id(), self_test=self_test)
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
         with index.database.writing() as connection:
             self._refuse_taken(kind, name, asset.digest)

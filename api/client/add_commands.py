@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -43,6 +43,10 @@ from service.store.object_sets import files_of_set
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
 
+#: How long a check is waited for, without and with a self-test [s].
+_CHECK_S: Final = 120.0
+_SELF_TEST_S: Final = 900.0
+
 
 @reporting_errors
 def add_hand(
@@ -60,18 +64,22 @@ def add_hand(
     drop: DropOption = None,
     licence: LicenceOption = None,
     source: SourceOption = None,
+    self_test: Annotated[
+        bool, typer.Option("--self-test/--no-self-test", help="Record how many of 64 grasps of plain objects hold.")
+    ] = False,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload a hand, wait for its check, and say what was guessed."""
+    """Upload a hand, wait for its check, say what was guessed, and with --self-test what it holds."""
     options = hand_options(
         urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
         fingertips=fingertips, fix=fix, drop=drop,
     )  # fmt: skip
     options |= provenance(licence, source)
     with upload_of(file) as (upload, main):
-        _add(AssetKind.HAND, upload, name, ({"file": main} if main else {}) | options, wait=wait, url=url, json=json)
+        said = ({"file": main} if main else {}) | options
+        _add(AssetKind.HAND, upload, name, said, self_test=self_test, wait=wait, url=url, json=json)
 
 
 @reporting_errors
@@ -107,12 +115,20 @@ def add_object(
 
 
 def _add(
-    kind: AssetKind, file: Path, name: str | None, options: dict[str, Any], *, wait: bool, url: str | None, json: bool
+    kind: AssetKind,
+    file: Path,
+    name: str | None,
+    options: dict[str, Any],
+    *,
+    self_test: bool = False,
+    wait: bool,
+    url: str | None,
+    json: bool,
 ) -> None:
     with open_client(url) as client:
-        asset = client.upload(kind, file, name=name or name_of_upload(file.name), options=options)
+        asset = client.upload(kind, file, name=name or name_of_upload(file.name), options=options, self_test=self_test)
         if wait:
-            asset = client.wait_checked(kind, asset.name)
+            asset = client.wait_checked(kind, asset.name, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
     show_asset(asset.model_dump(mode="json"), json=json)
     if asset.verdict == "refuse":
         raise InputError(f"refused: {asset.message}")

@@ -100,10 +100,20 @@ class Client:
         return AssetView.model_validate_json(self.send("GET", f"/v1/{kind.value}s/{name}").content)
 
     def upload(
-        self, kind: AssetKind, path: Path, *, name: str | None = None, options: dict[str, Any] | None = None
+        self,
+        kind: AssetKind,
+        path: Path,
+        *,
+        name: str | None = None,
+        options: dict[str, Any] | None = None,
+        self_test: bool = False,
     ) -> AssetView:
-        """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened."""
+        """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened.
+
+        The check of a hand ends with the self-test if wanted.
+        """
         fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
+        fields |= {"self_test": "true"} if self_test else {}
         try:
             with path.open("rb") as file:
                 answer = self.send(

@@ -23,6 +23,7 @@ from service.cli import JsonFlag, emit, reporting_errors
 from service.model.domain import AssetKind, State
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
+from service.store.asset_summary import self_test_line
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -208,6 +209,8 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         table = Table("name", "file", "size", "check", "digest", box=None, header_style="bold")
         for asset in assets:
             origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
+            if says := self_test_line(asset.facts):
+                origin += f"; {says}"
             table.add_row(asset.name, asset.filename, size(asset.size_bytes), origin, asset.digest[:12])
         Console().print(table)
 

@@ -21,7 +21,7 @@ from api.routes.paging import link_next
 from api.uploads import files_of_upload, name_of_upload
 from service.index.views import AssetView, Page
 from service.model.domain import AssetKind, Name
-from service.model.errors import RateError
+from service.model.errors import InputError, RateError
 from service.store.hand_corrections import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
@@ -97,11 +97,18 @@ def asset_router(kind: AssetKind) -> APIRouter:
         options: Annotated[
             str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
         ] = "",
+        self_test: Annotated[
+            bool, Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker")
+        ] = False,
     ) -> AssetView:
         """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
         limit = request.app.state.settings.max_upload_bytes
         uploads: Turns = request.app.state.uploads
-        asset = await uploads.run(store_upload, assets, kind, file, name, limit_bytes=limit, options=options)
+        if self_test and kind is not AssetKind.HAND:
+            raise InputError("self_test: only a hand can be tried")
+        asset = await uploads.run(
+            store_upload, assets, kind, file, name, limit_bytes=limit, options=options, self_test=self_test
+        )
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         response.headers["Retry-After"] = "1"
         return asset
@@ -121,7 +128,14 @@ def asset_router(kind: AssetKind) -> APIRouter:
 
 
 def store_upload(
-    assets: Assets, kind: AssetKind, file: AnyUpload, name: str | None, *, limit_bytes: int, options: str = ""
+    assets: Assets,
+    kind: AssetKind,
+    file: AnyUpload,
+    name: str | None,
+    *,
+    limit_bytes: int,
+    options: str = "",
+    self_test: bool = False,
 ) -> AssetView:
     """An asset of immutable bytes, and the task that checks it. The upload lies in a file of its own until then.
 
@@ -131,7 +145,7 @@ def store_upload(
     filename = file.filename or ""
     with _one_of_few():
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
-        return assets.add(kind, name or name_of_upload(filename), files)
+        return assets.add(kind, name or name_of_upload(filename), files, self_test=self_test)
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:

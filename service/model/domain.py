@@ -337,6 +337,7 @@ class Asset(Model):
     builtin: bool = False
     owner: str = Field("", max_length=64, description="id of the API key that uploaded it; empty: none, or not known")
     facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
+    self_test: bool = Field(False, description="of a hand: whether the check ends with grasps of plain objects")
 
     # A newer graspd may have written more.
     model_config = ConfigDict(frozen=True, extra="ignore")

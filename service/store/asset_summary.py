@@ -39,6 +39,12 @@ def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
     return [f"{label:<18} {text}" for label, text in pairs]
 
 
+def self_test_line(facts: Mapping[str, Any]) -> str:
+    """What a hand's self-test says: `ready: 91 % hold`, or what is suspicious; empty: it was not tried."""
+    tried = facts.get("self_test")
+    return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
+
+
 def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     guessed = facts.get("guessed", [])
     lines: list[tuple[str, str]] = []
@@ -49,6 +55,8 @@ def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines.append(("fingertips", ", ".join(facts["fingertips"])))
     if "opening_m" in facts:
         lines.append(("opening", f"{1e3 * facts['opening_m']:.1f} mm between the pads"))
+    if says := self_test_line(facts):
+        lines.append(("self-test", says))
     if "dofs" in facts:
         lines.append(("dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"))
         lines += [("", _dof(name, facts)) for name in facts["dofs"]]

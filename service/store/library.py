@@ -54,6 +54,7 @@ def store_files(
     builtin: bool = False,
     created: str = "",
     owner: str = "",
+    self_test: bool = False,
 ) -> Asset:
     """The first half of `publish_asset`: the archive is there, and nothing counts it yet.
 
@@ -61,7 +62,7 @@ def store_files(
         InputError: `asset.json` is missing or wrong.
     """
     asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
-    asset = asset.model_copy(update={"owner": owner})
+    asset = asset.model_copy(update={"owner": owner, "self_test": self_test})
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         store.put_file(names.asset_files(kind, asset.digest), archive)

@@ -75,7 +75,7 @@ def check(
     if write and report["verdict"] != "refuse":
         _write(file, options, report, write)
     if self_test and report["verdict"] != "refuse":
-        from worker.studies.hand_self_test import self_test as tried
+        from worker.stages.hand_self_test import self_test as tried
 
         report["self_test"] = tried(hand_from_path(file, options)).facts()
     if json:

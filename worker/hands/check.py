@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from service.model.errors import HandError, InputError
+from service.model.errors import InputError
 from worker.hands.jaws import jaws_of
 from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
-from worker.hands.oppositions import opposes
+from worker.hands.oppositions import require_opposing
 from worker.hands.options import HandOptions, parse_options
 from worker.hands.read import read_robot
 from worker.hands.robot import Robot
@@ -35,8 +35,7 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
         robot = read_robot(files, main, settings.xacro)
         hand = assemble(robot, settings, files, main, name=name, digest="0" * 32)
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
-        if not opposes(hand):
-            raise HandError(f"{name}: {_why_not(hand)}")
+        require_opposing(hand)
     except InputError as error:
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
     stated = {
@@ -57,18 +56,6 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     notes = [*robot.notes, *_left_out(robot, hand, settings)]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
-
-
-def _why_not(hand: HandModel) -> str:
-    """What is missing of a hand that can hold nothing, and the mend."""
-    shaped = {piece.body for piece in hand.pieces}
-    bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
-    if bare:
-        return f"no two opposing digits: {', '.join(bare[:4])} have no collision shapes; give the hand with its fingers"
-    return (
-        "no two opposing digits: no two surfaces of it face each other and close, so it can hold nothing; "
-        "give the whole hand, or another --root"
-    )
 
 
 def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:

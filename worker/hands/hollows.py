@@ -89,6 +89,9 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
         parts = tuple(part for part in made if len(part) > 3 and np.ptp(part, axis=0).min() > _MIN_EXTENT_M)
         if parts and (error := surface.error(parts)) < least:
             best, least = parts, error
+        if len(made) >= MAX_PIECES:
+            # A finer threshold is merged back to as many pieces, at twice the time.
+            break
     return best, sure
 
 

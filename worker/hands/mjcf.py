@@ -17,7 +17,7 @@ import numpy as np
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, Floats, compose, invert, quat_from_axis_angle
 from worker.hands.mjcf_couplings import couplings
-from worker.hands.mjcf_servos import Servo, servos
+from worker.hands.mjcf_servos import Servo, commanded, servos
 from worker.hands.mjcf_source import self_contained
 from worker.hands.primitives import hull
 from worker.hands.robot import UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
@@ -40,9 +40,9 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
         HandError: MuJoCo does not take it, or it is no hand; the message names what is wrong.
         LimitError: larger than a hand is.
     """
-    text, assets = self_contained(files, main)
+    text, assets, notes = self_contained(files, main)
     model = _compile(text, assets, main)
-    reader = _Reader(model, main)
+    reader = _Reader(model, main, notes=notes)
     roots = reader.roots()
     if len(roots) == 1 and not reader.joints_of(roots[0]):
         reader.body(roots[0], "", IDENTITY_POSE)
@@ -75,11 +75,13 @@ class _Reader:
         self.name = ""
         self._mimics: dict[int, Mimic | float] = {}
         self._servos: dict[int, Servo] = {}
+        self._commanded: dict[int, tuple[float, float]] = {}
         self._bare = not self.model.ngeom or not any(
             self.model.geom_contype[g] or self.model.geom_conaffinity[g] for g in range(self.model.ngeom)
         )
         self._mimics, notes = couplings(self.model, self.joint_name)
         self._servos = servos(self.model, self._mimics)
+        self._commanded = commanded(self.model)
         self.notes += notes
 
     def roots(self) -> list[int]:
@@ -155,6 +157,9 @@ class _Reader:
         if not -4 * math.pi <= lower <= upper <= 4 * math.pi:
             raise HandError(f"{what}: range {lower:g} .. {upper:g} is reversed or too large")
         servo = self._servos.get(joint, Servo())
+        least, largest = self._commanded.get(joint, (lower, upper))
+        if max(lower, least) < min(upper, largest):
+            limited, lower, upper = True, max(lower, least), min(upper, largest)
         kind_name = "prismatic" if slides else "revolute" if limited else "continuous"
         return Joint(
             name, kind_name, parent, child, origin, axis, lower, upper, servo.effort, follows,

@@ -31,6 +31,9 @@ def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic |
         kind = int(model.eq_type[equality])
         if kind == int(mujoco.mjtEq.mjEQ_TENDON):
             ends = [joints_on_tendon(model, tendon) if tendon >= 0 else [] for tendon in (first, second)]
+            if len(ends[0]) == 2 and second < 0:
+                _note(notes, _couple_on_tendon(model, equality, ends[0], found, name))
+                continue
             if len(ends[0]) != 1 or len(ends[1]) != 1:
                 notes.append("an equality of tendons with several joints was left out")
                 continue
@@ -39,7 +42,17 @@ def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic |
             _note(notes, _couple(model, first, second, np.asarray(model.eq_data[equality, :5]), found, name))
     notes += _couple_by_tendons(model, found, name)
     notes += follow_loops(model, found, name)
+    _hold_followers(model, found, name)
     return found, notes
+
+
+def _hold_followers(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> None:
+    """What follows a joint that stands still, stands still."""
+    held = {name(joint): value for joint, value in found.items() if isinstance(value, float)}
+    while moved := [(j, f) for j, f in found.items() if isinstance(f, Mimic) and f.joint in held]:
+        for joint, follows in moved:
+            value = follows.multiplier * held[follows.joint] + follows.offset
+            found[joint] = held[name(joint)] = float(np.clip(value, *_range(model, joint)))
 
 
 def _note(notes: list[str], text: str) -> None:
@@ -76,6 +89,33 @@ def _couple_tendons(
     """The same for tendons of one joint each: c1 (q1 - q1_0) = p(c2 (q2 - q2_0))."""
     scaled = np.asarray(model.eq_data[equality, :5]) * other[1] ** np.arange(5) / one[1]
     return _couple(model, one[0], other[0], scaled, found, name)
+
+
+def _couple_on_tendon(
+    model: Any, equality: int, pulled: list[tuple[int, float]], found: dict[int, Mimic | float],
+    name: Callable[[int], str],
+) -> str:  # fmt: skip
+    """Two joints on a tendon of fixed length: c1 (q1 - q1_0) + c2 (q2 - q2_0) = p0. What no actuator moves, follows.
+
+    Limits go before the tendon: where they stop the follower it stays, as in a finger whose end gives way.
+    """
+    actuated = {joint for actuator in range(model.nu) for joint, _ in driven(model, actuator)}
+    free = [pair for pair in pulled if pair[0] not in found and pair[0] not in actuated]
+    if not free or abs(free[-1][1]) < 1e-9:
+        return f"a tendon of {' and '.join(name(joint) for joint, _ in pulled)} was left out"
+    joint, coefficient = free[-1]
+    ((driver, pull),) = [pair for pair in pulled if pair[0] != joint]
+    rest = [float(model.qpos0[model.jnt_qposadr[j]]) for j in (joint, driver)]
+    at = np.linspace(*_range(model, driver), _RANGE_POINTS)
+    line = rest[0] + (float(model.eq_data[equality, 0]) - pull * (at - rest[1])) / coefficient
+    values = np.clip(line, *_range(model, joint))
+    slope, constant = map(float, np.polyfit(at, values, 1))
+    if np.ptp(values) < 1e-6:
+        found[joint] = float(values[0])
+        return f"{name(joint)!r} stays at {values[0]:.3g}: its limits stop what its tendon asks of it"
+    found[joint] = Mimic(name(driver), slope, constant)
+    error = float(np.abs(values - constant - slope * at).max())
+    return f"{name(joint)!r} follows {name(driver)!r} by a line within {error:.2g}" if error > 1e-6 else ""
 
 
 def _couple_by_tendons(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> list[str]:

@@ -50,6 +50,21 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float]) -> dict[int, Servo]:
     return found
 
 
+def commanded(model: Any) -> dict[int, tuple[float, float]]:
+    """Values that a joint's own position servo can be told to go to: g k (u - q) with u within its range of control."""
+    found = {}
+    for actuator in range(model.nu):
+        kind, gain = int(model.actuator_trntype[actuator]), _gain(model, actuator)
+        gear = float(model.actuator_gear[actuator, 0])
+        if kind != int(mujoco.mjtTrn.mjTRN_JOINT) or gain <= 0 or not gear or not model.actuator_ctrllimited[actuator]:
+            continue
+        told = float(model.actuator_gainprm[actuator, 0]) * np.asarray(model.actuator_ctrlrange[actuator], float)
+        ends = (told + float(model.actuator_biasprm[actuator, 0])) / (gain * gear)
+        if np.ptp(ends) > 1e-6:
+            found[int(model.actuator_trnid[actuator, 0])] = float(ends.min()), float(ends.max())
+    return found
+
+
 def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
     """Joints that an actuator moves, with the rate at which its length changes with each."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])

@@ -6,6 +6,7 @@ the hand's files and renamed, and every part that a hand does not need is left o
 
 from __future__ import annotations
 
+import math
 import posixpath
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
@@ -36,8 +37,8 @@ _DROPPED: Final = frozenset(
 _MESHES: Final = (".stl", ".obj", ".msh")
 
 
-def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes]]:
-    """The model as one text, and the mesh files it names.
+def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
+    """The model as one text, the mesh files it names, and notes for the user.
 
     Raises:
         HandError: not XML, not MJCF, an include or a mesh is not there or lies outside the upload, or an element that
@@ -61,6 +62,9 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
             continue
         for name in _DROPPED & element.attrib.keys():
             del element.attrib[name]
+        if element.tag == "default":
+            # MuJoCo refuses what else stands there; others pass over it.
+            element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
     _prune(root)
     _prune_actuators(root)
     compiler = root.find("compiler")
@@ -69,7 +73,29 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     # Frames without mass are common in hands and stop MuJoCo's reader.
     compiler.set("boundmass", compiler.get("boundmass", "1e-9"))
     compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
-    return ElementTree.tostring(root, encoding="unicode"), assets
+    notes = []
+    if _means_radians(root):
+        compiler.set("angle", "radian")
+        notes.append("angles read as radians: in degrees no joint would turn (say so: <compiler angle=\"degree\"/>)")
+    return ElementTree.tostring(root, encoding="unicode"), assets, notes
+
+
+def _means_radians(root: Element) -> bool:
+    """Whether a model that states no unit of angles, so that they are degrees, is part of one that says radians: none of
+    its joints would turn by more than 2 pi degrees, and no angle is larger."""
+    if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
+        return False
+    hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]
+    ranges = [value for hinge in hinges for value in _numbers(hinge.get("range", ""))]
+    turns = [value for e in root.iter() for value in _numbers(e.get("euler", "")) + _numbers(e.get("axisangle", ""))[3:]]
+    return bool(ranges) and max(map(abs, ranges + turns)) <= 2 * math.pi
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return []
 
 
 def _parse(data: bytes, name: str) -> Element:

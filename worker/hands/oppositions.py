@@ -15,6 +15,7 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, quat_rotate
 from worker.hands.guess import posture
 from worker.hands.kinematics import body_poses
@@ -187,6 +188,34 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return finger, rank
 
 
+def require_opposing(hand: HandModel) -> None:
+    """Refuse a hand that can hold nothing, before any work; from memory where it was asked for before.
+
+    Raises:
+        HandError: no two of its surfaces face each other and close; the message says the mend.
+    """
+    with _lock:
+        if hand.content not in _holding:
+            _holding[hand.content] = opposes(hand)
+        if not _holding[hand.content]:
+            raise HandError(f"{hand.name}: {_why_not(hand)}")
+
+
+_holding: LRUCache[str, bool] = LRUCache(32)
+
+
+def _why_not(hand: HandModel) -> str:
+    """What is missing of a hand that can hold nothing, and the mend."""
+    shaped = {piece.body for piece in hand.pieces}
+    bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
+    if bare:
+        return f"no two opposing digits: {', '.join(bare[:4])} have no collision shapes; give the hand with its fingers"
+    return (
+        "no two opposing digits: no two surfaces of it face each other and close, so it can hold nothing; "
+        "give the whole hand, or another --root"
+    )
+
+
 def opposes(hand: HandModel) -> bool:
     """Whether two points on different bodies face each other in some posture, with a gap that the joints change."""
     points = sample_surface(hand, _CHECKED_POINTS)
@@ -205,7 +234,9 @@ def opposes(hand: HandModel) -> bool:
         facing |= found & apart
         np.minimum(least, gaps, out=least)
         np.maximum(most, gaps, out=most)
-    return bool((facing & (most - least > _CLOSING_M)).any())
+        if (facing & (most - least > _CLOSING_M)).any():
+            return True
+    return False
 
 
 def _face_to_face(position: Floats, normal: Floats) -> tuple[np.ndarray, Floats]:

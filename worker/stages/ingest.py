@@ -17,8 +17,9 @@ from typing import Any, Final
 
 from service.model import names
 from service.model.domain import AssetKind, IngestMessage
+from service.model.errors import InputError
 from service.store.assets import pack, unpack
-from service.store.library import UNPACKED_LIMIT_BYTES, load_asset_files
+from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
 from worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
@@ -40,9 +41,23 @@ def run(message: IngestMessage, context: TaskContext) -> None:
     """Check the asset and write `check.json`, whatever is found; a refusal is a finding too."""
     files = load_asset_files(context.store, message.kind, message.digest)
     found, model = check_in_child(message.kind, message.name, files, context)
+    if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
+        found["facts"]["self_test"] = _self_test(message, files, context)
     if model:
         context.store.put(names.asset_model(message.kind, message.digest), model)
     context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+
+
+def _self_test(message: IngestMessage, files: dict[str, bytes], context: TaskContext) -> dict[str, Any]:
+    """How many grasps of plain objects hold. A hand that finds none is no error: that is what it tells."""
+    from worker.hands.load import load_hand
+    from worker.stages.hand_self_test import failed, self_test
+
+    try:
+        hand = load_hand(files, name=message.name, digest=message.digest)
+        return self_test(hand, context.run).facts()
+    except InputError as error:
+        return failed(str(error))
 
 
 def check_in_child(

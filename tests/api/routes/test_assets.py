@@ -13,7 +13,8 @@ from service.model.domain import AssetKind
 from service.model.errors import InputError, LimitError
 from service.pipeline.backends import Parts
 from service.settings import Settings
-from service.store.library import load_asset_files
+from service.store.asset_summary import summary
+from service.store.library import load_asset, load_asset_files
 
 STL = b"solid box\nendsolid box\n"
 
@@ -38,6 +39,26 @@ def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, parts
     assert (asset["name"], asset["verdict"]) == ("My-box-2", None)
     assert load_asset_files(parts.store, AssetKind.OBJECT, asset["digest"])["My box (2).stl"] == STL
     assert [check.name for check in parts.index.feed.ready_checks(now=1e12, limit=9)] == ["My-box-2"]
+
+
+def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: TestClient, parts: Parts) -> None:
+    asked = {"name": "mine", "self_test": "true"}
+    answer = http.post("/v1/hands", files={"file": ("mine.urdf", b"<robot name='mine'/>")}, data=asked)
+    assert answer.status_code == 202
+    record = load_asset(parts.store, AssetKind.HAND, answer.json()["digest"])
+    assert record.self_test
+    tried = {"gsr": 0.9, "n": 64, "width_m": 0.04, "by_object": {"box": 0.9}, "says": "ready: 90 % hold"}
+    found = {"verdict": "accept", "message": "", "repairs": [], "facts": {"self_test": tried}}
+    parts.index.write.add_asset(record, found)
+    shown = http.get("/v1/hands/mine").json()
+    assert shown["facts"]["self_test"] == tried
+    assert "self-test          ready: 90 % hold" in summary(AssetKind.HAND, shown["facts"])
+
+
+def test_only_hands_are_tried(http: TestClient) -> None:
+    answer = http.post("/v1/objects", files={"file": ("box.stl", STL)}, data={"self_test": "true"})
+    assert answer.status_code == 422
+    assert "only a hand" in answer.json()["detail"]
 
 
 def test_the_same_upload_twice_is_one_object(http: TestClient) -> None:

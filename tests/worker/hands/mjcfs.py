@@ -83,3 +83,46 @@ FOUR_BAR = """
   <actuator><position joint="drive" kp="5"/><position joint="thumb" kp="5"/></actuator>
 </mujoco>
 """
+
+#: Two fingers whose ends hang on tendons of fixed length: the left one's follows it, the right one's limits forbid that
+#: and hold it, and its tip with it. Angles are radians although nobody says so; servos go half the way of the joints.
+TENDON_CLAW = """
+<mujoco>
+  <default><default class="finger" group="1"><geom type="capsule" size="0.005"/></default></default>
+  <worldbody>
+    <body name="palm">
+      <geom type="box" size="0.04 0.02 0.01"/>
+      <body name="left" pos="-0.03 0 0.01">
+        <joint name="left" axis="0 1 0" range="0 1.4"/>
+        <geom class="finger" fromto="0 0 0 0 0 0.04"/>
+        <body name="left_end" pos="0 0 0.045">
+          <joint name="left_end" axis="0 -1 0" range="-1 1"/>
+          <geom class="finger" fromto="0 0 0 0 0 0.03"/>
+        </body>
+      </body>
+      <body name="right" pos="0.03 0 0.01">
+        <joint name="right" axis="0 -1 0" range="0 1.4"/>
+        <geom class="finger" fromto="0 0 0 0 0 0.04"/>
+        <body name="right_end" pos="0 0 0.045">
+          <joint name="right_end" axis="0 -1 0" range="0 1"/>
+          <geom class="finger" fromto="0 0 0 0 0 0.02"/>
+          <body name="right_tip" pos="0 0 0.025">
+            <joint name="right_tip" axis="0 -1 0" range="0 1"/>
+            <geom class="finger" fromto="0 0 0 0 0 0.01"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="l"><joint joint="left" coef="1"/><joint joint="left_end" coef="-2"/></fixed>
+    <fixed name="r"><joint joint="right" coef="1"/><joint joint="right_end" coef="1"/></fixed>
+    <fixed name="t"><joint joint="right_end" coef="1"/><joint joint="right_tip" coef="-1"/></fixed>
+  </tendon>
+  <equality><tendon tendon1="l"/><tendon tendon1="r"/><tendon tendon1="t"/></equality>
+  <actuator>
+    <position joint="left" kp="20" ctrllimited="true" ctrlrange="0 0.7"/>
+    <general joint="right" biastype="affine" gainprm="0.2" biasprm="0 -20 0" ctrllimited="true" ctrlrange="0 70"/>
+  </actuator>
+</mujoco>
+"""

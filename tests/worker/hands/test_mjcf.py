@@ -14,7 +14,7 @@ import trimesh
 
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix
-from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
+from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
 from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
 from worker.hands.kinematics import body_poses
@@ -115,6 +115,29 @@ def test_an_equality_and_a_tendon_couple_joints() -> None:
     assert q["left_curl"] == pytest.approx(0.5 * values["left_bend"])
     # q1 - q1_0 = 0.1 - 0.5 (q2 - q2_0), both at rest at 0.
     assert q["right_curl"] == pytest.approx(0.1 - 0.5 * values["left_spread"])
+
+
+def test_two_joints_on_a_tendon_of_fixed_length_go_together_as_far_as_their_limits_let_them() -> None:
+    hand = load(TENDON_CLAW)
+    assert hand.dof_names == ("left", "right")
+    q = dict(zip(hand.joint_names, hand.expand(np.array([0.6, 0.4])), strict=True))
+    # left - 2 left_end keeps its length; the right end would have to bend to -0.4, and its range begins at 0.
+    assert q["left_end"] == pytest.approx(0.3)
+    assert "right_end" not in q and "right_tip" not in q
+
+
+def test_a_servo_goes_no_farther_than_it_can_be_told() -> None:
+    hand = load(TENDON_CLAW)
+    # 20 (u - q) with u to 0.7; and 0.2 u - 20 q with u to 70. The joints alone would go to 1.4.
+    assert hand.upper.tolist() == pytest.approx([0.7, 0.7])
+
+
+def test_angles_that_would_be_no_motion_in_degrees_are_radians() -> None:
+    notes = check_hand(files(TENDON_CLAW), "claw")["message"]
+    assert "angles read as radians" in notes
+    stated = TENDON_CLAW.replace("<worldbody>", '<compiler angle="degree"/><worldbody>', 1)
+    assert "radians" not in check_hand(files(stated), "claw")["message"]
+    assert "radians" not in check_hand(files(), "claw")["message"]
 
 
 def test_servos_give_force_limits_and_gains() -> None:

@@ -70,3 +70,15 @@ def test_both_jaws_open_for_the_way_in() -> None:
         # At least 5 mm clear of the object, as seen by points on the pads, in steps of 2 mm.
         assert opened.min() >= 0.0245
         assert opened.max() <= 0.028
+
+
+def test_a_flat_pad_touches_a_flat_side_at_several_points() -> None:
+    """At one point each a box turns about the line between them: what a flat pad is made to prevent."""
+    box = object_from_mesh(trimesh.creation.box((0.04, 0.05, 0.03)))
+    hand = gripper()
+    scene = build(hand, box, decompose(box), MujocoOptions())
+    data = mujoco.MjData(scene.model)
+    scene.place(data, AT[0], hand.expand(np.full((1, 1), 0.02 - 1e-4))[0])
+    mujoco.mj_forward(scene.model, data)
+    touching = [sorted(data.contact[i].geom) for i in range(data.ncon) if data.contact[i].dist < 0]
+    assert all(touching.count(pair) >= 3 for pair in touching) and len({tuple(pair) for pair in touching}) == 2

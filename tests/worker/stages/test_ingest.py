@@ -13,11 +13,15 @@ import pytest
 
 from service.model import names
 from service.model.domain import AssetKind, IngestMessage
-from service.model.errors import TaskCancelled
-from service.store.library import publish_asset
+from service.model.errors import InputError, TaskCancelled
+from service.store.library import publish_asset, record_asset, store_files
 from service.store.store import Store, open_store
-from worker.stages import ingest
+from tests.worker.hands.grippers import gripper_urdf
+from worker.hands.model import HandModel
+from worker.run import Run
+from worker.stages import hand_self_test, ingest
 from worker.stages.context import StopReason, TaskContext
+from worker.stages.hand_self_test import SelfTest
 
 TETRAHEDRON = """\
 solid t
@@ -71,6 +75,44 @@ def test_a_sound_object_is_taken_with_its_facts(context: TaskContext) -> None:
     found = run(context.store, context, OBJECT, AssetKind.OBJECT)
     assert found["verdict"] in ("accept", "repair"), found["message"]
     assert found["facts"]
+
+
+def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trial itself is tested beside it: here that it runs on the hand that was checked, and what is kept."""
+    tried = []
+
+    def stand_in(hand: HandModel, run: Run) -> SelfTest:
+        tried.append(hand.name)
+        return SelfTest(0.9, 64, 0.04, {"box": 0.9})
+
+    monkeypatch.setattr(hand_self_test, "self_test", stand_in)
+    files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
+    untried = run(context.store, context, files, AssetKind.HAND)
+    assert not tried and "self_test" not in untried["facts"]  # type: ignore[operator]
+    asset = store_files(context.store, AssetKind.HAND, "mine", {**files, "note.txt": b"x"}, self_test=True)
+    record_asset(context.store, asset)
+    message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
+    ingest.run(message, context)
+    found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
+    assert tried == ["mine"]
+    assert found["facts"]["self_test"]["says"] == "ready: 90 % hold"
+
+
+def test_a_hand_that_finds_no_grasp_is_taken_and_says_why(
+    context: TaskContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stand_in(hand: HandModel, run: Run) -> SelfTest:
+        raise InputError("no way in")
+
+    monkeypatch.setattr(hand_self_test, "self_test", stand_in)
+    files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
+    asset = store_files(context.store, AssetKind.HAND, "mine", files, self_test=True)
+    record_asset(context.store, asset)
+    message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
+    ingest.run(message, context)
+    found = json.loads(context.store.get(names.asset_check(AssetKind.HAND, asset.digest)))
+    assert found["verdict"] == "accept"
+    assert found["facts"]["self_test"]["says"] == "suspicious: no way in"
 
 
 def test_a_broken_object_is_refused_with_a_reason(context: TaskContext) -> None:

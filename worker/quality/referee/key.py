@@ -80,6 +80,8 @@ def verdict_key(
             "pieces": pieces.digest,
             "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
+            # Of grippers alone: the keys of hands stay what they are.
+            **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
         }
     )
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from service.model.transforms import slerp
 from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
+from worker.hands.jaws import jaws_of
 from worker.hands.model import ConvexPiece, HandModel, JointType
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
@@ -190,7 +191,7 @@ def scene_spec(
     option.impratio = 10.0
     option.noslip_iterations = physics.noslip_iterations
     spec.memory = ARENA
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | NOT_IN_3_3_2
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~several_contacts(hand))
     friction = [*physics.friction, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
     add_object(spec, obj, pieces.vertices, friction, OBJECT_MASS)
@@ -199,6 +200,12 @@ def scene_spec(
     for k, one in enumerate(neighbours):
         add_object(spec, one.obj, one.pieces, friction, DENSITY * one.obj.volume, name=f"neighbour{k}")
     return spec
+
+
+def several_contacts(hand: HandModel) -> int:
+    """What a gripper needs of `NOT_IN_3_3_2`: a flat pad on a flat side touches in an area, and at a single point of it,
+    wherever the engine puts that, an object turns as no real one does. The protocol was made for rounded fingers."""
+    return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 
 def _leading(hand: HandModel) -> tuple[Floats, Floats]:

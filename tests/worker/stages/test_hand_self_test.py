@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.worker.hands.grippers import OPENING, gripper
-from worker.studies.hand_self_test import OF_OPENING, SelfTest, fitting_width, plain_objects, self_test
+from worker.stages.hand_self_test import OF_OPENING, SelfTest, fitting_width, plain_objects, self_test
 
 
 def test_objects_are_as_wide_as_suits_the_opening() -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import trimesh
 
 from service.model.domain import BATCH_SIZE, JobOptions
-from worker.certified import certified_grasps
+from worker.certified import Certified, certified_grasps
+from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
@@ -28,6 +29,15 @@ _IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 
 @dataclass(frozen=True)
+class Best:
+    """Of the grasps that hold the one with the largest epsilon; of equal ones the one that moves least."""
+
+    obj: ObjectModel
+    grasp: Posture
+    rank: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class SelfTest:
     """What came of it; `gsr` is the share of raw grasps that hold by the certificate."""
 
@@ -35,6 +45,8 @@ class SelfTest:
     n: int
     width_m: float
     by_object: dict[str, float]
+    best: Best | None = None
+    """None: nothing was held."""
 
     @property
     def line(self) -> str:
@@ -50,6 +62,11 @@ class SelfTest:
         return {"gsr": self.gsr, "n": self.n, "width_m": self.width_m, "by_object": self.by_object, "says": self.line}
 
 
+def failed(reason: str) -> dict[str, Any]:
+    """The facts of a hand that could not be tried at all."""
+    return {"gsr": 0.0, "n": 0, "width_m": 0.0, "by_object": {}, "says": f"suspicious: {reason}"}
+
+
 def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: int = 0) -> SelfTest:
     """Raw grasps of a sphere, a box and a cylinder, as `JobOptions` has them by default, shared out evenly.
 
@@ -58,17 +75,33 @@ def self_test(hand: HandModel, run: Run = ALONE, *, grasps: int = GRASPS, seed: 
     """
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
-    for number, (name, obj) in enumerate(plain_objects(width).items()):
+    best: Best | None = None
+    objects = plain_objects(width)
+    for number, (name, obj) in enumerate(objects.items()):
         share = grasps // 3 + (number < grasps % 3)
         held[name] = []
+        part = run.part(number / len(objects), (number + 1) / len(objects))
         for batch, first in enumerate(range(0, share, BATCH_SIZE)):
             count = min(BATCH_SIZE, share - first)
             request = JobOptions(want="raw", grasps=count, seed=seed, referee="certificate")
-            found = certified_grasps(hand, obj, request, count=count, batch=batch, run=run)
+            found = certified_grasps(hand, obj, request, count=count, batch=batch, run=part)
             held[name] += [bool(value == 1) for value in found.columns["quality/success"]]
+            better = _best(obj, found)
+            best = max((one for one in (best, better) if one), key=lambda one: one.rank, default=None)
     every = [value for values in held.values() for value in values]
     by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
-    return SelfTest(float(np.mean(every)), len(every), width, by_object)
+    return SelfTest(float(np.mean(every)), len(every), width, by_object, best)
+
+
+def _best(obj: ObjectModel, found: Certified) -> Best | None:
+    columns = found.columns
+    rows = np.flatnonzero(columns["quality/success"] == 1)
+    if not len(rows):
+        return None
+    # Thin pads at two places give epsilon 0 at any threshold: then what moves least under the pushes is best.
+    ranks = [(float(columns["quality/epsilon"][k].max()), -float(columns["quality/verdict_margin"][k])) for k in rows]
+    row = max(range(len(rows)), key=ranks.__getitem__)
+    return Best(obj, found.grasps.grasp.take(rows[[row]]), ranks[row])
 
 
 def fitting_width(hand: HandModel) -> float:

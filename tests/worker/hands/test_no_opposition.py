@@ -1,0 +1,39 @@
+"""A hand that can hold nothing is refused before any work, wherever it comes in."""
+
+from __future__ import annotations
+
+import pytest
+import trimesh
+
+from service.model.domain import JobOptions
+from service.model.errors import HandError
+from tests.worker.hands.grippers import gripper
+from tests.worker.models import object_from_mesh
+from worker.certified import certified_grasps
+from worker.hands.load import load_hand
+from worker.hands.model import HandModel
+from worker.hands.oppositions import require_opposing
+
+_LINK = '<link name="{name}"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.01 0.01 0.04"/></geometry></collision></link>'
+_JOINT = (
+    '<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 0.04"/>'
+    '<axis xyz="0 1 0"/><limit lower="0" upper="0.3" effort="1" velocity="1"/></joint>'
+)
+
+
+def pointer() -> HandModel:
+    """A stick of three links that bends a little: none of them ever faces another."""
+    links = "".join(_LINK.format(name=name) for name in "abc")
+    joints = _JOINT.format(name="one", parent="a", child="b") + _JOINT.format(name="two", parent="b", child="c")
+    files = {"pointer.urdf": f'<robot name="pointer">{links}{joints}</robot>'.encode()}
+    return load_hand(files, name="pointer", digest="0" * 32)
+
+
+def test_grasps_of_a_hand_without_opposing_digits_are_not_even_planned() -> None:
+    ball = object_from_mesh(trimesh.creation.icosphere(2, 0.02))
+    with pytest.raises(HandError, match="pointer: no two opposing digits.*--root"):
+        certified_grasps(pointer(), ball, JobOptions(want="raw", grasps=1), count=1)
+
+
+def test_a_gripper_opposes() -> None:
+    require_opposing(gripper())
