@@ -19,6 +19,7 @@ from api.routes.hand_corrections import CorrectionRequest
 from service.index.views import AssetView
 from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError, NotFoundError
+from service.store.asset_summary import self_test_line
 from service.store.hand_corrections import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
@@ -44,8 +45,9 @@ def hands_page(
         for hand in page.items
     }
     return render(
-        request, "hands.html", page="/hands", poll_s=2 * _CHECK_S, hands=page.items, numbers=numbers, next=page.next
-    )
+        request, "hands.html", page="/hands", poll_s=2 * _CHECK_S, hands=page.items, numbers=numbers, next=page.next,
+        self_tests={hand.digest: self_test_line(hand.facts) for hand in page.items},
+    )  # fmt: skip
 
 
 @router.get("/{name}", dependencies=[Depends(may_read)])
@@ -95,6 +97,7 @@ def _page(
         problem=problem,
         form=form,
         guessed=guessed if isinstance(guessed, list) else [],
+        self_test=self_test_line(hand.facts),
         approaches=_APPROACHES,
     )
 

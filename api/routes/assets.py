@@ -98,7 +98,8 @@ def asset_router(kind: AssetKind) -> APIRouter:
             str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
         ] = "",
         self_test: Annotated[
-            bool, Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker")
+            bool,
+            Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker"),
         ] = False,
     ) -> AssetView:
         """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""

@@ -76,18 +76,20 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     notes = []
     if _means_radians(root):
         compiler.set("angle", "radian")
-        notes.append("angles read as radians: in degrees no joint would turn (say so: <compiler angle=\"degree\"/>)")
+        notes.append('angles read as radians: in degrees no joint would turn (say so: <compiler angle="degree"/>)')
     return ElementTree.tostring(root, encoding="unicode"), assets, notes
 
 
 def _means_radians(root: Element) -> bool:
-    """Whether a model that states no unit of angles, so that they are degrees, is part of one that says radians: none of
-    its joints would turn by more than 2 pi degrees, and no angle is larger."""
+    """Whether a model that states no unit of angles, so that they are degrees, belongs to one that says radians:
+    none of its joints would turn by more than 2 pi degrees, and no angle is larger."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
     hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]
     ranges = [value for hinge in hinges for value in _numbers(hinge.get("range", ""))]
-    turns = [value for e in root.iter() for value in _numbers(e.get("euler", "")) + _numbers(e.get("axisangle", ""))[3:]]
+    turns = [
+        value for e in root.iter() for value in _numbers(e.get("euler", "")) + _numbers(e.get("axisangle", ""))[3:]
+    ]
     return bool(ranges) and max(map(abs, ranges + turns)) <= 2 * math.pi
 
 

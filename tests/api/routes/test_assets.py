@@ -53,6 +53,7 @@ def test_a_self_test_is_asked_for_with_the_hand_and_shown_with_its_facts(http: T
     shown = http.get("/v1/hands/mine").json()
     assert shown["facts"]["self_test"] == tried
     assert "self-test          ready: 90 % hold" in summary(AssetKind.HAND, shown["facts"])
+    assert "ready: 90 % hold" in http.get("/hands").text
 
 
 def test_only_hands_are_tried(http: TestClient) -> None:

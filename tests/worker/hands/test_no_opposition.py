@@ -14,7 +14,10 @@ from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 
-_LINK = '<link name="{name}"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.01 0.01 0.04"/></geometry></collision></link>'
+_LINK = (
+    '<link name="{name}"><collision><origin xyz="0 0 0.02"/><geometry><box size="0.01 0.01 0.04"/></geometry>'
+    "</collision></link>"
+)
 _JOINT = (
     '<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 0.04"/>'
     '<axis xyz="0 1 0"/><limit lower="0" upper="0.3" effort="1" velocity="1"/></joint>'
@@ -31,7 +34,7 @@ def pointer() -> HandModel:
 
 def test_grasps_of_a_hand_without_opposing_digits_are_not_even_planned() -> None:
     ball = object_from_mesh(trimesh.creation.icosphere(2, 0.02))
-    with pytest.raises(HandError, match="pointer: no two opposing digits.*--root"):
+    with pytest.raises(HandError, match=r"pointer: no two opposing digits.*--root"):
         certified_grasps(pointer(), ball, JobOptions(want="raw", grasps=1), count=1)
 
 

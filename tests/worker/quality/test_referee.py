@@ -24,7 +24,7 @@ from worker.hands.model import HandModel
 from worker.objects.convex import union_volume
 from worker.quality import postures
 from worker.quality.postures import pregrasp, squeeze
-from worker.quality.referee import protocol
+from worker.quality.referee import model, protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import LEVEL_MOVES, MOVES, Level, verdict_key
@@ -116,13 +116,18 @@ def test_joints_have_the_damping_of_the_protocol_and_no_armature_nor_dry_frictio
     assert not model.dof_frictionloss.any()
 
 
-def test_a_pair_of_convex_pieces_has_one_contact_as_in_the_engine_that_the_protocol_pins() -> None:
+@pytest.mark.parametrize(("jaws", "contacts"), [(False, 2), (True, 8)], ids=["hand", "gripper"])
+def test_a_pair_of_convex_pieces_has_one_contact_as_the_protocol_pins_but_between_jaws(
+    jaws: bool, contacts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not jaws:
+        monkeypatch.setattr(model, "jaws_of", lambda hand: None)
     scene = build(plate_hand(), BOX, WHOLE, MujocoOptions())
     data = mujoco.MjData(scene.model)
     scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 1e-3)
     mujoco.mj_forward(scene.model, data)
-    # A plate's face lies flat on the box: with multi-contact each of the two would have four points.
-    assert len(data.contact.dist) == 2
+    # A plate's face lies flat on the box: with multi-contact each of the two has four points.
+    assert len(data.contact.dist) == contacts
 
 
 def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:

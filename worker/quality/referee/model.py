@@ -203,7 +203,7 @@ def scene_spec(
 
 
 def several_contacts(hand: HandModel) -> int:
-    """What a gripper needs of `NOT_IN_3_3_2`: a flat pad on a flat side touches in an area, and at a single point of it,
+    """What a gripper needs of `NOT_IN_3_3_2`: a flat pad on a flat side touches in an area. At a single point of it,
     wherever the engine puts that, an object turns as no real one does. The protocol was made for rounded fingers."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 

@@ -1,0 +1,190 @@
+"""A page of real hands as their makers and others publish them: what each holds, and a picture of its best grasp.
+
+    pip install --no-deps --target /tmp/hands airo-models example-robot-data robosuite robosuite-models robopianist
+    python -m benchmarks.gallery --sources /tmp/hands
+
+Nothing of the packages is run: their files are read as a user's folder is. Each hand goes through
+`graspd hands check --self-test`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content, so
+a broken run goes on where it was, and a hand that is read in another way is tried anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from service.model.errors import GraspdError
+from worker.hands.jaws import jaws_of
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.rendering.pages.pictures import grasp_pictures
+from worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
+
+PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
+RESULTS = Path("docs/results/hands-gallery.json")
+PAGE = Path("docs/hands-gallery.md")
+PICTURES = Path("docs/images/hands-gallery")
+#: Two sides of the best grasp [px, rad].
+EDGE, SIDES = 220, (-0.6, 2.6)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A hand: where it lies in the sources, and what had to be said of it."""
+
+    name: str
+    title: str
+    source: str
+    path: str = ""
+    """Below the sources; empty: built in."""
+    options: dict[str, Any] = field(default_factory=dict)
+    said: str = ""
+    """The options as the command line has them."""
+
+
+_AIRO = ("airo-models, MIT", "airo_models/grippers")
+_SUITE = ("robosuite, MIT", "robosuite/models/assets/grippers")
+_MODELS = ("robosuite-models, BSD-3", "robosuite_models/assets/grippers")
+_DATA = ("example-robot-data, BSD-3", "cmeel.prefix/share/example-robot-data/robots")
+
+
+#: Every joint turns as far as the one that is driven, so the pads stay parallel.
+_LINKAGE_140 = {
+    joint: {"of": "finger_joint", "multiplier": multiplier}
+    for joint, multiplier in {
+        "left_inner_finger_joint": 1.0, "left_inner_knuckle_joint": -1.0, "right_outer_knuckle_joint": -1.0,
+        "right_inner_finger_joint": 1.0, "right_inner_knuckle_joint": -1.0,
+    }.items()
+}  # fmt: skip
+
+
+def _of(source: tuple[str, str], name: str, title: str, path: str, said: str = "", **options: Any) -> Entry:
+    return Entry(name, title, source[0], f"{source[1]}/{path}", options, said)
+
+
+HANDS = (
+    Entry("allegro", "Allegro", "built in"),
+    Entry("barrett", "Barrett BH280", "built in"),
+    Entry("shadow", "Shadow", "built in"),
+    _of(_DATA, "franka", "Franka Hand, on its arm", "panda_description/urdf/panda.urdf"),
+    _of(_AIRO, "robotiq-2f-85", "Robotiq 2F-85", "robotiq_2f_85/urdf/robotiq_2f_85.urdf"),
+    _of(_SUITE, "robotiq-2f-140", "Robotiq 2F-140", "robotiq_gripper_140.xml",
+        "`couplings` of its linkage in `asset.json`: the published tendons turn the pads inwards",
+        couplings=_LINKAGE_140),
+    _of(_SUITE, "robotiq-3f", "Robotiq 3-Finger Adaptive", "robotiq_gripper_s.xml"),
+    _of(_AIRO, "schunk-egk40", "Schunk EGK 40, flat fingers", "", "`--urdf schunk_egk40_magneto.urdf`",
+        file="schunk_egk40_magneto.urdf"),
+    _of(_SUITE, "rethink", "Rethink parallel gripper", "rethink_gripper.xml"),
+    _of(_MODELS, "umi", "UMI, soft fingers for a WSG 50", "umi_gripper.xml"),
+    _of(_MODELS, "yumi", "ABB YuMi", "yumi_right_gripper.xml"),
+    _of(_MODELS, "aloha", "ALOHA", "aloha_gripper.xml"),
+    _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml"),
+    _of(_SUITE, "jaco", "Kinova Jaco, three fingers", "jaco_three_finger_gripper.xml"),
+    _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
+    _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml"),
+    _of(_DATA, "unitree-dex3", "Unitree Dex3 of a G1", "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+        "`--root right_hand_palm_link`", root="right_hand_palm_link"),
+    _of(_SUITE, "fourier", "Fourier 6-dof hand", "fourier_right_hand.xml"),
+    _of(_MODELS, "schunk-svh", "Schunk SVH", "schunk_svh_right_hand.xml"),
+    Entry("shadow-mjcf", "Shadow, MJCF with tendons", "robopianist, Apache-2.0",
+          "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"),
+)  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sources", type=Path, required=True, help="where the packages were installed to")
+    parser.add_argument("--only", help="names of hands, comma-separated")
+    parser.add_argument("--grasps", type=int, default=GRASPS)
+    asked = parser.parse_args()
+    wanted = asked.only.split(",") if asked.only else [entry.name for entry in HANDS]
+    done: dict[str, Any] = json.loads(RESULTS.read_text())["hands"] if RESULTS.is_file() else {}
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    for entry in HANDS:
+        if entry.name in wanted:
+            row = tried(entry, asked.sources, asked.grasps, done.get(entry.name))
+            done[entry.name] = row
+            sys.stderr.write(f"{entry.title}: {row['self_test']['says']}\n")
+            keep(done)
+    PAGE.write_text(page(done))
+
+
+def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | None) -> dict[str, Any]:
+    """The row of a hand: from before where it is the same hand and has a picture."""
+    picture = PICTURES / f"{entry.name}.png"
+    try:
+        hand = hand_from_path(sources / entry.path if entry.path else entry.name, entry.options)
+        key = f"{hand.content[:16]}-{grasps}"
+        if before and before.get("key") == key and (picture.is_file() or not before["self_test"]["gsr"]):
+            return before
+        found = self_test(hand, grasps=grasps)
+    except GraspdError as error:
+        return {"key": "", "title": entry.title, "self_test": failed(str(error))}
+    if found.best:
+        draw(hand, found.best, picture)
+    jaws = jaws_of(hand)
+    return {
+        "key": key, "title": entry.title, "dofs": hand.dofs, "joints": len(hand.joint_names),
+        "opening_mm": None if jaws is None else round(1e3 * jaws.opening, 1),
+        "picture": found.best.obj.name if found.best else None, "self_test": found.facts(),
+    }  # fmt: skip
+
+
+def draw(hand: HandModel, best: Best, picture: Path) -> None:
+    """The grasp from two sides, beside each other, in few colours: pages of many pictures stay light."""
+    sides = grasp_pictures(
+        hand, best.obj, best.grasp.hand_pose, best.grasp.joint_positions, (EDGE, EDGE), azimuths=SIDES
+    )[0]
+    drawn = Image.fromarray(np.concatenate(list(sides), axis=1)).quantize(128, dither=Image.Dither.NONE)
+    data = io.BytesIO()
+    drawn.save(data, "PNG", optimize=True)
+    picture.write_bytes(data.getvalue())
+
+
+def keep(done: dict[str, Any]) -> None:
+    order = [entry.name for entry in HANDS]
+    rows = dict(sorted(done.items(), key=lambda item: order.index(item[0]) if item[0] in order else len(order)))
+    RESULTS.write_text(json.dumps({"ready": READY, "hands": rows}, indent=1) + "\n")
+
+
+def page(done: dict[str, Any]) -> str:
+    """The page of all hands that were tried."""
+    lines = [
+        "# Gallery of hands", "",
+        "Real hands and grippers, read from the files in which they are published. Each was tried as",
+        "`graspd hands check HAND --self-test` does: 64 raw grasps of a sphere, a box and a cylinder of a size that",
+        f"suits it, judged by the certificate; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
+        "best of them, from two sides.", "", "```sh",
+        f"pip install --no-deps --target /tmp/hands {PACKAGES}",
+        "python -m benchmarks.gallery --sources /tmp/hands", "```", "",
+        "| hand | read from | dofs, joints | opens | tried on | self-test | best grasp |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]  # fmt: skip
+    for entry in HANDS:
+        row = done.get(entry.name)
+        if row is None or "dofs" not in row:
+            continue
+        test = row["self_test"]
+        opens = f"{row['opening_mm']:.0f} mm" if row["opening_mm"] else ""
+        source = f"`{entry.path.rpartition('/')[2]}`, {entry.source}" if entry.path else entry.source
+        source += f"; {entry.said}" if entry.said else ""
+        shown = f"![{row['title']} holding a {row['picture']}](images/hands-gallery/{entry.name}.png)"
+        each = ", ".join(f"{name} {100 * share:.0f} %" for name, share in test["by_object"].items())
+        says = test["says"].partition(",")[0].partition(":")
+        lines.append(
+            f"| {row['title']} | {source} | {row['dofs']}, {row['joints']} | {opens} | {1e3 * test['width_m']:.0f} mm: "
+            f"{each} | **{says[0]}**:{says[2]} | {shown if row['picture'] else ''} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()
