@@ -65,6 +65,11 @@ _LINKAGE_140 = {
     }.items()
 }  # fmt: skip
 
+_LINKAGE_PR2 = {
+    joint: {"of": "gripper_l_finger_joint", "multiplier": 1.0}
+    for joint in ("gripper_l_finger_tip_joint", "gripper_r_finger_joint", "gripper_r_finger_tip_joint")
+}
+
 
 def _of(source: tuple[str, str], name: str, title: str, path: str, said: str = "", **options: Any) -> Entry:
     return Entry(name, title, source[0], f"{source[1]}/{path}", options, said)
@@ -86,7 +91,8 @@ HANDS = (
     _of(_MODELS, "umi", "UMI, soft fingers for a WSG 50", "umi_gripper.xml"),
     _of(_MODELS, "yumi", "ABB YuMi", "yumi_right_gripper.xml"),
     _of(_MODELS, "aloha", "ALOHA", "aloha_gripper.xml"),
-    _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml"),
+    _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml", "`couplings` in `asset.json`: one motor moves all four joints",
+        couplings=_LINKAGE_PR2),
     _of(_SUITE, "jaco", "Kinova Jaco, three fingers", "jaco_three_finger_gripper.xml"),
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
     _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml"),
@@ -174,7 +180,7 @@ def page(done: dict[str, Any]) -> str:
             continue
         test = row["self_test"]
         opens = f"{row['opening_mm']:.0f} mm" if row["opening_mm"] else ""
-        source = f"`{entry.path.rpartition('/')[2]}`, {entry.source}" if entry.path else entry.source
+        source = f"`{entry.path.rstrip('/').rpartition('/')[2]}`, {entry.source}" if entry.path else entry.source
         source += f"; {entry.said}" if entry.said else ""
         shown = f"![{row['title']} holding a {row['picture']}](images/hands-gallery/{entry.name}.png)"
         each = ", ".join(f"{name} {100 * share:.0f} %" for name, share in test["by_object"].items())
