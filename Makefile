@@ -21,7 +21,7 @@ demo: $(STAMP) ## the main job on built-in data: grasps, scenes, pictures
 	$(BIN)/graspd demo --out demo-out
 
 test: $(STAMP) ## the tests (under 20 minutes on 2 cores)
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 test-slow: $(STAMP) ## the long accuracy and soak runs
 	$(BIN)/python -m pytest -m slow
