@@ -106,6 +106,8 @@ def read_spec(file: Path) -> dict[str, Any]:
     try:
         if isinstance(found.get("scene"), str):
             found["scene"] = scene_option(found["scene"], beside=file.parent)
+        if isinstance(beside := found.get("neighbours"), list):
+            found["neighbours"] = [known_name(one) if isinstance(one, str) else one for one in beside]
         spec: Spec = validated(Spec, found)
     except InputError as error:
         raise InputError(f"{file}: {str(error).removeprefix('--')}") from None

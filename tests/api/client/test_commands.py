@@ -80,6 +80,15 @@ def test_a_job_can_ask_for_larger_pictures_with_more_channels(graspd: Shell) -> 
     assert rich["job"] != plain["job"], "other pictures are another job"
 
 
+def test_a_job_has_neighbours_by_name_and_in_a_scene_file(graspd: Shell, tmp_path: Path) -> None:
+    pair = ("--hand", "allegro", "--object", "mug")
+    named = graspd.json("submit", *pair, "--scene", "bin", "--with", "block", "--with", "bottle")
+    assert named["state"] == "queued"
+    assert named["job"] != graspd.json("submit", *pair, "--scene", "bin", "--with", "block")["job"]
+    (tmp_path / "s.yaml").write_text("supports: [{kind: half_space}]\nneighbours: [{object: block}]\n")
+    assert graspd.json("submit", *pair, "--scene", str(tmp_path / "s.yaml"))["state"] == "queued"
+
+
 def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
     assert "allegro" in {hand["name"] for hand in graspd.json("hands", "list")["hands"]}
     assert graspd.json("objects", "show", "mug")["verdict"] == "accept"
@@ -108,6 +117,8 @@ def test_the_licence_of_an_object_is_kept_with_its_files(graspd: Shell, tmp_path
         (("--hand", "allegro", "--object", "mug", "-n", "-5"), "--grasps"),
         (("--hand", "allegro", "--object", "mug", "--fidelity", "perfect"), "standard"),
         (("--hand", "allegro", "--object", "mug", "--views", "2"), "scenes"),
+        (("--hand", "allegro", "--object", "mug", "--with", "block"), "neighbours stand in a scene"),
+        (("--hand", "allegro", "--object", "mug", "--scene", "bin", "--with", "teapot"), "no object 'teapot'"),
         (("--hand", "allegro", "--object", "mug", "--channels", "infrared"), "channels"),
         (("--hand", "allegro", "--object", "nowhere/box.stl"), "nowhere/box.stl"),
     ],

@@ -97,3 +97,22 @@ def test_a_scene_is_a_kind_or_a_file_beside_the_spec(tmp_path: Path) -> None:
     assert asked(spec(tmp_path, text + '"table"'), scene="bin").options["scene"] == "bin"
     with pytest.raises(InputError, match="unknown scene 'moon'"):
         asked(spec(tmp_path, text + '"moon"'))
+
+
+def test_neighbours_are_named_in_a_spec_in_an_option_and_in_a_scene_file(tmp_path: Path) -> None:
+    text = 'hands = ["allegro"]\nobjects = ["mug"]\nscene = "table"\n'
+    told = asked(spec(tmp_path, text + 'neighbours = ["block", "bottle"]')).options["neighbours"]
+    assert [one["object"] for one in told] == ["block", "bottle"]
+    assert asked(spec(tmp_path, text), neighbours=["mug"]).options["neighbours"] == ["mug"]
+    (tmp_path / "shelf.yaml").write_text("supports: [{kind: half_space}]\nneighbours: [{object: block}]\n")
+    document = asked(spec(tmp_path, text.replace("table", "shelf.yaml"))).options["scene"]
+    assert [one["object"] for one in document["neighbours"]] == ["block"]
+
+
+def test_a_neighbour_of_a_dataset_that_is_a_file_is_added_first(tmp_path: Path) -> None:
+    text = 'hands = ["allegro"]\nobjects = ["mug"]\nscene = "table"\n'
+    words = "parts/bracket.stl is a file: `graspd objects add parts/bracket.stl` first"
+    with pytest.raises(InputError, match=words):
+        asked(spec(tmp_path, text + 'neighbours = ["parts/bracket.stl"]'))
+    with pytest.raises(InputError, match=words):
+        asked(spec(tmp_path, text), neighbours=["parts/bracket.stl"])
