@@ -1,0 +1,85 @@
+"""What stands in the way of grasps planned in bins, on shelves and among neighbours: contact, closing, coming or lift.
+
+    python -m benchmarks.scene_ways [--count 24] [--json]
+
+A hand comes straight over 10 cm. The last column counts grasps for which that alone is not free: what an approach that
+bends could save at most.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any, Final
+
+import numpy as np
+
+from service.model.domain import resolve_fidelity
+from service.model.scene_spec import SceneSpec
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.planners.port import Wanted
+from worker.scenes.beside import scenes_of
+from worker.scenes.clearance import MARGIN_M
+from worker.scenes.way import Way, plan_way
+
+HANDS: Final = ("barrett", "allegro", "shadow")
+#: Target, kind of its scene, and what stands beside it.
+PLACES: Final = (
+    ("block", "bin", ("mug", "bottle", "block")),
+    ("bottle", "bin", ("block", "mug")),
+    ("mug", "shelf", ("block", "bottle")),
+    ("bottle", "shelf", ()),
+    ("mug", "table", ("block",) * 6),
+)
+SCENES: Final = 4
+SEEDS: Final = (11, 3)  # of the scenes, of the grasps
+
+
+def blocked(way: Way) -> dict[str, int]:
+    """How many grasps are clear, and how many are blocked in each part of their way."""
+    parts = {"contact": way.contact, "closing": way.closing, "lift": way.lifting}
+    near = {name: distance < MARGIN_M for name, distance in parts.items()}
+    elsewhere = np.any(list(near.values()), axis=0)
+    return {
+        "clear": int(way.clear.sum()),
+        **{name: int(found.sum()) for name, found in near.items()},
+        "coming": int((~way.clear & ~elsewhere).sum()),
+    }
+
+
+def run(count: int) -> list[dict[str, Any]]:
+    """A row for each hand and place; `count` raw draft grasps each."""
+    fidelity = resolve_fidelity("draft")
+    names = {name for target, _, beside in PLACES for name in (target, *beside)}
+    things = {name: object_from_path(name, face_error_m=fidelity.face_error_m) for name in names}
+    rows = []
+    for name in HANDS:
+        hand = hand_from_path(name)
+        for target, kind, beside in PLACES:
+            spec = SceneSpec(kind=kind, neighbours=tuple({"object": one} for one in beside), touch=2.0)
+            scenes, _ = scenes_of(spec, things[target], [things[one] for one in beside], count=SCENES, seed=SEEDS[0])
+            placed = scenes.placed(np.arange(count) % SCENES)
+            wanted = Wanted(count=count, fidelity=fidelity, seed=SEEDS[1], placed=placed)
+            way = plan_way(hand, things[target], synthesize(hand, things[target], wanted), placed)
+            told = {"hand": name, "object": target, "scene": kind, "beside": len(beside), "grasps": count}
+            rows.append(told | blocked(way))
+            sys.stdout.write(" ".join(f"{key}={value}" for key, value in rows[-1].items()) + "\n")
+            sys.stdout.flush()
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--count", type=int, default=24, help="raw grasps for each hand and place")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    rows = run(given.count)
+    total = {key: sum(row[key] for row in rows) for key in ("grasps", "clear", "contact", "closing", "lift", "coming")}
+    sys.stdout.write((json.dumps({"rows": rows, "total": total}) if given.json else f"all: {total}") + "\n")
+
+
+if __name__ == "__main__":
+    main()
