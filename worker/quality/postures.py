@@ -19,7 +19,7 @@ from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.jaw_squeeze import jaw_squeeze
-from worker.quality.probe import Distances, Probe, probe_of
+from worker.quality.probe import Probe, Touch, probe_of
 from worker.quality.raising import raised
 from worker.quality.squeeze import Contacts, Hold, balanced
 from worker.simulation.obstacles import body_room
@@ -125,7 +125,7 @@ def hold_forces(
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     holds: list[Hold] = []
     for start in range(0, len(grasp), _CHUNK):
-        found = probe.measure(_rows(grasp, start))
+        found = probe.touch(_rows(grasp, start), reach=PRESSING_M)
         holds += balanced(
             hand, found.bodies, _pressing(probe, found), total_normal_force=total_normal_force, friction=friction,
             centre=obj.centre_of_mass, radius=obj.radius,
@@ -133,7 +133,7 @@ def hold_forces(
     return holds
 
 
-def _pressing(probe: Probe, found: Distances) -> list[Contacts]:
+def _pressing(probe: Probe, found: Touch) -> list[Contacts]:
     """The contacts of each grasp that press."""
     near = probe.facing(found) & (found.distance < PRESSING_M)
     contacts = []
@@ -147,7 +147,7 @@ def _pregrasp(probe: Probe, grasp: Posture, placed: Placed | None) -> Posture:
     hand = probe.hand
     q = hand.reduce(grasp.joint_positions)
     finger = _finger_of_dof(hand)
-    paths = _openings(hand, q, _leaving(probe, probe.measure(grasp), finger))
+    paths = _openings(hand, q, _leaving(probe, probe.touch(grasp, reach=CLEARANCE_M), finger))
     clearance = _finger_clearance(probe, grasp.hand_pose, paths)
     stuck = np.flatnonzero((clearance.max(axis=1) < STUCK_M).any(axis=1))
     if len(stuck):
@@ -186,7 +186,7 @@ def _fingers(hand: HandModel) -> int:
     return max(1, len(hand.fingertips), int(_finger_of_body(hand).max()) + 1)
 
 
-def _leaving(probe: Probe, found: Distances, finger: NDArray[np.int32]) -> Floats:
+def _leaving(probe: Probe, found: Touch, finger: NDArray[np.int32]) -> Floats:
     """(B, D) directions in which fingers leave the object; the fastest dof of each finger has about 1."""
     hand = probe.hand
     out = np.tile(-np.asarray(hand.closing, float), (len(found.bodies), 1))
@@ -216,7 +216,8 @@ def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
 
 
 def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
-    """(B, K, fingers) least distance of each finger's points to the object; inf where a finger has none.
+    """(B, K, fingers) least distance of each finger's points to the object, at most `CLEARANCE_M`; inf where a finger
+    has none.
 
     A hand whose fingers have all been `CLEARANCE_M` away is not looked at farther on its way: -inf there.
     """
@@ -228,7 +229,8 @@ def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     for first in range(0, steps, _LOOK_STEPS):
         look = paths[going, first : first + _LOOK_STEPS]
         joints = probe.hand.expand(look).reshape(-1, len(probe.hand.joint_names))
-        distance = _distances(probe, np.repeat(hand_pose[going], look.shape[1], axis=0), joints, points)
+        poses = np.repeat(hand_pose[going], look.shape[1], axis=0)
+        distance = _distances(probe, poses, joints, points, reach=CLEARANCE_M)
         found = np.full((len(distance), out.shape[2]), np.inf)
         for f in range(out.shape[2]):
             mine = finger[points] == f
@@ -241,10 +243,12 @@ def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     return out
 
 
-def _distances(probe: Probe, hand_pose: Floats, joints: Floats, points: NDArray[np.intp] | None = None) -> Floats:
-    """(B, P) signed distances of the hand's points, or of some of them, at B postures."""
+def _distances(
+    probe: Probe, hand_pose: Floats, joints: Floats, points: NDArray[np.intp] | None = None, *, reach: float
+) -> Floats:
+    """(B, P) signed distances of the hand's points, or of some of them, at B postures, at most `reach` [m]."""
     posed = probe.posed_points(body_poses(probe.hand, hand_pose, joints), points)
-    return probe.signed_distance(posed.reshape(-1, 3))[0].reshape(posed.shape[:2])
+    return probe.signed_distance(posed.reshape(-1, 3), reach=reach)[0].reshape(posed.shape[:2])
 
 
 def _first_clear(clearance: Floats, wanted: float) -> NDArray[np.intp]:
@@ -316,7 +320,8 @@ def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
     poses = np.repeat(hand_pose[:, None], choices, axis=1)
     poses[..., :3] += np.array(RETREATS_M)[None, :, None] * back[:, None]
     joints = probe.hand.expand(q)
-    distance = _distances(probe, poses.reshape(-1, 7), np.repeat(joints, choices, axis=0))
+    joined = np.repeat(joints, choices, axis=0)
+    distance = _distances(probe, poses.reshape(-1, 7), joined, reach=PALM_CLEARANCE_M)
     chosen = _first_clear(distance.min(axis=1).reshape(count, choices), PALM_CLEARANCE_M)
     return Posture(poses[np.arange(count), chosen], joints)
 

@@ -38,8 +38,8 @@ FACING_COS: Final = -0.5
 
 
 @dataclass(frozen=True)
-class Distances:
-    """B grasps, N hand points, P pieces; all in the object frame, metres."""
+class Touch:
+    """Where the hand points of B grasps are and what of the object is near them; in the object frame, metres."""
 
     bodies: Floats
     """(B, L, 7) poses of the bodies."""
@@ -48,11 +48,17 @@ class Distances:
     hand_normals: Floats
     """(B, N, 3) outward unit normals of the hand at its points."""
     distance: Floats
-    """(B, N) signed distance of hand points to the object, at most `REACH_M`."""
+    """(B, N) signed distance of hand points to the object, at most the reach asked for."""
     closest: Floats
     """(B, N, 3) closest points on the object."""
     normal: Floats
     """(B, N, 3) gradient of the distance: the object's outward unit normal, seen from the point; 0 beyond reach."""
+
+
+@dataclass(frozen=True)
+class Distances(Touch):
+    """The same, and what else touches; P pieces."""
+
     piece_distance: Floats
     """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: the point is inside."""
     self_depth: Floats
@@ -108,12 +114,13 @@ class Probe:
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return float(np.sqrt(0.5 * np.linalg.norm(cross, axis=1).sum() / len(self.samples)))
 
-    def signed_distance(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """Signed distance (P,), closest point (P, 3), outward normal (P, 3) of points (P, 3) in the object frame."""
-        distance, closest, normal = self._query(points)
-        return np.minimum(distance, REACH_M), closest, normal
+    def signed_distance(self, points: Floats, *, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
+        """Signed distance (P,), at most `reach`, closest point (P, 3), outward normal (P, 3) of points (P, 3) in the
+        object frame; those beyond reach are their own closest points or not, with normal 0 or not."""
+        distance, closest, normal = self._query(points, reach)
+        return np.minimum(distance, reach), closest, normal
 
-    def _query(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+    def _query(self, points: Floats, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
         count = len(points)
         with wp.ScopedDevice("cpu"):
             given = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
@@ -132,6 +139,7 @@ class Probe:
                     self._coarse,
                     self._spacing,
                     REACH_M,
+                    reach,
                     given,
                 ],
                 outputs=[distance, closest, normal],
@@ -147,25 +155,31 @@ class Probe:
             body, position = body[rows], position[rows]
         return _turned(bodies, body, position) + bodies[:, body, :3]
 
-    def measure(self, posture: Posture) -> Distances:
-        """All distances of B postures."""
+    def touch(self, posture: Posture, *, reach: float = REACH_M) -> Touch:
+        """What of the object is near the hand points of B postures, within `reach` [m]."""
         bodies = body_poses(self.hand, posture.hand_pose, posture.joint_positions)
         points = self.posed_points(bodies)
         shape = points.shape[:2]
-        distance, closest, normal = self.signed_distance(points.reshape(-1, 3))
-        pieces = self._piece_distances(bodies)
-        return Distances(
+        distance, closest, normal = self.signed_distance(points.reshape(-1, 3), reach=reach)
+        return Touch(
             bodies=bodies,
             hand_points=points,
             hand_normals=_turned(bodies, self.points.body, self.points.normal),
             distance=distance.reshape(shape),
             closest=closest.reshape(*shape, 3),
             normal=normal.reshape(*shape, 3),
-            piece_distance=pieces,
-            self_depth=self.self_depth(bodies, points).max(axis=1),
         )
 
-    def facing(self, found: Distances) -> NDArray[np.bool_]:
+    def measure(self, posture: Posture) -> Distances:
+        """All distances of B postures."""
+        found = self.touch(posture)
+        return Distances(
+            **vars(found),
+            piece_distance=self._piece_distances(found.bodies),
+            self_depth=self.self_depth(found.bodies, found.hand_points).max(axis=1),
+        )
+
+    def facing(self, found: Touch) -> NDArray[np.bool_]:
         """(B, N) points whose hand surface looks at the object: only there can it press."""
         cosine = np.einsum("bni,bni->bn", found.hand_normals, found.normal)
         facing: NDArray[np.bool_] = cosine < FACING_COS

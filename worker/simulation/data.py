@@ -31,7 +31,8 @@ class Tables:
 
 
 class Contacts:
-    """Candidate contacts (B, N), those of a hand packed at the front; `gradient` is dL/d distance."""
+    """Candidate contacts (B, N), those of a hand packed at the front; `gradient` is dL/d distance, `near` (B, N) the
+    indices of those that the object may meet in its step."""
 
     def __init__(self, capacity: int, points: int) -> None:
         shape = (capacity, points)
@@ -42,6 +43,8 @@ class Contacts:
         self.distance = wp.zeros(shape, dtype=wp.float32)
         self.weight = wp.zeros(shape, dtype=wp.float32)
         self.gradient = wp.zeros(shape, dtype=wp.float32)
+        self.near_count = wp.zeros(capacity, dtype=wp.int32)
+        self.near = wp.zeros(shape, dtype=wp.int32)
 
 
 class Depths:
@@ -86,6 +89,7 @@ class Data:
         self.torque = wp.zeros((B, L), dtype=wp.vec3)
         self.loss = wp.zeros((B, M), dtype=wp.float32)
         self.end = wp.zeros((B, M), dtype=contact.vec6)
+        self.adjoint = wp.zeros((B, M), dtype=contact.vec6)
         self.gradient = wp.zeros((B, 6 + D), dtype=wp.float32)
         self.first = wp.zeros((B, 6 + D), dtype=wp.float32)
         self.second = wp.zeros((B, 6 + D), dtype=wp.float32)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from worker.hands.jaws import slides
 from worker.hands.model import ConvexPiece, HandModel
 from worker.objects.model import ObjectModel
-from worker.simulation.kernels import kinematics, pieces, surface
+from worker.simulation.cells import faces_of, list_cells
+from worker.simulation.kernels import kinematics, nearest, pieces, surface
 
 Floats = NDArray[np.float64]
 
@@ -20,6 +21,10 @@ Floats = NDArray[np.float64]
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
 #: Distances farther than this from the surface are never asked for [m].
 FIELD_REACH: Final = 0.06
+#: Cells that come as near to the surface as this and the grid's error list their nearest faces [m].
+LISTED_M: Final = 0.004
+#: Cells that samples of the object are sorted by [m].
+SAMPLE_CELL_M: Final = 0.008
 #: Way of a sliding joint that moves a fingertip as a revolute joint of a finger does by one radian [m].
 SLIDE_M: Final = 0.05
 
@@ -136,6 +141,8 @@ class DeviceObject:
     mesh: Any
     samples: Any
     bvh: Any
+    sorted_samples: Any
+    """The samples by the cells of a grid."""
 
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
@@ -156,11 +163,19 @@ class DeviceObject:
             skin.corner_normals = wp.array(obj.corner_normals.reshape(-1, 3), dtype=wp.vec3)
             skin.alpha = phong_alpha
             skin.field = wp.zeros((0, 0, 0), dtype=wp.float32)
+            skin.cells = nearest.Cells()
+            skin.cells.faces = faces_of(obj)
             if cell > 0:
                 _add_field(skin, obj, cell)
+                skin.cells = list_cells(
+                    obj, mesh, skin.field, skin.field_origin, skin.field_cell, LISTED_M + skin.field_error
+                )
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             bvh = wp.Bvh(centred, centred)
-        return cls(model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh)
+            cells = sorted_samples(samples - obj.centre_of_mass)
+        return cls(
+            model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh, sorted_samples=cells
+        )  # fmt: skip
 
     def thinned(self, count: int) -> DeviceObject:
         """The same object with its first `count` samples: farthest-point samples are even at any length."""
@@ -168,7 +183,24 @@ class DeviceObject:
             return self
         with wp.ScopedDevice(self.device):
             samples = wp.clone(self.samples[:count])
-            return replace(self, samples=samples, bvh=wp.Bvh(samples, samples))
+            cells = sorted_samples(samples.numpy())
+            return replace(self, samples=samples, bvh=wp.Bvh(samples, samples), sorted_samples=cells)
+
+
+def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
+    """Points (S, 3) [m] sorted by the cells of a grid of this size [m], on the present Warp device."""
+    low = samples.min(axis=0)
+    # At most 64 cells a side: a large object has larger ones.
+    size = max(size, float((samples.max(axis=0) - low).max()) / 64)
+    cell = np.floor((samples - low) / size).astype(int)
+    shape = cell.max(axis=0) + 1
+    index = np.ravel_multi_index(tuple(cell.T), tuple(shape))
+    order = np.argsort(index, kind="stable")
+    out = pieces.Samples()
+    out.position = wp.array(samples[order], dtype=wp.vec3)
+    out.first = wp.array(np.searchsorted(index[order], np.arange(int(np.prod(shape)) + 1)), dtype=wp.int32)
+    out.low, out.size, out.shape = wp.vec3(*low.tolist()), size, wp.vec3i(*shape.tolist())
+    return out
 
 
 def _add_field(skin: Any, obj: ObjectModel, cell: float) -> None:

@@ -25,6 +25,10 @@ REFERENCE_SAMPLES: Final = 2000
 REFERENCE_SELF_POINTS: Final = 1000
 #: Kernels of the contact step by their names.
 SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
+#: Contacts with a gap of at most this are listed for the direct solver: four steps of the object [m].
+NEAR_GAP: Final = 4e-3
+#: Points that one thread works on: on the CPU a thread costs as much as a point; on CUDA every point has its own.
+CPU_LANE: Final = 64
 #: Largest dilation a schedule may ask for [m].
 MAX_DILATION: Final = 0.1
 
@@ -106,6 +110,16 @@ class Model:
         return self.hand.device
 
     @property
+    def lane(self) -> int:
+        """Points of a hand that one thread works on."""
+        return 1 if wp.get_device(self.device).is_cuda else CPU_LANE
+
+    @property
+    def lanes(self) -> int:
+        """Threads that the points of a hand take."""
+        return -(-self.count // self.lane)
+
+    @property
     def dofs(self) -> int:
         return self.hand.model.dofs
 
@@ -134,17 +148,19 @@ def body_points(points: SurfacePoints, bodies: int) -> Any:
     order = np.argsort(points.body, kind="stable")
     body, position = points.body[order], points.position[order]
     first = np.searchsorted(body, np.arange(bodies + 1))
-    centre, radius = np.zeros((bodies, 3)), np.zeros(bodies)
+    centre, radius, extent = np.zeros((bodies, 3)), np.zeros(bodies), np.zeros(bodies)
     for k in range(bodies):
         own = position[first[k] : first[k + 1]]
         if len(own):
             centre[k] = (own.min(axis=0) + own.max(axis=0)) / 2
             radius[k] = np.linalg.norm(own - centre[k], axis=1).max()
+            extent[k] = np.linalg.norm(own, axis=1).max()
     out = pieces.BodyPoints()
     out.first = wp.array(first, dtype=wp.int32)
     out.position = wp.array(position, dtype=wp.vec3)
     out.centre = wp.array(centre, dtype=wp.vec3)
     out.radius = wp.array(radius, dtype=wp.float32)
+    out.extent = wp.array(extent, dtype=wp.float32)
     return out
 
 
@@ -162,5 +178,6 @@ def _physics(obj: DeviceObject, options: LossOptions) -> Any:
     physics.leak_length = options.leak_length
     physics.one_sided = int(options.one_sided)
     physics.step = options.step
+    physics.near_gap = NEAR_GAP
     physics.radius = obj.model.radius + options.band + MAX_DILATION
     return physics

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 #: Residuals kept per grasp and iteration.
 CAPACITY: Final = 1024
+#: A state is better than another if it is less deep by more than this [m].
+BETTER_M: Final = 1e-5
 
 
 @dataclass(frozen=True)
@@ -84,52 +86,58 @@ class Projection:
         data = self.data
         n = len(state.pivot)
         data.set_schedule(still_schedule())
-        placement = record_placement(self.model, data)
+        placement = record_placement(self.model, data, within=max(self.options.near, self.options.hold))
         best, depth = state, np.full(n, np.inf)
         current = state
         for step in range(iterations + 1):
-            data.set_state(current)
+            # A hand without penetration cannot become better: it costs nothing more.
+            going = depth > BETTER_M
+            if not going.any():
+                break
+            data.set_state(current, active=going)
             placement.run()
-            now = data.deepest(n)
-            better = now < depth - 1e-5
+            now = np.where(going, data.deepest(n), np.inf)
+            better = now < depth - BETTER_M
             best = _where(better, current, best)
             depth = np.where(better, now, depth)
             if step == iterations:
                 break
-            current = self._moved(current, self._step(n))
+            current = self._moved(current, self._step(np.flatnonzero(going), n))
         return best, depth.astype(float)
 
-    def _step(self, n: int) -> Floats:
-        """Damped Gauss-Newton step (n, 6 + D) for the placement just evaluated."""
+    def _step(self, rows: NDArray[np.intp], n: int) -> Floats:
+        """Damped Gauss-Newton step (n, 6 + D) of some hands for the placement just evaluated; 0 for the others."""
         self._assemble()
         o = self.options
-        lower = self.matrix.numpy()[:n].astype(float)
+        lower = self.matrix.numpy()[rows].astype(float)
         H = lower + np.tril(lower, -1).transpose(0, 2, 1)
-        g = self.vector.numpy()[:n].astype(float)
-        rows = np.minimum(self.residuals.count.numpy()[:n], CAPACITY)
+        g = self.vector.numpy()[rows].astype(float)
+        count = np.minimum(self.residuals.count.numpy()[rows], CAPACITY)
         scale = np.repeat(o.scale, [3, 3, self.model.dofs])
         scale[6:] *= self.data.unit
         H = H * scale[:, None] * scale[None, :]
-        damping = o.damping * np.maximum(rows, 1)
+        damping = o.damping * np.maximum(count, 1)
         H[:, np.arange(len(scale)), np.arange(len(scale))] += damping[:, None]
         step = -np.linalg.solve(H, (g * scale)[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         step *= np.minimum(1.0, o.step / np.maximum(length, 1e-12))
-        return step * scale
+        out = np.zeros((n, len(scale)))
+        out[rows] = step * scale
+        return out
 
     def _assemble(self) -> None:
         m, d, o, r = self.model, self.data, self.options, self.residuals
         c, pose = d.contacts, [d.body_p, d.body_q]
         r.count.zero_()
         wp.launch(
-            kernels.point_residuals, (d.capacity, m.count),
-            inputs=[d.active, c.count, c.body, c.point, c.normal, c.distance,
+            kernels.point_residuals, (d.capacity, m.lanes),
+            inputs=[m.lane, d.active, c.count, c.body, c.point, c.normal, c.distance,
                     o.near, o.target, o.hold, o.hold_target, o.hold_weight],
             outputs=[r], device=m.device,
         )  # fmt: skip
         wp.launch(
             kernels.sample_residuals, (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.active, *pose, o.sample_near, o.target],
+            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target],
             outputs=[r], device=m.device,
         )  # fmt: skip
         wp.launch(

@@ -10,19 +10,22 @@ from typing import Final
 
 from service.model.errors import InputError
 from worker.simulation.data import Data
-from worker.simulation.kernels import kinematics, obstacles, optimizers, penalties, pieces, solids, surface
+from worker.simulation.kernels import contact, kinematics, obstacles, optimizers, penalties, pieces, solids, surface
 from worker.simulation.launches import Launches
-from worker.simulation.model import REFERENCE_SAMPLES, SOLVERS, Model
+from worker.simulation.model import NEAR_GAP, REFERENCE_SAMPLES, SOLVERS, Model
 
 #: Names that `record_iteration` knows.
 OPTIMIZERS: Final = ("adam", "gd")
 
 
-def record_placement(m: Model, d: Data, *, room: float = 0.0) -> Launches:
-    """Contacts and penetration depths only; `room` is the distance to keep besides each feature's margin [m]."""
+def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | None = None) -> Launches:
+    """Contacts and penetration depths only; `room` is the distance to keep besides each feature's margin [m].
+
+    `within`: only contacts nearer than this are wanted, exactly [m]; depths are the same whatever it is.
+    """
     out = Launches(m.device)
     add_poses(out, m, d)
-    add_distances(out, m, d)
+    add_distances(out, m, d, within=within)
     add_penalties(out, m, d, room=room)
     return out
 
@@ -56,19 +59,20 @@ def add_poses(out: Launches, m: Model, d: Data) -> None:
     out.add(
         kinematics.forward, d.capacity,
         inputs=[m.hand.tree, d.active, d.pivot, d.rotation, d.q],
-        outputs=[d.body_p, d.body_q, d.axis, d.force, d.torque, d.contacts.count, d.depths.points, d.depths.object,
-                 d.depths.links],
+        outputs=[d.body_p, d.body_q, d.axis, d.force, d.torque, d.contacts.count, d.contacts.near_count,
+                 d.depths.points, d.depths.object, d.depths.links],
     )  # fmt: skip
 
 
-def add_distances(out: Launches, m: Model, d: Data) -> None:
+def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = None) -> None:
     """Candidate contacts: hand points near the object, their distances and normals."""
-    c = d.contacts
+    c, o = d.contacts, m.options
+    nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     out.add(
-        surface.gather, (d.capacity, m.count),
-        inputs=[m.obj.surface, m.options.band, m.options.exact_below, m.point_body, m.point_position, m.point_weight,
+        surface.gather, (d.capacity, m.lanes),
+        inputs=[m.obj.surface, *nearness, NEAR_GAP, m.lane, m.point_body, m.point_position, m.point_weight,
                 d.active, d.iteration, d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q],
-        outputs=[c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient],
+        outputs=[c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient, c.near_count, c.near],
     )  # fmt: skip
 
 
@@ -81,12 +85,30 @@ def add_contact(out: Launches, m: Model, d: Data) -> None:
             inputs=[o.leak, o.leak_length, d.active, c.count, c.distance, c.weight], outputs=[c.gradient],
         )  # fmt: skip
         return
-    kept = [] if d.states is None else [d.states]
+    if o.contact_solver == "direct":
+        _add_direct(out, m, d)
+        return
     out.add(
         SOLVERS[o.contact_solver], (d.capacity, o.velocities),
         inputs=[m.physics, m.motions, o.passes, d.active, d.iteration, d.schedule.dilation, d.dilation_scale,
                 c.count, c.point, c.normal, c.distance, c.weight],
-        outputs=[*kept, d.loss, d.end, c.gradient],
+        outputs=[d.states, d.loss, d.end, c.gradient],
+    )  # fmt: skip
+
+
+def _add_direct(out: Launches, m: Model, d: Data) -> None:
+    """The direct solver in two launches: over simulations, then over contacts."""
+    c = d.contacts
+    schedule = [d.active, d.iteration, d.schedule.dilation, d.dilation_scale]
+    contacts = [c.count, c.point, c.normal, c.distance, c.weight]
+    out.add(
+        SOLVERS["direct"], (d.capacity, m.options.velocities),
+        inputs=[m.physics, m.motions, m.options.passes, *schedule, *contacts, c.near_count, c.near],
+        outputs=[d.loss, d.end, d.adjoint],
+    )  # fmt: skip
+    out.add(
+        contact.direct_gradient, (d.capacity, m.lanes),
+        inputs=[m.physics, m.lane, *schedule, *contacts, d.end, d.adjoint], outputs=[c.gradient],
     )  # fmt: skip
 
 
@@ -96,9 +118,9 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
     add_self_penalty(out, m, d, m.options.self_margin)
     c, wrench = d.contacts, [d.force, d.torque]
     out.add(
-        penalties.points_to_bodies, (d.capacity, m.count),
-        inputs=[0.0, d.active, d.iteration, d.schedule.penetration, c.count, c.body, c.point, c.normal, c.distance,
-                c.weight, c.gradient],
+        penalties.points_to_bodies, (d.capacity, m.lanes),
+        inputs=[0.0, m.lane, d.active, d.iteration, d.schedule.penetration, c.count, c.body, c.point, c.normal,
+                c.distance, c.weight, c.gradient],
         outputs=[*wrench, d.depths.points],
     )  # fmt: skip
     if m.obstacles is not None:
@@ -120,10 +142,9 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
 
 def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
     """The object's samples inside links."""
-    samples = m.obj.samples
     out.add(
         pieces.object_in_pieces, (d.capacity, m.pieces),
-        inputs=[m.hand.pieces, m.obj.bvh.id, samples, REFERENCE_SAMPLES / len(samples),
+        inputs=[m.hand.pieces, m.obj.sorted_samples, REFERENCE_SAMPLES / len(m.obj.samples),
                 d.active, d.iteration, d.schedule.object_penetration, d.body_p, d.body_q],
         outputs=[d.force, d.torque, d.depths.object],
     )  # fmt: skip

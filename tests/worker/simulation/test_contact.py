@@ -11,7 +11,7 @@ import warp as wp
 
 from worker.simulation import reference
 from worker.simulation.kernels import contact
-from worker.simulation.model import initial_motions
+from worker.simulation.model import NEAR_GAP, initial_motions
 from worker.simulation.reference import Contacts, World
 
 #: float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m.
@@ -32,18 +32,27 @@ def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: 
     return Contacts(0.04 * normals, normals, gap + spread * rng.normal(size=count), rng.uniform(0.5, 1.5, count))
 
 
-def physics(world: World, *, leak: float = 0.0, one_sided: bool = True) -> Any:
+def physics(world: World, *, leak: float = 0.0, one_sided: bool = True, near_gap: float = NEAR_GAP) -> Any:
     out = contact.Physics()
     out.mass = contact.mat66(*world.mass.ravel().tolist())
     out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
     out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
     out.leak, out.leak_length, out.one_sided, out.step = leak, 0.02, int(one_sided), world.step
     out.radius = 0.2
+    out.near_gap = near_gap
     return out
 
 
 def run(
-    kernel: Any, contacts: Contacts, world: World, *, passes: int = PASSES, leak: float = 0.0, one_sided: bool = True
+    kernel: Any,
+    contacts: Contacts,
+    world: World,
+    *,
+    passes: int = PASSES,
+    leak: float = 0.0,
+    one_sided: bool = True,
+    near_gap: float = NEAR_GAP,
+    lane: int = 5,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Motions at the end (M, 6), losses (M,), dL/drho (N,)."""
     motions = initial_motions(7, world.step, world.gyration)
@@ -51,18 +60,28 @@ def run(
     with wp.ScopedDevice("cpu"):
         loss, end = wp.zeros((1, m), dtype=wp.float32), wp.zeros((1, m), dtype=contact.vec6)
         gradient = wp.zeros((1, n), dtype=wp.float32)
-        inputs = [
-            physics(world, leak=leak, one_sided=one_sided), wp.array(motions, dtype=contact.vec6), passes,
+        constants = physics(world, leak=leak, one_sided=one_sided, near_gap=near_gap)
+        given = [
             wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32),
             wp.ones(1, dtype=wp.float32),
             wp.array([n], dtype=wp.int32),
             wp.array(contacts.points[None], dtype=wp.vec3), wp.array(contacts.normals[None], dtype=wp.vec3),
             wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
         ]  # fmt: skip
-        outputs = [loss, end, gradient]
-        if kernel is not contact.direct:
-            outputs.insert(0, wp.zeros((1, m, max(n, passes)), dtype=contact.vec6))
-        wp.launch(kernel, dim=(1, m), inputs=inputs, outputs=outputs)
+        inputs = [constants, wp.array(motions, dtype=contact.vec6), passes, *given]
+        if kernel is contact.direct:
+            listed = np.flatnonzero(contacts.distances - world.dilation <= near_gap)
+            near = np.concatenate([listed, np.zeros(n - len(listed), int)])
+            adjoint = wp.zeros((1, m), dtype=contact.vec6)
+            inputs += [wp.array([len(listed)], dtype=wp.int32), wp.array(near[None], dtype=wp.int32)]
+            wp.launch(kernel, dim=(1, m), inputs=inputs, outputs=[loss, end, adjoint])
+            wp.launch(
+                contact.direct_gradient, dim=(1, -(-n // lane)), inputs=[constants, lane, *given, end, adjoint],
+                outputs=[gradient],
+            )  # fmt: skip
+        else:
+            states = wp.zeros((1, m, max(n, passes)), dtype=contact.vec6)
+            wp.launch(kernel, dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
         return end.numpy()[0].astype(float), loss.numpy()[0].astype(float), gradient.numpy()[0].astype(float)
 
 
@@ -108,6 +127,16 @@ def test_the_gradient_agrees_with_central_differences_of_the_reference(name: str
         numeric = numeric_gradient(solver, contacts, WORLD)
         cosines.append(gradient @ numeric / np.linalg.norm(gradient) / np.linalg.norm(numeric))
     assert np.median(cosines) > COSINE, cosines
+
+
+def test_the_list_of_near_contacts_and_the_lane_change_nothing() -> None:
+    rng = np.random.default_rng(7)
+    for spread in (2e-4, 2e-2):
+        contacts = ring(rng, count=40, gap=1e-3, spread=spread)
+        whole = run(contact.direct, contacts, WORLD, leak=0.1, near_gap=1.0, lane=1)
+        listed = run(contact.direct, contacts, WORLD, leak=0.1)
+        for found, expected in zip(listed, whole, strict=True):
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_a_free_object_keeps_its_motion() -> None:

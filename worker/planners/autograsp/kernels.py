@@ -64,7 +64,7 @@ def points_to_object(
         return
     body = body_in[i]
     point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
-    wp.atomic_min(near_inout, b, body, distance(surface_in, point, reach_in, exact_in).distance)
+    wp.atomic_min(near_inout, b, body, distance(surface_in, point, reach_in, exact_in, reach_in).distance)
 
 
 @wp.kernel
@@ -123,8 +123,9 @@ def bodies_to_pieces(
     other = pieces_in.body[piece]
     q = piece_rotation(pieces_in, piece, b, body_q_in)
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    reach = wp.length(pieces_in.half[piece]) + margin_in
     for own in range(body_p_in.shape[1]):
-        if may_touch(pieces_in, points_in, piece, own, b, margin_in, body_p_in, body_q_in):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
             least = float(margin_in)
             for i in range(points_in.first[own], points_in.first[own + 1]):
                 x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])

@@ -38,23 +38,17 @@ CLEAR: Final = 0.001
 DRAWS: Final = 48
 
 
-@dataclass
-class _Draw:
-    state: HandState
-    approach: Floats
-
-
 def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.Generator:
     """Random numbers of one start of one grasp, independent of every other."""
     return np.random.default_rng(np.random.SeedSequence([seed, batch, index, start]))
 
 
 def _frame(z: Floats) -> Floats:
-    """Rotation matrix with third column z (3,) and an arbitrary but fixed first."""
-    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
+    """Rotation matrices (..., 3, 3) with third columns z (..., 3) and arbitrary but fixed first ones."""
+    helper = np.eye(3)[np.argmin(np.abs(z), axis=-1)]
     x = cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, cross(z, x), z], axis=1)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, cross(z, x), z], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -84,40 +78,56 @@ class _Pair:
         return cls(hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T)
 
 
-def draw(pair: _Pair, rng: np.random.Generator) -> _Draw:
-    """One candidate start at its nearest distance; `approach` (3,) is the direction in which the palm looks."""
-    hand = pair.hand
-    face = int(pair.share.searchsorted(rng.random(), side="right"))
-    u, v = rng.random(2)
-    if u + v > 1:
-        u, v = 1 - u, 1 - v
-    corner = pair.corners[face]
-    point = corner[0] + u * (corner[1] - corner[0]) + v * (corner[2] - corner[0])
-    normal = pair.across[face] / pair.area[face]
-    tilt_axis = _frame(normal)[:, :2] @ rng.normal(size=2)
-    angle = float(np.linalg.norm(tilt_axis)) * TILT
-    if angle > 1e-9:
-        axis = tilt_axis / np.linalg.norm(tilt_axis)
-        normal = normal * np.cos(angle) + cross(axis, normal) * np.sin(angle)
+@dataclass(frozen=True)
+class _Numbers:
+    """What n draws take of their generators, in the order in which they take it."""
+
+    uniform: Floats
+    """(n, 5) face, two for the point, roll, gap."""
+    normal: Floats
+    """(n, 2 + D) tilt, then noise of the pre-shape."""
+
+    @classmethod
+    def of(cls, generators: list[np.random.Generator], dofs: int) -> _Numbers:
+        uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
+        for i, rng in enumerate(generators):
+            uniform[i, :3] = rng.random(3)
+            normal[i, :2] = rng.standard_normal(2)
+            uniform[i, 3] = rng.random()
+            normal[i, 2:] = rng.standard_normal(dofs)
+            uniform[i, 4] = rng.random()
+        return cls(uniform, normal)
+
+
+def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
+    """A candidate start of each generator at its nearest distance, and the directions (n, 3) in which palms look."""
+    hand, number = pair.hand, _Numbers.of(generators, pair.hand.dofs)
+    face = pair.share.searchsorted(number.uniform[:, 0], side="right")
+    inside = number.uniform[:, 1:3]
+    u, v = np.where(inside.sum(axis=1, keepdims=True) > 1, 1 - inside, inside).T[..., None]
+    a, b, c = np.moveaxis(pair.corners[face], 1, 0)
+    point = a + u * (b - a) + v * (c - a)
+    normal = pair.across[face] / pair.area[face, None]
+    tilt = np.einsum("nij,nj->ni", _frame(normal)[..., :2], number.normal[:, :2])
+    length = np.linalg.norm(tilt, axis=1, keepdims=True)
+    angle = np.where(length * TILT > 1e-9, length * TILT, 0.0)
+    normal = normal * np.cos(angle) + cross(tilt / np.maximum(length, 1e-12), normal) * np.sin(angle)
     approach = -normal
-    align = _frame(approach) @ pair.palm
-    roll = quat_from_axis_angle(approach, np.array(rng.uniform(0, 2 * np.pi)))
-    rotation = quat_multiply(roll, quat_from_matrix(align))
-    span = hand.upper - hand.lower
-    q = np.clip(hand.preshape + POSTURE_NOISE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
-    pivot = point - pair.centre - approach * rng.uniform(*GAP)
-    return _Draw(HandState(pivot[None], rotation[None], q[None]), approach)
+    roll = quat_from_axis_angle(approach, 2 * np.pi * number.uniform[:, 3])
+    rotation = quat_multiply(roll, quat_from_matrix(_frame(approach) @ pair.palm))
+    noise = POSTURE_NOISE * (hand.upper - hand.lower) * number.normal[:, 2:]
+    near, far = GAP
+    pivot = point - pair.centre - approach * (near + (far - near) * number.uniform[:, 4:])
+    return HandState(pivot, rotation, np.clip(hand.preshape + noise, hand.lower, hand.upper)), approach
 
 
-def _retreated(draws: list[_Draw]) -> HandState:
-    """Each draw at each distance of retreat, (len(draws) * len(RETREATS)) hands."""
+def _retreated(state: HandState, approach: Floats) -> HandState:
+    """Each hand at each distance of retreat, (n * len(RETREATS)) hands."""
     back = np.array(RETREATS)[None, :, None]
-    pivot = np.stack([d.state.pivot[0] for d in draws])[:, None] - back * np.stack([d.approach for d in draws])[:, None]
+    pivot = state.pivot[:, None] - back * approach[:, None]
     repeat = len(RETREATS)
     return HandState(
-        pivot.reshape(-1, 3),
-        np.repeat(np.stack([d.state.rotation[0] for d in draws]), repeat, axis=0),
-        np.repeat(np.stack([d.state.q[0] for d in draws]), repeat, axis=0),
+        pivot.reshape(-1, 3), np.repeat(state.rotation, repeat, axis=0), np.repeat(state.q, repeat, axis=0)
     )
 
 
@@ -127,18 +137,20 @@ class Probe:
     def __init__(self, model: Model, capacity: int, *, room: float = 0.0) -> None:
         self.data = Data(model, capacity)
         self.band = model.options.band
+        self._touching = record_placement(model, self.data, room=room, within=0.0)
         self._placement = record_placement(model, self.data, room=room)
 
     def depths(self, states: HandState) -> Floats:
         """Deepest penetration of each hand (n,) [m]: into the object, of the object into links, of links into links,
         and what it lacks of its distance from obstacles."""
         self.data.set_state(states)
-        self._placement.run()
+        self._touching.run()
         return self.data.deepest(len(states.pivot)).astype(float)
 
     def nearest(self, states: HandState) -> Floats:
         """Distance of each hand's nearest point from the object (n,) [m], at most the model's band."""
-        self.depths(states)
+        self.data.set_state(states)
+        self._placement.run()
         n = len(states.pivot)
         counts = self.data.contacts.count.numpy()[:n]
         distances = self.data.contacts.distance.numpy()[:n]
@@ -158,33 +170,36 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     probe = Probe(model, len(indices) * each * len(retreats))
     pair = _Pair.of(hand, obj)
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
-    best: list[tuple[float, HandState] | None] = [None] * len(generators)
-    open_ = list(range(len(generators)))
+    best: HandState | None = None
+    deepest = np.full(len(generators), np.inf)
+    open_ = np.arange(len(generators))
     for _ in range(DRAWS):
         if jaws is None:
-            states = _retreated([draw(pair, generators[i]) for i in open_])
+            states = _retreated(*draw(pair, [generators[i] for i in open_]))
         else:
             states = jaws.draw(np.array([generators[i].random(jaw_starts.UNIFORM) for i in open_]))
         depth = probe.depths(states).reshape(len(open_), len(retreats))
-        for row, i in enumerate(open_):
-            # The nearest clear distance, or else the least deep.
-            clear = np.flatnonzero(depth[row] <= CLEAR)
-            pick = int(clear[0]) if len(clear) else int(np.argmin(depth[row]))
-            found = best[i]
-            if found is None or depth[row, pick] < found[0]:
-                k = row * len(retreats) + pick
-                best[i] = (float(depth[row, pick]), states[k : k + 1])
-        open_ = [i for i in open_ if (b := best[i]) is None or b[0] > CLEAR]
-        if not open_:
+        # The nearest clear distance, or else the least deep.
+        clear = depth <= CLEAR
+        pick = np.where(clear.any(axis=1), clear.argmax(axis=1), depth.argmin(axis=1))
+        found = states[np.arange(len(open_)) * len(retreats) + pick]
+        depth = depth[np.arange(len(open_)), pick]
+        better = depth < deepest[open_]
+        best = found if best is None else _put(best, open_[better], found[better])
+        deepest[open_[better]] = depth[better]
+        open_ = open_[deepest[open_] > CLEAR]
+        if not len(open_):
             break
-    chosen = [b for b in best if b is not None]
-    if max(b[0] for b in chosen) > 0.01:
+    if best is None or deepest.max() > 0.01:
         raise InputError(
             f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
             "check the object's units"
         )
-    return HandState(
-        np.concatenate([b[1].pivot for b in chosen]),
-        np.concatenate([b[1].rotation for b in chosen]),
-        np.concatenate([b[1].q for b in chosen]),
-    )
+    return best
+
+
+def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> HandState:
+    """The states with these rows exchanged."""
+    out = HandState(states.pivot.copy(), states.rotation.copy(), states.q.copy())
+    out.pivot[rows], out.rotation[rows], out.q[rows] = others.pivot, others.rotation, others.q
+    return out

@@ -30,6 +30,7 @@ def distance_grid(obj: DeviceObject, cells: int) -> Any:
     reach = float(np.linalg.norm(high - low))
     flat = surface.Surface()
     flat.mesh, flat.corner_normals, flat.alpha = obj.surface.mesh, obj.surface.corner_normals, 0.0
+    flat.cells = obj.surface.cells
     device = obj.device
     with wp.ScopedDevice(device):
         field = wp.empty(tuple(shape), dtype=wp.float32)
@@ -48,7 +49,7 @@ def distance_grid(obj: DeviceObject, cells: int) -> Any:
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda ends: slab(*ends), pairwise(bounds.tolist())))
     out = surface.Surface()
-    out.mesh, out.corner_normals, out.alpha = flat.mesh, flat.corner_normals, 0.0
+    out.mesh, out.corner_normals, out.alpha, out.cells = flat.mesh, flat.corner_normals, 0.0, flat.cells
     out.field, out.field_origin, out.field_cell = field, wp.vec3(*low), cell
     out.field_error = 0.5 * cell
     return out

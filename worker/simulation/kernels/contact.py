@@ -36,6 +36,7 @@ class Physics:
     one_sided: wp.int32
     step: wp.float32  # |s0| of a moving simulation [m]
     radius: wp.float32  # no point taking part is farther from the centre of mass [m]
+    near_gap: wp.float32  # direct solver: contacts with a larger gap are not in the list of near ones [m]
 
 
 @wp.func
@@ -139,16 +140,19 @@ def direct(
     normal_in: wp.array2d(dtype=wp.vec3),
     distance_in: wp.array2d(dtype=wp.float32),
     weight_in: wp.array2d(dtype=wp.float32),
+    near_count_in: wp.array(dtype=wp.int32),
+    near_in: wp.array2d(dtype=wp.int32),
     # Data out:
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
-    gradient_inout: wp.array2d(dtype=wp.float32),
+    adjoint_out: wp.array2d(dtype=vec6),
 ):
     """Order-independent compliant contact: all contacts at once in one 6 x 6 system. Launch over (B, M).
 
     Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of magnitude at most mu k w_i C_i, by
     iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking
-    one a spring of stiffness k w_i.
+    one a spring of stiffness k w_i. `near` (B, N) lists the contacts whose gap is at most `near_gap`: only those are
+    looked at unless the object moves farther. `adjoint` (B, M) is how the loss depends on forces on the object.
     """
     b, m = wp.tid()
     if active_in[b] == 0:
@@ -157,7 +161,6 @@ def direct(
     s0 = motion_in[m]
     s = s0
     k = physics_in.stiffness
-    count = count_in[b]
     a = physics_in.mass
     for _pass in range(passes_in):
         a = physics_in.mass
@@ -168,7 +171,14 @@ def direct(
         c2 = wp.mat33(0.0)
         # No point moves farther than this, so points farther from the surface need no look.
         motion = wp.length(wp.vec3(s[0], s[1], s[2])) + wp.length(wp.vec3(s[3], s[4], s[5])) * physics_in.radius
-        for i in range(count):
+        all_near = motion <= physics_in.near_gap
+        count = count_in[b]
+        if all_near:
+            count = near_count_in[b]
+        for listed in range(count):
+            i = listed
+            if all_near:
+                i = near_in[b, listed]
             rho = distance_in[b, i]
             if rho - r > motion:
                 continue
@@ -190,25 +200,60 @@ def direct(
         s = solve_spd(a, rhs)
     loss_out[b, m] = displacement_loss(s, physics_in)
     end_out[b, m] = s
-    y = solve_spd(a, displacement_gradient(s, physics_in))
-    share = 1.0 / float(motion_in.shape[0])
-    for i in range(count):
+    adjoint_out[b, m] = solve_spd(a, displacement_gradient(s, physics_in))
+
+
+@wp.kernel
+def direct_gradient(
+    # Model:
+    physics_in: Physics,
+    lane_in: wp.int32,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    iteration_in: wp.array(dtype=wp.int32),
+    dilation_in: wp.array(dtype=wp.float32),
+    dilation_scale_in: wp.array(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    point_in: wp.array2d(dtype=wp.vec3),
+    normal_in: wp.array2d(dtype=wp.vec3),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    end_in: wp.array2d(dtype=vec6),
+    adjoint_in: wp.array2d(dtype=vec6),
+    # Data out:
+    gradient_out: wp.array2d(dtype=wp.float32),
+):
+    """dL/drho of each contact after `direct`, over all simulations in their order. Launch over (B, N / lane)."""
+    b, part = wp.tid()
+    if active_in[b] == 0:
+        return
+    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
+    share = 1.0 / float(end_in.shape[1])
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
         rho = distance_in[b, i]
         n = normal_in[b, i]
         p = point_in[b, i]
-        u = point_motion(s, p)
-        c = r - rho + wp.dot(n, u)
-        kw = k * weight_in[b, i]
-        g = kw * wp.dot(row(n, p), y)
-        if c > 0.0:
-            tangent = u - wp.dot(n, u) * n
-            length = wp.length(tangent)
-            if physics_in.friction * c < length:
-                g += kw * physics_in.friction * wp.dot(row(tangent / length, p), y)
-        else:
-            g = leaked(g, rho - r, physics_in)
-        if g != 0.0:
-            wp.atomic_add(gradient_inout, b, i, share * g)
+        j = row(n, p)
+        kw = physics_in.stiffness * weight_in[b, i]
+        fade = physics_in.leak * wp.exp((r - rho) / physics_in.leak_length)
+        total = float(0.0)
+        for m in range(end_in.shape[1]):
+            s = end_in[b, m]
+            y = adjoint_in[b, m]
+            g = wp.dot(j, y)
+            c = r - rho + wp.dot(j, s)
+            if c > 0.0:
+                u = point_motion(s, p)
+                tangent = u - wp.dot(n, u) * n
+                length = wp.length(tangent)
+                if physics_in.friction * c < length:
+                    g += physics_in.friction * wp.dot(row(tangent / length, p), y)
+            elif physics_in.one_sided == 1 and g < 0.0:
+                g = 0.0
+            else:
+                g = g * fade
+            total += g
+        gradient_out[b, i] = share * kw * total
 
 
 @wp.func

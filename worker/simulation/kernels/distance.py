@@ -28,6 +28,7 @@ def mesh_distance(
     high_in: wp.vec3,
     coarse_in: wp.array3d(dtype=wp.float32),
     spacing_in: wp.float32,
+    coarse_reach_in: wp.float32,
     # In:
     reach_in: wp.float32,
     point_in: wp.array(dtype=wp.vec3),
@@ -40,8 +41,9 @@ def mesh_distance(
 
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
     The sign is ray parity, or the winding number where `winding` is 1 (open meshes): both are right near creases.
-    `coarse` has the distance at nodes `spacing` apart, the first one at `low`; empty: not known. A point is at most as
-    much nearer to the surface as it is away from a node: what is beyond reach by that is looked up no further.
+    `coarse` has the distance at nodes `spacing` apart, the first one at `low`, at least `coarse_reach` where it is not
+    exact; empty: not known. Between a node and a point the distance changes at most by the way between them: what is
+    beyond reach by that is looked up no further, no face is looked for beyond it, and no sign where it cannot change.
     """
     i = wp.tid()
     p = point_in[i]
@@ -57,25 +59,35 @@ def mesh_distance(
         and p[1] < high_in[1]
         and p[2] < high_in[2]
     )
+    known = float(0.0)
+    within = reach_in
+    if inside:
+        within = wp.length(high_in - low_in)
     if inside and coarse_in.shape[0] > 0:
         at = (p - low_in) / spacing_in
         x = wp.min(int(at[0] + 0.5), coarse_in.shape[0] - 1)
         y = wp.min(int(at[1] + 0.5), coarse_in.shape[1] - 1)
         z = wp.min(int(at[2] + 0.5), coarse_in.shape[2] - 1)
-        node = low_in + spacing_in * wp.vec3(float(x), float(y), float(z))
-        if coarse_in[x, y, z] - wp.length(p - node) > reach_in + ROUNDING:
+        way = wp.length(p - (low_in + spacing_in * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
+        coarse = coarse_in[x, y, z]
+        if coarse - way > reach_in:
             return
-    if inside:
-        if winding_in == 1:
-            query = wp.mesh_query_point_sign_winding_number(mesh_in, p, wp.length(high_in - low_in))
-        else:
-            query = wp.mesh_query_point(mesh_in, p, wp.length(high_in - low_in))
+        if wp.abs(coarse) > way:
+            known = wp.sign(coarse)
+        if coarse < coarse_reach_in:
+            within = wp.min(within, wp.abs(coarse) + way)
+    if not inside or known != 0.0:
+        query = wp.mesh_query_point_no_sign(mesh_in, p, within)
+    elif winding_in == 1:
+        query = wp.mesh_query_point_sign_winding_number(mesh_in, p, within)
     else:
-        query = wp.mesh_query_point_no_sign(mesh_in, p, reach_in)
+        query = wp.mesh_query_point(mesh_in, p, within)
     if query.result:
         closest = wp.mesh_eval_position(mesh_in, query.face, query.u, query.v)
         sign = float(1.0)
-        if inside:
+        if known != 0.0:
+            sign = known
+        elif inside:
             sign = query.sign
         gap = wp.length(p - closest)
         u = query.u

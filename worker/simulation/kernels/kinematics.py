@@ -36,6 +36,7 @@ def forward(
     force_out: wp.array2d(dtype=wp.vec3),
     torque_out: wp.array2d(dtype=wp.vec3),
     count_out: wp.array(dtype=wp.int32),
+    near_count_out: wp.array(dtype=wp.int32),
     point_depth_out: wp.array(dtype=wp.float32),
     object_depth_out: wp.array(dtype=wp.float32),
     self_depth_out: wp.array(dtype=wp.float32),
@@ -45,6 +46,7 @@ def forward(
     if active_in[b] == 0:
         return
     count_out[b] = 0
+    near_count_out[b] = 0
     point_depth_out[b] = 0.0
     object_depth_out[b] = 0.0
     self_depth_out[b] = 0.0

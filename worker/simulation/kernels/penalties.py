@@ -9,6 +9,7 @@ wp.set_module_options({"enable_backward": False})
 def points_to_bodies(
     # Model:
     clearance_in: wp.float32,
+    lane_in: wp.int32,
     # Data in:
     active_in: wp.array(dtype=wp.int32),
     iteration_in: wp.array(dtype=wp.int32),
@@ -27,21 +28,24 @@ def points_to_bodies(
 ):
     """Wrench gradient on bodies from dL/drho, with the penetration term w sum w_i min(rho - clearance, 0)^2 added.
 
-    The distance grows along the object's outward normal (normals are taken as constant). Launch over (B, N).
+    The distance grows along the object's outward normal (normals are taken as constant). Launch over
+    (B, N / lane).
     """
-    b, i = wp.tid()
-    if active_in[b] == 0 or i >= count_in[b]:
+    b, part = wp.tid()
+    if active_in[b] == 0:
         return
-    rho = distance_in[b, i]
-    g = gradient_in[b, i]
-    if rho < clearance_in:
-        g += 2.0 * penetration_weight_in[iteration_in[0]] * weight_in[b, i] * (rho - clearance_in)
-        wp.atomic_max(depth_inout, b, -rho)
-    if g != 0.0:
-        body = body_in[b, i]
-        f = g * normal_in[b, i]
-        wp.atomic_add(force_inout, b, body, f)
-        wp.atomic_add(torque_inout, b, body, wp.cross(point_in[b, i], f))
+    penetration = 2.0 * penetration_weight_in[iteration_in[0]]
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
+        rho = distance_in[b, i]
+        g = gradient_in[b, i]
+        if rho < clearance_in:
+            g += penetration * weight_in[b, i] * (rho - clearance_in)
+            wp.atomic_max(depth_inout, b, -rho)
+        if g != 0.0:
+            body = body_in[b, i]
+            f = g * normal_in[b, i]
+            wp.atomic_add(force_inout, b, body, f)
+            wp.atomic_add(torque_inout, b, body, wp.cross(point_in[b, i], f))
 
 
 @wp.kernel

@@ -124,12 +124,49 @@ def world_extent(q: wp.quat, half: wp.vec3):
     )
 
 
+@wp.struct
+class Samples:
+    """Points on the object's surface, sorted by the cells of a grid that they lie in, z changing fastest."""
+
+    position: wp.array(dtype=wp.vec3)
+    first: wp.array(dtype=wp.int32)  # (cells + 1,)
+    low: wp.vec3
+    size: wp.float32
+    shape: wp.vec3i
+
+
+@wp.func
+def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.float32, count: wp.int32):
+    """First and last of `count` cells along an axis that an interval meets; first > last: none."""
+    a = int(wp.floor((low - origin) / size))
+    b = int(wp.floor((high - origin) / size))
+    return wp.vec2i(wp.max(a, 0), wp.min(b, count - 1))
+
+
+@wp.func
+def clip_depth(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
+    """`piece_distance`, or some distance that is larger than `above` where the distance is."""
+    if pieces.kind[piece] != HULL:
+        return piece_distance(pieces, piece, x)
+    d = float(-1.0e9)
+    best = pieces.first_plane[piece]
+    for k in range(pieces.first_plane[piece], pieces.first_plane[piece + 1]):
+        plane = pieces.planes[k]
+        value = plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] - plane[3]
+        if value > d:
+            d = value
+            best = k
+            if d > above:
+                break
+    plane = pieces.planes[best]
+    return wp.vec4(plane[0], plane[1], plane[2], d)
+
+
 @wp.kernel
 def object_in_pieces(
     # Model:
     pieces_in: Pieces,
-    bvh_in: wp.uint64,
-    sample_in: wp.array(dtype=wp.vec3),
+    samples_in: Samples,
     sample_weight_in: wp.float32,
     # Data in:
     active_in: wp.array(dtype=wp.int32),
@@ -154,25 +191,44 @@ def object_in_pieces(
     q = piece_rotation(pieces_in, piece, b, body_q_in)
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece]
-    extent = world_extent(q, half)
+    turn = wp.quat_to_matrix(q)
+    # Along each axis of the world a box turned by `turn` reaches this far.
+    extent = wp.vec3(
+        wp.abs(turn[0, 0]) * half[0] + wp.abs(turn[0, 1]) * half[1] + wp.abs(turn[0, 2]) * half[2],
+        wp.abs(turn[1, 0]) * half[0] + wp.abs(turn[1, 1]) * half[1] + wp.abs(turn[1, 2]) * half[2],
+        wp.abs(turn[2, 0]) * half[0] + wp.abs(turn[2, 1]) * half[1] + wp.abs(turn[2, 2]) * half[2],
+    )
     weight = 2.0 * sample_weight_in * weight_in[iteration_in[0]]
     force = wp.vec3(0.0)
     torque = wp.vec3(0.0)
     deepest = float(0.0)
-    query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
-    index = wp.int32(0)
-    while wp.bvh_query_next(query, index):
-        x = sample_in[index]
-        local = wp.quat_rotate_inv(q, x - p)
-        if in_box(local, half):
-            nd = piece_distance(pieces_in, piece, local)
-            depth = -nd[3]
-            if depth > 0.0:
-                n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                f = (weight * depth) * n
-                force += f
-                torque += wp.cross(x, f)
-                deepest = wp.max(deepest, depth)
+    low = samples_in.low
+    size = samples_in.size
+    shape = samples_in.shape
+    xs = cell_range(p[0] - extent[0], p[0] + extent[0], low[0], size, shape[0])
+    ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
+    zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
+    if xs[0] <= xs[1] and ys[0] <= ys[1] and zs[0] <= zs[1]:
+        for i in range(xs[0], xs[1] + 1):
+            for j in range(ys[0], ys[1] + 1):
+                row = (i * shape[1] + j) * shape[2]
+                for index in range(samples_in.first[row + zs[0]], samples_in.first[row + zs[1] + 1]):
+                    x = samples_in.position[index]
+                    offset = x - p
+                    local = wp.vec3(
+                        turn[0, 0] * offset[0] + turn[1, 0] * offset[1] + turn[2, 0] * offset[2],
+                        turn[0, 1] * offset[0] + turn[1, 1] * offset[1] + turn[2, 1] * offset[2],
+                        turn[0, 2] * offset[0] + turn[1, 2] * offset[1] + turn[2, 2] * offset[2],
+                    )
+                    if in_box(local, half):
+                        nd = clip_depth(pieces_in, piece, local, 0.0)
+                        depth = -nd[3]
+                        if depth > 0.0:
+                            n = turn * wp.vec3(nd[0], nd[1], nd[2])
+                            f = (weight * depth) * n
+                            force += f
+                            torque += wp.cross(x, f)
+                            deepest = wp.max(deepest, depth)
     if deepest > 0.0:
         wp.atomic_add(force_inout, b, body, force)
         wp.atomic_add(torque_inout, b, body, torque)
@@ -187,19 +243,23 @@ class BodyPoints:
     position: wp.array(dtype=wp.vec3)  # body frame
     centre: wp.array(dtype=wp.vec3)  # (L,)
     radius: wp.array(dtype=wp.float32)  # (L,)
+    extent: wp.array(dtype=wp.float32)  # (L,) greatest distance from the body's origin
 
 
 @wp.func
 def may_touch(
-    pieces: Pieces, points: BodyPoints, piece: wp.int32, own: wp.int32, b: wp.int32, margin: wp.float32,
+    pieces: Pieces, points: BodyPoints, other: wp.int32, centre: wp.vec3, reach: wp.float32, own: wp.int32, b: wp.int32,
     body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
 ):  # fmt: skip
-    """Whether the points of body `own` count against a piece and their bounding spheres meet."""
-    if pieces.apart[own, pieces.body[piece]] == 0 or points.first[own] == points.first[own + 1]:
+    """Whether the points of body `own` count against a piece of body `other` and come within `reach` of its centre."""
+    if pieces.apart[own, other] == 0 or points.first[own] == points.first[own + 1]:
         return False
-    centre = piece_centre(pieces, piece, b, body_p, body_q)
-    offset = body_p[b, own] + wp.quat_rotate(body_q[b, own], points.centre[own]) - centre
-    reach = wp.length(pieces.half[piece]) + points.radius[own] + margin
+    offset = body_p[b, own] - centre
+    about = reach + points.extent[own]
+    if wp.dot(offset, offset) >= about * about:
+        return False
+    offset += wp.quat_rotate(body_q[b, own], points.centre[own])
+    reach += points.radius[own]
     return wp.dot(offset, offset) < reach * reach
 
 
@@ -233,19 +293,33 @@ def pieces_in_pieces(
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     weight = 2.0 * point_weight_in * weight_in[iteration_in[0]]
     half = pieces_in.half[piece] + wp.vec3(margin_in, margin_in, margin_in)
+    reach = wp.length(pieces_in.half[piece]) + margin_in
     for own in range(body_p_in.shape[1]):
-        if may_touch(pieces_in, points_in, piece, own, b, margin_in, body_p_in, body_q_in):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
+            # From the body's frame straight into the piece's.
+            turn = wp.quat_to_matrix(wp.quat_inverse(q) * body_q_in[b, own])
+            shift = wp.quat_rotate_inv(q, body_p_in[b, own] - p)
+            force = wp.vec3(0.0)
+            torque = wp.vec3(0.0)
+            deepest = float(0.0)
+            touched = wp.int32(0)
             for i in range(points_in.first[own], points_in.first[own + 1]):
-                x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
-                local = wp.quat_rotate_inv(q, x - p)
+                local = turn * points_in.position[i] + shift
                 if in_box(local, half):
-                    nd = piece_distance(pieces_in, piece, local)
+                    nd = clip_depth(pieces_in, piece, local, margin_in)
                     depth = margin_in - nd[3]
                     if depth > 0.0:
-                        f = (weight * depth) * wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                        t = wp.cross(x, f)
-                        wp.atomic_add(force_inout, b, other, f)
-                        wp.atomic_add(torque_inout, b, other, t)
-                        wp.atomic_add(force_inout, b, own, -f)
-                        wp.atomic_add(torque_inout, b, own, -t)
-                        wp.atomic_max(depth_inout, b, -nd[3])
+                        f = (weight * depth) * wp.vec3(nd[0], nd[1], nd[2])
+                        force += f
+                        torque += wp.cross(local, f)
+                        deepest = wp.max(deepest, -nd[3])
+                        touched = 1
+            if touched == 1:
+                f = wp.quat_rotate(q, force)
+                # About the object's origin: the sum was about the piece's.
+                t = wp.quat_rotate(q, torque) + wp.cross(p, f)
+                wp.atomic_add(force_inout, b, other, f)
+                wp.atomic_add(torque_inout, b, other, t)
+                wp.atomic_add(force_inout, b, own, -f)
+                wp.atomic_add(torque_inout, b, own, -t)
+                wp.atomic_max(depth_inout, b, deepest)

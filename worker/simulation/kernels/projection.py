@@ -11,10 +11,12 @@ from worker.simulation.kernels.kinematics import Tree
 from worker.simulation.kernels.pieces import (
     BodyPoints,
     Pieces,
+    Samples,
+    cell_range,
+    clip_depth,
     in_box,
     may_touch,
     piece_centre,
-    piece_distance,
     piece_rotation,
     world_extent,
 )
@@ -52,6 +54,8 @@ def emit(
 
 @wp.kernel
 def point_residuals(
+    # Model:
+    lane_in: wp.int32,
     # Data in:
     active_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
@@ -68,23 +72,27 @@ def point_residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Hand points nearer than `near` go to `target`; those nearer than `hold` are held near it, weakly. Over (B, N)."""
-    b, i = wp.tid()
-    if active_in[b] == 0 or i >= count_in[b]:
+    """Hand points nearer than `near` go to `target`; those nearer than `hold` are held near it, weakly.
+
+    Launch over (B, N / lane).
+    """
+    b, part = wp.tid()
+    if active_in[b] == 0:
         return
-    rho = distance_in[b, i]
-    if rho < near_in:
-        emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
-    elif rho < hold_in:
-        emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - hold_target_in, hold_weight_in)
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
+        rho = distance_in[b, i]
+        if rho < near_in:
+            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
+        elif rho < hold_in:
+            gap = rho - hold_target_in
+            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], gap, hold_weight_in)
 
 
 @wp.kernel
 def sample_residuals(
     # Model:
     pieces_in: Pieces,
-    bvh_in: wp.uint64,
-    sample_in: wp.array(dtype=wp.vec3),
+    samples_in: Samples,
     # Data in:
     active_in: wp.array(dtype=wp.int32),
     body_p_in: wp.array2d(dtype=wp.vec3),
@@ -104,17 +112,26 @@ def sample_residuals(
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
     extent = world_extent(q, half)
-    query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
-    index = wp.int32(0)
-    while wp.bvh_query_next(query, index):
-        x = sample_in[index]
-        local = wp.quat_rotate_inv(q, x - p)
-        if in_box(local, half):
-            nd = piece_distance(pieces_in, piece, local)
-            if nd[3] < near_in:
-                n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                # The link moving along its own outward normal comes nearer: d falls.
-                emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
+    low = samples_in.low
+    size = samples_in.size
+    shape = samples_in.shape
+    xs = cell_range(p[0] - extent[0], p[0] + extent[0], low[0], size, shape[0])
+    ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
+    zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
+    back = wp.transpose(wp.quat_to_matrix(q))
+    if xs[0] <= xs[1] and ys[0] <= ys[1] and zs[0] <= zs[1]:
+        for i in range(xs[0], xs[1] + 1):
+            for j in range(ys[0], ys[1] + 1):
+                row = (i * shape[1] + j) * shape[2]
+                for index in range(samples_in.first[row + zs[0]], samples_in.first[row + zs[1] + 1]):
+                    x = samples_in.position[index]
+                    local = back * (x - p)
+                    if in_box(local, half):
+                        nd = clip_depth(pieces_in, piece, local, near_in)
+                        if nd[3] < near_in:
+                            n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                            # The link moving along its own outward normal comes nearer: d falls.
+                            emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
 
 
 @wp.kernel
@@ -140,14 +157,18 @@ def self_residuals(
     q = piece_rotation(pieces_in, piece, b, body_q_in)
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
+    reach = wp.length(pieces_in.half[piece]) + near_in
     for own in range(body_p_in.shape[1]):
-        if may_touch(pieces_in, points_in, piece, own, b, near_in, body_p_in, body_q_in):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
+            # From the body's frame straight into the piece's.
+            turn = wp.quat_to_matrix(wp.quat_inverse(q) * body_q_in[b, own])
+            shift = wp.quat_rotate_inv(q, body_p_in[b, own] - p)
             for i in range(points_in.first[own], points_in.first[own + 1]):
-                x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
-                local = wp.quat_rotate_inv(q, x - p)
+                local = turn * points_in.position[i] + shift
                 if in_box(local, half):
-                    nd = piece_distance(pieces_in, piece, local)
+                    nd = clip_depth(pieces_in, piece, local, near_in)
                     if nd[3] < near_in:
+                        x = p + wp.quat_rotate(q, local)
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
                         emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
 

@@ -9,6 +9,8 @@ the surface. Corner normals stop at creases, so boxes and cylinders keep their e
 
 import warp as wp
 
+from worker.simulation.kernels.nearest import Cells, closest_in_cell
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -23,6 +25,7 @@ class Surface:
     field_origin: wp.vec3
     field_cell: wp.float32
     field_error: wp.float32  # a point whose grid distance is above `exact below` + this is never asked of the mesh
+    cells: Cells  # faces near each cell of the grid; without lists: the mesh's tree is asked
 
 
 @wp.struct
@@ -34,6 +37,39 @@ class Sample:
 
 
 @wp.func
+def smoothed(surface: Surface, point: wp.vec3, closest: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32,
+             sign: wp.float32):  # fmt: skip
+    """Distance and normal at a point whose closest point on the mesh has weights u, v, 1 - u - v of a face."""
+    out = Sample()
+    w = 1.0 - u - v
+    n0 = surface.corner_normals[3 * face]
+    n1 = surface.corner_normals[3 * face + 1]
+    n2 = surface.corner_normals[3 * face + 2]
+    # Corners from the closest point: v_0 = b - v ab - w ac, and so on.
+    sides = surface.cells.faces.face[face]
+    ab = sides.ab
+    ac = sides.ac
+    from0 = v * ab + w * ac
+    smooth = wp.normalize(u * n0 + v * n1 + w * n2)
+    # b - r* = alpha sum_k w_k ((b - v_k).n_k) n_k
+    lift = (u * wp.dot(from0, n0)) * n0 + (v * wp.dot(from0 - ab, n1)) * n1 + (w * wp.dot(from0 - ac, n2)) * n2
+    offset = point - closest
+    gap = wp.length(offset)
+    out.distance = sign * gap + surface.alpha * wp.dot(lift, smooth)
+    # Far from the surface the direction to the closest point is the gradient; on it that is 0/0.
+    share = wp.min(gap / 1.0e-3, 1.0)
+    direction = (1.0 - share) * smooth
+    if gap > 1.0e-9:
+        direction = direction + (share * sign / gap) * offset
+    length = wp.length(direction)
+    if length > 1.0e-6:
+        out.normal = direction / length
+    else:
+        out.normal = smooth
+    return out
+
+
+@wp.func
 def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
     """Smoothed signed distance and normal; distance = reach and normal 0 where the surface is farther than `reach`."""
     out = Sample()
@@ -41,37 +77,67 @@ def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
     out.normal = wp.vec3(0.0)
     query = wp.mesh_query_point_sign_normal(surface.mesh, point, reach)
     if query.result:
-        face = query.face
-        u = query.u
-        v = query.v
-        w = 1.0 - u - v
-        closest = wp.mesh_eval_position(surface.mesh, face, u, v)
-        n0 = surface.corner_normals[3 * face]
-        n1 = surface.corner_normals[3 * face + 1]
-        n2 = surface.corner_normals[3 * face + 2]
-        v0 = wp.mesh_get_point(surface.mesh, 3 * face)
-        v1 = wp.mesh_get_point(surface.mesh, 3 * face + 1)
-        v2 = wp.mesh_get_point(surface.mesh, 3 * face + 2)
-        smooth = wp.normalize(u * n0 + v * n1 + w * n2)
-        # b - r* = alpha sum_k w_k ((b - v_k).n_k) n_k
-        lift = (
-            (u * wp.dot(closest - v0, n0)) * n0
-            + (v * wp.dot(closest - v1, n1)) * n1
-            + (w * wp.dot(closest - v2, n2)) * n2
-        )
-        offset = point - closest
-        gap = wp.length(offset)
-        out.distance = query.sign * gap + surface.alpha * wp.dot(lift, smooth)
-        # Far from the surface the direction to the closest point is the gradient; on it that is 0/0.
-        share = wp.min(gap / 1.0e-3, 1.0)
-        direction = (1.0 - share) * smooth
-        if gap > 1.0e-9:
-            direction = direction + (share * query.sign / gap) * offset
-        length = wp.length(direction)
-        if length > 1.0e-6:
-            out.normal = direction / length
-        else:
-            out.normal = smooth
+        closest = wp.mesh_eval_position(surface.mesh, query.face, query.u, query.v)
+        out = smoothed(surface, point, closest, query.face, query.u, query.v, query.sign)
+    return out
+
+
+@wp.func
+def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
+    """The same, from the list of the cell that the point is in if that has one."""
+    x = (point - surface.field_origin) / surface.field_cell
+    i = int(wp.floor(x[0]))
+    j = int(wp.floor(x[1]))
+    k = int(wp.floor(x[2]))
+    nx = surface.field.shape[0] - 1
+    ny = surface.field.shape[1] - 1
+    nz = surface.field.shape[2] - 1
+    if i >= 0 and j >= 0 and k >= 0 and i < nx and j < ny and k < nz:
+        centre = surface.field_origin + surface.field_cell * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
+        found = closest_in_cell(surface.cells, (i * ny + j) * nz + k, centre, point)
+        if found.face >= 0:
+            out = smoothed(surface, point, found.point, found.face, 1.0 - found.v - found.w, found.v, found.sign)
+            if found.gap >= reach:
+                out.distance = reach
+                out.normal = wp.vec3(0.0)
+            return out
+    return mesh_distance(surface, point, reach)
+
+
+@wp.func
+def field_value(surface: Surface, point: wp.vec3):
+    """Trilinear interpolation of the grid; 1e3 m outside it."""
+    out = float(1.0e3)
+    x = (point - surface.field_origin) / surface.field_cell
+    i = int(wp.floor(x[0]))
+    j = int(wp.floor(x[1]))
+    k = int(wp.floor(x[2]))
+    if (
+        i >= 0
+        and j >= 0
+        and k >= 0
+        and i + 1 < surface.field.shape[0]
+        and j + 1 < surface.field.shape[1]
+        and k + 1 < surface.field.shape[2]
+    ):
+        a = x[0] - float(i)
+        b = x[1] - float(j)
+        c = x[2] - float(k)
+        f000 = surface.field[i, j, k]
+        f100 = surface.field[i + 1, j, k]
+        f010 = surface.field[i, j + 1, k]
+        f110 = surface.field[i + 1, j + 1, k]
+        f001 = surface.field[i, j, k + 1]
+        f101 = surface.field[i + 1, j, k + 1]
+        f011 = surface.field[i, j + 1, k + 1]
+        f111 = surface.field[i + 1, j + 1, k + 1]
+        f00 = f000 + a * (f100 - f000)
+        f10 = f010 + a * (f110 - f010)
+        f01 = f001 + a * (f101 - f001)
+        f11 = f011 + a * (f111 - f011)
+        f0 = f00 + b * (f10 - f00)
+        f1 = f01 + b * (f11 - f01)
+        out = f0 + c * (f1 - f0)
     return out
 
 
@@ -119,15 +185,19 @@ def field_distance(surface: Surface, point: wp.vec3):
 
 
 @wp.func
-def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: wp.float32):
-    """The mesh's distance near the surface, the grid's where that is good enough, `reach` beyond it."""
+def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: wp.float32, keep: wp.float32):
+    """The mesh's distance near the surface, the grid's where that is good enough; `reach` beyond that, and where the
+    grid says more than `keep`, which is at least `exact_below`."""
     if surface.field.shape[0] > 0:
-        coarse = field_distance(surface, point)
-        if coarse.distance > exact_below + surface.field_error:
-            if coarse.distance > reach:
-                coarse.distance = reach
-                coarse.normal = wp.vec3(0.0)
-            return coarse
+        coarse = field_value(surface, point)
+        if coarse > exact_below + surface.field_error:
+            if coarse < keep:
+                return field_distance(surface, point)
+            out = Sample()
+            out.distance = reach
+            out.normal = wp.vec3(0.0)
+            return out
+        return near_distance(surface, point, reach)
     return mesh_distance(surface, point, reach)
 
 
@@ -162,7 +232,7 @@ def probe(
 ):
     """Distances and normals at given points. Launch over the points."""
     i = wp.tid()
-    sample = distance(surface_in, point_in[i], reach_in, exact_below_in)
+    sample = distance(surface_in, point_in[i], reach_in, exact_below_in, reach_in)
     distance_out[i] = sample.distance
     normal_out[i] = sample.normal
 
@@ -173,6 +243,9 @@ def gather(
     surface_in: Surface,
     band_in: wp.float32,
     exact_in: wp.float32,
+    keep_in: wp.float32,
+    near_gap_in: wp.float32,
+    lane_in: wp.int32,
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
     weight_in: wp.array(dtype=wp.float32),
@@ -191,21 +264,28 @@ def gather(
     contact_distance_out: wp.array2d(dtype=wp.float32),
     contact_weight_out: wp.array2d(dtype=wp.float32),
     gradient_out: wp.array2d(dtype=wp.float32),
+    near_count_inout: wp.array(dtype=wp.int32),
+    near_out: wp.array2d(dtype=wp.int32),
 ):
-    """Candidate contacts: hand points nearer than dilation + band, packed per grasp. Launch over (B, N)."""
-    b, i = wp.tid()
+    """Candidate contacts: hand points nearer than dilation + keep, packed per grasp; `near` lists those with a gap of
+    at most `near_gap`. Launch over (B, N / lane)."""
+    b, part = wp.tid()
     if active_in[b] == 0:
         return
-    body = body_in[i]
-    point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
     dilation = dilation_scale_in[b] * dilation_in[iteration_in[0]]
     reach = dilation + band_in
-    sample = distance(surface_in, point, reach, exact_in)
-    if sample.distance < reach:
-        k = wp.atomic_add(count_inout, b, 1)
-        contact_body_out[b, k] = body
-        contact_point_out[b, k] = point
-        contact_normal_out[b, k] = sample.normal
-        contact_distance_out[b, k] = sample.distance
-        contact_weight_out[b, k] = weight_in[i]
-        gradient_out[b, k] = 0.0
+    keep = dilation + keep_in
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, body_in.shape[0])):
+        body = body_in[i]
+        point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+        sample = distance(surface_in, point, reach, exact_in, keep)
+        if sample.distance < keep:
+            k = wp.atomic_add(count_inout, b, 1)
+            contact_body_out[b, k] = body
+            contact_point_out[b, k] = point
+            contact_normal_out[b, k] = sample.normal
+            contact_distance_out[b, k] = sample.distance
+            contact_weight_out[b, k] = weight_in[i]
+            gradient_out[b, k] = 0.0
+            if sample.distance - dilation <= near_gap_in:
+                near_out[b, wp.atomic_add(near_count_inout, b, 1)] = k

@@ -11,8 +11,10 @@ def forget(
     active_in: wp.array(dtype=wp.int32),
     # Data out:
     count_out: wp.array(dtype=wp.int32),
+    near_count_out: wp.array(dtype=wp.int32),
 ):
     """No contacts yet. Launch over B."""
     b = wp.tid()
     if active_in[b] == 1:
         count_out[b] = 0
+        near_count_out[b] = 0

@@ -18,7 +18,8 @@ class AskingEach(Pair):
         record.add_poses(out, model, data)
         record.add_distances(out, model, data)
         for _ in range(model.options.velocities - 1):
-            out.add(kernels.forget, data.capacity, inputs=[data.active], outputs=[data.contacts.count])
+            counts = [data.contacts.count, data.contacts.near_count]
+            out.add(kernels.forget, data.capacity, inputs=[data.active], outputs=counts)
             record.add_distances(out, model, data)
         record.add_contact(out, model, data)
         record.add_penalties(out, model, data)

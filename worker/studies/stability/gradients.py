@@ -44,17 +44,24 @@ def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
     with wp.ScopedDevice("cpu"):
         loss, end = wp.zeros((1, m), dtype=wp.float32), wp.zeros((1, m), dtype=contact.vec6)
         gradient = wp.zeros((1, n), dtype=wp.float32)
-        inputs = [
-            _physics(world), wp.array(motions, dtype=contact.vec6), PASSES, wp.ones(1, dtype=wp.int32),
-            wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32), wp.ones(1, dtype=wp.float32),
-            wp.array([n], dtype=wp.int32), wp.array(contacts.points[None], dtype=wp.vec3),
+        physics = _physics(world)
+        given = [
+            wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32), wp.array([world.dilation], dtype=wp.float32),
+            wp.ones(1, dtype=wp.float32), wp.array([n], dtype=wp.int32), wp.array(contacts.points[None], dtype=wp.vec3),
             wp.array(contacts.normals[None], dtype=wp.vec3),
             wp.array(contacts.distances[None], dtype=wp.float32), wp.array(contacts.weights[None], dtype=wp.float32),
         ]  # fmt: skip
-        outputs = [loss, end, gradient]
-        if name != "direct":
-            outputs.insert(0, wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6))
-        wp.launch(_KERNELS[name], dim=(1, m), inputs=inputs, outputs=outputs)
+        inputs = [physics, wp.array(motions, dtype=contact.vec6), PASSES, *given]
+        if name == "direct":
+            near = [wp.array([n], dtype=wp.int32), wp.array(np.arange(n)[None], dtype=wp.int32)]
+            adjoint = wp.zeros((1, m), dtype=contact.vec6)
+            wp.launch(contact.direct, dim=(1, m), inputs=[*inputs, *near], outputs=[loss, end, adjoint])
+            wp.launch(
+                contact.direct_gradient, dim=(1, 1), inputs=[physics, n, *given, end, adjoint], outputs=[gradient]
+            )  # fmt: skip
+        else:
+            states = wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6)
+            wp.launch(_KERNELS[name], dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
         return gradient.numpy()[0].astype(float)
 
 
@@ -101,6 +108,7 @@ def _physics(world: World) -> Any:
     out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
     out.leak, out.leak_length, out.one_sided, out.step = 0.0, 0.02, 1, world.step
     out.radius = 10.0
+    out.near_gap = 100.0
     return out
 
 

@@ -1,0 +1,219 @@
+"""The closest point of a triangle mesh, from lists: each cell of a grid near the surface knows the faces among which
+the nearest to any of its points is, so no tree is walked.
+
+With D the distance of a cell's centre from the surface and h half the cell's diagonal, the nearest face to a point of
+the cell is at most D + 2 h from the centre. Faces are listed by that distance k, so a point at e from the centre need
+not look beyond k - e > its nearest so far. The sign is that of the angle-weighted normal of the feature on which the
+closest point lies (Baerentzen & Aanaes 2005).
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: Features of a face for `Faces.normal`: its inside, the edges ab, bc, ca, the corners a, b, c.
+FEATURES = wp.constant(7)
+
+
+@wp.struct
+class Face:
+    """A triangle a, b, c with what a distance to it takes, side by side in memory."""
+
+    a: wp.vec3
+    ab: wp.vec3
+    ac: wp.vec3
+    square: wp.vec3  # ab.ab, ab.ac, ac.ac
+
+
+@wp.struct
+class Faces:
+    """F triangles."""
+
+    face: wp.array(dtype=Face)
+    normal: wp.array(dtype=wp.vec3)  # (7 F,) outward, angle-weighted
+
+
+@wp.struct
+class Cells:
+    """Faces listed by cells; `first` has one entry more than there are cells, all 0 in size where nothing is listed."""
+
+    faces: Faces
+    first: wp.array(dtype=wp.int32)  # (cells + 1,)
+    face: wp.array(dtype=wp.int32)
+    key: wp.array(dtype=wp.float32)  # distance of the face from the cell's centre, ascending in a cell
+
+
+@wp.struct
+class Closest:
+    """A closest point of the mesh: a + v ab + w ac."""
+
+    face: wp.int32  # -1: none
+    v: wp.float32
+    w: wp.float32
+    point: wp.vec3
+    gap: wp.float32  # unsigned
+    sign: wp.float32
+
+
+@wp.func
+def on_face(face: Face, p: wp.vec3):
+    """Weights v, w of the point of a face nearest to p, and the feature it lies on (Ericson 2005, section 5.1.5)."""
+    ab = face.ab
+    ac = face.ac
+    square = face.square
+    ap = p - face.a
+    d1 = wp.dot(ab, ap)
+    d2 = wp.dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return wp.vec3(0.0, 0.0, 4.0)
+    d3 = d1 - square[0]
+    d4 = d2 - square[1]
+    if d3 >= 0.0 and d4 <= d3:
+        return wp.vec3(1.0, 0.0, 5.0)
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        return wp.vec3(d1 / (d1 - d3), 0.0, 1.0)
+    d5 = d1 - square[1]
+    d6 = d2 - square[2]
+    if d6 >= 0.0 and d5 <= d6:
+        return wp.vec3(0.0, 1.0, 6.0)
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        return wp.vec3(0.0, d2 / (d2 - d6), 3.0)
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return wp.vec3(1.0 - w, w, 2.0)
+    total = va + vb + vc
+    return wp.vec3(vb / total, vc / total, 0.0)
+
+
+@wp.func
+def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
+    """The closest point of the mesh to p, which lies in the cell with this centre; face -1 where nothing is listed."""
+    out = Closest()
+    out.face = -1
+    off = wp.length(p - centre)
+    best = float(1.0e30)
+    feature = float(0.0)
+    least = float(1.0e15)
+    for k in range(cells.first[cell], cells.first[cell + 1]):
+        if cells.key[k] - off > least:
+            break
+        index = cells.face[k]
+        face = cells.faces.face[index]
+        at = on_face(face, p)
+        point = face.a + at[0] * face.ab + at[1] * face.ac
+        offset = p - point
+        square = wp.dot(offset, offset)
+        if square < best:
+            best = square
+            least = wp.sqrt(square)
+            feature = at[2]
+            out.face = index
+            out.v = at[0]
+            out.w = at[1]
+            out.point = point
+    if out.face >= 0:
+        out.gap = least
+        out.sign = 1.0
+        if wp.dot(cells.faces.normal[7 * out.face + int(feature)], p - out.point) < 0.0:
+            out.sign = -1.0
+    return out
+
+
+@wp.kernel
+def count_faces(
+    # In:
+    mesh_in: wp.uint64,
+    faces_in: Faces,
+    low_in: wp.vec3,
+    size_in: wp.float32,
+    field_in: wp.array3d(dtype=wp.float32),
+    within_in: wp.float32,
+    # Out:
+    radius_out: wp.array(dtype=wp.float32),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """Faces to list for each cell that has a corner with a distance of at most `within`, and how far they may be from
+    its centre. Launch over the cells, in the order of their index."""
+    cell = wp.tid()
+    ny = field_in.shape[1] - 1
+    nz = field_in.shape[2] - 1
+    i = cell // (ny * nz)
+    j = (cell // nz) % ny
+    k = cell % nz
+    least = float(1.0e3)
+    low = float(1.0e3)
+    high = float(-1.0e3)
+    for corner in range(8):
+        value = field_in[i + corner // 4, j + (corner // 2) % 2, k + corner % 2]
+        least = wp.min(least, wp.abs(value))
+        low = wp.min(low, value)
+        high = wp.max(high, value)
+    count_out[cell] = 0
+    if least > within_in and low * high > 0.0:
+        return
+    centre = low_in + size_in * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
+    query = wp.mesh_query_point_no_sign(mesh_in, centre, 1.0e3)
+    if not query.result:
+        return
+    # Half a diagonal is 0.866 of the cell's size; a little more for rounding.
+    radius = wp.length(wp.mesh_eval_position(mesh_in, query.face, query.u, query.v) - centre) + 1.74 * size_in
+    radius_out[cell] = radius
+    extent = wp.vec3(radius, radius, radius)
+    near = wp.mesh_query_aabb(mesh_in, centre - extent, centre + extent)
+    index = wp.int32(0)
+    count = wp.int32(0)
+    while wp.mesh_query_aabb_next(near, index):
+        face = faces_in.face[index]
+        at = on_face(face, centre)
+        if wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre) <= radius:
+            count += 1
+    count_out[cell] = count
+
+
+@wp.kernel
+def list_faces(
+    # In:
+    mesh_in: wp.uint64,
+    faces_in: Faces,
+    low_in: wp.vec3,
+    size_in: wp.float32,
+    shape_in: wp.vec3i,
+    radius_in: wp.array(dtype=wp.float32),
+    first_in: wp.array(dtype=wp.int32),
+    # Out:
+    face_out: wp.array(dtype=wp.int32),
+    key_out: wp.array(dtype=wp.float32),
+):
+    """Fill the lists that `count_faces` counted, nearest faces first. Launch over the cells."""
+    cell = wp.tid()
+    start = first_in[cell]
+    if first_in[cell + 1] == start:
+        return
+    i = cell // (shape_in[1] * shape_in[2])
+    j = (cell // shape_in[2]) % shape_in[1]
+    k = cell % shape_in[2]
+    centre = low_in + size_in * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
+    radius = radius_in[cell]
+    extent = wp.vec3(radius, radius, radius)
+    near = wp.mesh_query_aabb(mesh_in, centre - extent, centre + extent)
+    index = wp.int32(0)
+    count = wp.int32(0)
+    while wp.mesh_query_aabb_next(near, index):
+        face = faces_in.face[index]
+        at = on_face(face, centre)
+        key = wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre)
+        if key <= radius and start + count < first_in[cell + 1]:
+            place = start + count
+            # Equal keys stand in the order of their faces: what is nearest does not depend on the tree.
+            while place > start and (
+                key_out[place - 1] > key or (key_out[place - 1] == key and face_out[place - 1] > index)
+            ):
+                key_out[place] = key_out[place - 1]
+                face_out[place] = face_out[place - 1]
+                place -= 1
+            key_out[place] = key
+            face_out[place] = index
+            count += 1
