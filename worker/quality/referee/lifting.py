@@ -23,7 +23,7 @@ from worker.quality.referee import lift as protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
-from worker.quality.referee.model import DENSITY, MujocoOptions, build
+from worker.quality.referee.model import DENSITY, TOUCH_ROUNDING_M, MujocoOptions, build
 from worker.run import ALONE, Run
 from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed
@@ -137,7 +137,7 @@ def lift_key(
     physics = asdict(MujocoOptions().hardened() if hard else MujocoOptions())
     terms = [REVISION, pushes, level, physics, digest_bytes(supports), constants]
     if any(support.tips_m is not None for support in placed.supports):
-        terms.append([support.tips_m for support in placed.supports])
+        terms.append([TOUCH_ROUNDING_M, *(support.tips_m for support in placed.supports)])
     if placed.neighbours:
         corners = b"".join(np.round(piece, 9).tobytes() for one in placed.neighbours for piece in one.pieces)
         terms += [digest_bytes(corners), [DENSITY, protocol.NEIGHBOUR_MOVED_M, protocol.NEIGHBOUR_TILTED]]
