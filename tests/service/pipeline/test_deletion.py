@@ -78,7 +78,7 @@ def test_shards_that_nobody_needs_go_after_the_grace_time(parts: Parts) -> None:
     Sweeper(parts).advance()
     assert not Sweeper(parts).collect()
     assert len(keys(parts, "shards")) == 2, "there is grace"
-    assert not graceless(parts).collect()
+    assert not graceless(parts).collect(budget_s=60)
     assert keys(parts, "shards", "released") == set()
     assert parts.index.overview.stats().grasps == 0
     assert differences(parts.index, parts.store) == []
@@ -88,7 +88,7 @@ def test_a_shard_that_another_job_needs_stays(parts: Parts) -> None:
     short, long = finished(parts), finished(parts, grasps=64)
     delete_job(parts, short)
     Sweeper(parts).advance()
-    assert not graceless(parts).collect()
+    assert not graceless(parts).collect(budget_s=60)
     assert len(keys(parts, "shards")) == 4
     assert parts.index.jobs.get(long).grasps == 64
 
@@ -102,7 +102,7 @@ def test_a_deleted_job_may_be_submitted_again_and_finds_its_shards(parts: Parts)
     Sweeper(parts).advance()
     again, new = job_actions.submit(parts, request())
     assert (again.id, new, again.state) == (job, True, State.SUCCEEDED)
-    assert not graceless(parts).collect()
+    assert not graceless(parts).collect(budget_s=60)
     assert len(keys(parts, "shards")) == 2, "it needs them again"
     assert differences(parts.index, parts.store) == []
 

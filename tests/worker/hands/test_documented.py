@@ -16,7 +16,7 @@ from graspd.cli import build
 from tests.conftest import REPOSITORY
 from tests.worker.hands.my_hand import asset_json_of, write_all
 from worker.rendering.pages import portraits
-from worker.studies import hand_self_test
+from worker.stages import hand_self_test
 
 PAGE = (REPOSITORY / "docs" / "hands.md").read_text()
 BLOCKS = "".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).replace("\\\n", " ")

@@ -18,7 +18,7 @@ from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.simulation.obstacles import DeviceObstacles
 from worker.simulation.state import HandState
-from worker.simulation.surroundings import Obstacle, Surroundings
+from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 
 UP = np.array([0.0, 0, 1])
 
@@ -26,6 +26,11 @@ UP = np.array([0.0, 0, 1])
 def lying(obj) -> Surroundings:
     """The object on a table as its mesh stands."""
     return Surroundings((Obstacle.half_space(UP, float(obj.vertices[:, 2].min())),), UP)
+
+
+def on_its_table(obj) -> Scenes:
+    """The same as a scene; the object's frame is the table's."""
+    return Scenes(lying(obj).obstacles, np.array([[0.0, 0, 0, 1, 0, 0, 0]]))
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +94,26 @@ def test_a_hand_around_an_edge_is_hindered_and_one_before_it_is_not(block, barre
     closed = np.where(barrett.closing > 0, barrett.upper, barrett.lower)
     at = np.array([[0, 0, top + 0.15], [0, 0, top + 0.03]])
     states = HandState(at, np.tile(down, (2, 1)), np.stack([wide, closed]))
-    lost = hindrance(model, states, np.zeros(2, int))
+    lost = hindrance(model, states, on_its_table(block).placed(np.zeros(2, int)))
     assert lost[0] == 0.0
     assert lost[1] > 0.1
+
+
+@pytest.mark.parametrize(("room_m", "hindered"), [(0.06, True), (0.30, False)])
+def test_a_hand_below_a_board_is_hindered_where_it_cannot_rise(block, barrett, room_m, hindered) -> None:
+    pair = pair_of(barrett, block, resolve_fidelity("draft"), "cpu")
+    top = float(block.vertices[:, 2].max())
+    # The palm is 15 cm above the block, the board `room_m` above the palm; the hand's back is some cm thick.
+    board = Obstacle.box([0, 0, top + 0.15 + room_m + 0.25, 1, 0, 0, 0], [1.0, 1.0, 0.5])
+    scenes = replace(on_its_table(block), supports=(*on_its_table(block).supports, board))
+    placed = scenes.placed(np.zeros(1, int))
+    model = pair.model(pair.coarse, DeviceObstacles.create(barrett, placed.scenes, block.centre_of_mass, "cpu"))
+    state = HandState(
+        np.array([[0, 0, top - block.centre_of_mass[2] + 0.15]]),
+        np.array([[0.0, 1.0, 0.0, 0.0]]),
+        (barrett.lower + 0.1 * barrett.span)[None],
+    )
+    assert (hindrance(model, state, placed)[0] > 0.1) == hindered
 
 
 def test_what_lies_low_is_told_only_where_fingertips_may_touch(block, barrett) -> None:

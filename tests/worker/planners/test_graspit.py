@@ -113,7 +113,7 @@ def test_annealing_lowers_the_energy_and_stops_at_its_step() -> None:
         ground_of(two_finger_hand(), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu", kernels)
     )
     told: list[float] = []
-    steps = Steps(1.0, Run(progress=lambda done, total, message: told.append(done)))
+    steps = Steps(1e6, Run(progress=lambda done, total, message: told.append(done)))
     few = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 50, keep=1, tell=steps)
     assert told[-1] == 4 * 50
     many = search.run([[0, 0, c] for c in range(4)], steps=FIRST_STEP + 2000, keep=1, tell=steps)

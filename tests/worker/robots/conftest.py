@@ -1,4 +1,4 @@
-"""Real grasps, of a free block and of a block on a table, as shards that robots are to carry out."""
+"""Real grasps, of a free block and of a bottle on a table, as shards that robots are to carry out."""
 
 from __future__ import annotations
 
@@ -23,5 +23,5 @@ def free_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def table_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Barrett grasps of a block that lies on tables, as they come."""
+    """Barrett grasps of a bottle that lies on tables, as they come."""
     return make(TABLE, tmp_path_factory.mktemp("table") / "grasps.h5")

@@ -121,13 +121,13 @@ def test_moveit_grasps_have_the_fields_of_the_messages(table_shard: Path, tmp_pa
             assert way["desired_distance"] == pytest.approx(0.1, abs=1e-6) and 0 < way["min_distance"] < 0.1
             assert np.linalg.norm(list(way["direction"]["vector"].values())) == pytest.approx(1.0, abs=1e-6)
         assert grasp["post_grasp_retreat"]["direction"]["vector"]["z"] == pytest.approx(1.0, abs=1e-6)
-    assert read_urdf((tmp_path / "object" / "block.urdf").read_bytes().replace(b"</robot>", _FINGER)).root == "block"
+    assert read_urdf((tmp_path / "object" / "bottle.urdf").read_bytes().replace(b"</robot>", _FINGER)).root == "bottle"
     assert hand_from_path(tmp_path / "hand").joint_names == load_case(table_shard).hand.joint_names
 
 
 #: A link that moves, which our reader of robots asks for.
 _FINGER = (
-    b'<link name="f"/><joint name="j" type="revolute"><parent link="block"/><child link="f"/><axis xyz="0 0 1"/>'
+    b'<link name="f"/><joint name="j" type="revolute"><parent link="bottle"/><child link="f"/><axis xyz="0 0 1"/>'
     b'<limit lower="0" upper="1"/></joint></robot>'
 )
 

@@ -81,9 +81,9 @@ def test_usd_opens_a_grasp_in_metres_that_moves_from_the_standoff_to_the_lift(
     for name, points in bodies.items():
         np.testing.assert_allclose(vertices(f"/World/barrett/{name}", None), points, atol=ROUNDING_M)
     end = stage.GetEndTimeCode()
-    rest, lifted = vertices("/World/block", 0.0), vertices("/World/block", end)
-    block = load_case(table_shard).obj
-    np.testing.assert_allclose(rest, trimesh.transform_points(block.vertices, thing), atol=ROUNDING_M)
+    rest, lifted = vertices("/World/bottle", 0.0), vertices("/World/bottle", end)
+    bottle = load_case(table_shard).obj
+    np.testing.assert_allclose(rest, trimesh.transform_points(bottle.vertices, thing), atol=ROUNDING_M)
     np.testing.assert_allclose(lifted - rest, np.tile([0, 0, 0.1], (len(rest), 1)), atol=1e-5)
     palm = vertices("/World/barrett/palm", 0.0), vertices("/World/barrett/palm", None)
     assert np.linalg.norm((palm[1] - palm[0]).mean(axis=0)) >= 0.1 - 1e-3, "the standoff"

@@ -112,7 +112,7 @@ def _work(pair: Pair, part: Part, wanted: Wanted, steps: Steps) -> None:
     if finalists < fidelity.starts:
         merit = merits(hand, obj, state, losses)
         if placed is not None:
-            merit += hindrance(coarse, state, np.repeat(placed.index, fidelity.starts))
+            merit += hindrance(coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :finalists]
     seats = _Seats(pair, fine, fidelity, state, losses, placed, steps, part.curve)
     if finalists > 1 and placed is not None and wanted.trial is not None:

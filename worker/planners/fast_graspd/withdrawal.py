@@ -1,6 +1,7 @@
-"""Whether a hand gets out of its grasp again: fingers opened plainly, it moves back the way it came.
+"""Whether a hand gets out of its grasp again: fingers opened plainly, it moves back the way it came; closed, it rises.
 
-A hand that hooks around an edge holds well and cannot be got there. Asked before the dear phases, of every hand.
+A hand that hooks around an edge holds well and cannot be got there, and one close below a board cannot lift what it
+holds. Asked before the dear phases, of every hand.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from worker.planners.fast_graspd.starts import Probe
 from worker.quality.contact import finger_of_body
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
+from worker.simulation.surroundings import RISE_M, Placed, Surroundings
 
 Floats = NDArray[np.float64]
 
@@ -25,11 +27,22 @@ TOLERATED_M: Final = 0.001
 #: Merit lost for each metre of depth: 5 mm outweigh a grasp that balances by a fifth of its forces.
 WEIGHT: Final = 50.0
 DEEPEST_M: Final = 0.01
+#: Shares of the lift at which what stands above is looked for.
+UP: Final = (0.5, 1.0)
 
 
-def hindrance(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
-    """(n,) merit that hands lose since they cannot move straight back: what of them is then in the object or an
-    obstacle of their scene (n,)."""
+def hindrance(model: Model, state: HandState, placed: Placed) -> Floats:
+    """(n,) merit that hands lose since they cannot move straight back, or rise, in their scenes: what of them is then
+    in the object or in an obstacle."""
+    deep = _back(model, state, placed.index)
+    rows = np.flatnonzero(np.array([not _open_above(scene) for scene in placed.scenes])[placed.index])
+    if len(rows):
+        deep[rows] = np.maximum(deep[rows], _rising(model, state[rows], placed.take(rows)))
+    return np.asarray(WEIGHT * np.clip(deep - TOLERATED_M, 0.0, DEEPEST_M), float)
+
+
+def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
+    """(n,) depth of hands that open and move back [m]."""
     hand = model.hand.model
     finger = finger_of_body(hand)
     driven = np.zeros(hand.dofs, bool)
@@ -47,5 +60,20 @@ def hindrance(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Fl
     probe.depths(states)
     found = probe.data.depths
     depth = np.max([kind.numpy()[: len(OUT) * n] for kind in (found.points, found.object, found.obstacles)], axis=0)
-    deep = np.clip(depth - TOLERATED_M, 0.0, DEEPEST_M).reshape(len(OUT), n)
-    return np.asarray(WEIGHT * deep.max(axis=0), float)
+    return np.asarray(depth.reshape(len(OUT), n).max(axis=0), float)
+
+
+def _open_above(scene: Surroundings) -> bool:
+    """Whether nothing but floors, of which a hand that rises comes free, stands around."""
+    return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
+
+
+def _rising(model: Model, state: HandState, placed: Placed) -> Floats:
+    """(n,) depth in obstacles of hands that rise as they are [m]."""
+    n = len(state.pivot)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index]
+    pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])
+    probe = Probe(model, len(UP) * n)
+    probe.data.set_scenes(np.tile(placed.index, len(UP)))
+    probe.depths(HandState(pivot, np.tile(state.rotation, (len(UP), 1)), np.tile(state.q, (len(UP), 1))))
+    return np.asarray(probe.data.depths.obstacles.numpy()[: len(UP) * n].reshape(len(UP), n).max(axis=0), float)
