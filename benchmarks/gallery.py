@@ -91,8 +91,9 @@ HANDS = (
     _of(_MODELS, "umi", "UMI, soft fingers for a WSG 50", "umi_gripper.xml"),
     _of(_MODELS, "yumi", "ABB YuMi", "yumi_right_gripper.xml"),
     _of(_MODELS, "aloha", "ALOHA", "aloha_gripper.xml"),
-    _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml", "`couplings` in `asset.json`: one motor moves all four joints",
-        couplings=_LINKAGE_PR2),
+    _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml",
+        "in `asset.json` `couplings`, as one motor moves all four joints, and `stiffness` 20 N m/rad instead of 1,000, "
+        "with which it throws the object out", couplings=_LINKAGE_PR2, stiffness=20.0),
     _of(_SUITE, "jaco", "Kinova Jaco, three fingers", "jaco_three_finger_gripper.xml"),
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
     _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml"),

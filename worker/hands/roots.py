@@ -40,6 +40,11 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
     if hands:
         named = ", or ".join(f"--root {link}" for link in hands[:6])
         raise HandError(f"this is a robot with {len(hands)} hands; name its hand: {named}")
+    if stiff := tree.stiff_digits():
+        raise HandError(
+            f"no part of this robot branches into fingers that move: {', '.join(stiff[:4])} are fixed joints; give a "
+            "description in which its fingers move, or name another part: --root LINK"
+        )
     raise HandError("no part of this robot branches into fingers; if it has a hand, name it: --root LINK")
 
 
@@ -100,6 +105,17 @@ class _Moving:
     def touches(self, link: str) -> bool:
         """Whether two of the branches below a link have collision shapes."""
         return sum(self._has_shape(joint.child) for joint in self.onward(link)) > 1
+
+    def stiff_digits(self) -> list[str]:
+        """Fixed joints of the first link, behind a moving joint and with none behind it, at which shapes part."""
+        for joint in self.robot.joints.values():
+            ends = deque([joint.child] if self.free(joint) and not self._moves[joint.child] else [])
+            while ends:
+                digits = [other for other in self._children.get(ends.popleft(), []) if self._has_shape(other.child)]
+                if len(digits) > 1:
+                    return [digit.name for digit in digits]
+                ends.extend(digit.child for digit in digits)
+        return []
 
     def _has_shape(self, link: str) -> bool:
         if self.robot.links[link].shapes:

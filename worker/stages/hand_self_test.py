@@ -9,11 +9,13 @@ import numpy as np
 import trimesh
 
 from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.transforms import apply
 from worker.certified import Certified, certified_grasps
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.kinematics import body_poses
-from worker.hands.model import HandModel
+from worker.hands.model import Floats, HandModel
+from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
 from worker.run import ALONE, Run
@@ -109,9 +111,19 @@ def fitting_width(hand: HandModel) -> float:
     if (jaws := jaws_of(hand)) is not None:
         return float(np.clip(OF_OPENING * jaws.opening, *WIDTH_M))
     poses = body_poses(hand, _IDENTITY, hand.expand(hand.preshape))[0]
-    tips = poses[list(hand.fingertips) or [hand.bodies - 1], :3]
+    tips = np.array([_tip(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
     reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
     return float(np.clip(OF_REACH * reach, *WIDTH_M))
+
+
+def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
+    """Where a finger ends [m]: at its last joint; a finger that a single joint closes has that at its base, so at its
+    pad."""
+    closing, at = 0, body
+    while at > 0:
+        closing += int(hand.closing[hand.dof[at]] != 0)
+        at = int(hand.parent[at])
+    return apply(pose, fingertip_pad(hand, body).centre) if closing == 1 else pose[:3]
 
 
 def plain_objects(width: float) -> dict[str, ObjectModel]:

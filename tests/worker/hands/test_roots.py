@@ -72,6 +72,12 @@ def test_a_gripper_on_an_arm_begins_behind_its_last_joint() -> None:
     assert hand.root_link == "arm2" and hand.dofs == 2 and len(hand.arm) == 3
 
 
+def test_an_arm_whose_fingers_are_fixed_is_told_which() -> None:
+    urdf = robot(link("base"), *limb("arm", "base", (0.3, 0.3, 0.1)), *gripper("palm", "arm2", "0 0 0.1"))
+    message = report(urdf, fix={"palm_a_joint": 0.0, "palm_b_joint": 0.0})["message"]
+    assert "palm_a_joint, palm_b_joint are fixed joints" in message and "\n" not in message
+
+
 @pytest.mark.parametrize("hands", [(), ("neither",)])
 def test_a_robot_without_a_hand_is_refused_with_the_mend(hands: tuple[str, ...]) -> None:
     urdf = humanoid() if not hands else robot(link("base"), *limb("arm", "base", (0.3, 0.3, 0.1)))
