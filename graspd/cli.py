@@ -80,7 +80,13 @@ class LazyGroup(TyperGroup):
             args = ["bench-render", *args[2:]]
         name, command, rest = super().resolve_command(ctx, args)
         module = next((module for known, module, _, _ in COMMANDS if known == name), None)
-        return name, load(module, name, ctx) if module and name else command, rest
+        if module is None or name is None:
+            return name, command, rest
+        # A worker's image has no API, but checks hands and objects.
+        room = next((room for parent, child, room, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
+        if room and missing_extra(module):
+            return f"{name} {rest[0]}", load(room, rest[0]), rest[1:]
+        return name, load(module, name, ctx), rest
 
 
 class Deferred(TyperCommand):

@@ -103,6 +103,13 @@ def test_a_command_of_a_room_that_is_not_installed_says_what_to_install(command:
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_worker_without_an_api_checks_hands() -> None:
+    done = without_engine("hands", "check", "barrett", absent="fastapi")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "barrett" in done.stdout.lower()
+    assert "hands check" in without_engine("hands", "check", "--help", absent="fastapi").stdout
+
+
 def test_up_without_any_extra_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path / "data"))
     done = without_engine("up", "--workers", "0", absent="httpx,fastapi,warp,newton")
