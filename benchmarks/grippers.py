@@ -25,7 +25,7 @@ from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 
-GRIPPERS = ("franka", "robotiq-2f-85", "schunk-egk40", "umi", "robotiq-2f-140", "rethink")
+GRIPPERS = ("franka", "robotiq-2f-85", "schunk-egk40", "umi", "robotiq-2f-140", "rethink", "robotiq-3f")
 #: Not a seed that any setting was chosen with.
 SEED = 404
 RESULTS, PAGE = Path("docs/results/grippers.json"), Path("docs/results/grippers.md")
