@@ -20,6 +20,12 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
         "The main job on built-in data: grasps, scenes, pictures, and a page that shows them.",
     ),
     ("up", "service.run.commands", "Start here", "The whole service on this machine, until Ctrl-C."),
+    (
+        "doctor",
+        "graspd.doctor",
+        "Start here",
+        "Check disk, clocks, Redis, store, index, GPU, kernels and ports; say the mend.",
+    ),
     ("submit", "api.client.commands", "Jobs", "Submit a job: one hand on one object."),
     ("jobs", "api.client.commands", "Jobs", "List jobs, the newest first."),
     ("status", "api.client.commands", "Jobs", "Stages, progress and quality of a job."),

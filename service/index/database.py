@@ -23,7 +23,8 @@ from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-_MIGRATIONS: Final = Path(__file__).parent / "migrations"
+#: Folder of the revisions of the schema.
+MIGRATIONS: Final = Path(__file__).parent / "migrations"
 #: A job of a million grasps is one transaction of a few seconds; others wait for it.
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
@@ -106,7 +107,7 @@ class Database:
         """An engine on the present file, which is made and migrated if need be."""
         engine = _engine(self._url)
         try:
-            with _mapped(), self._file.opening() if self._file is not None else nullcontext():
+            with mapped(), self._file.opening() if self._file is not None else nullcontext():
                 self._note_identity()
                 _migrate(engine)
                 self._note_identity()
@@ -132,7 +133,7 @@ class Database:
     def _mended(self) -> Iterator[None]:
         """Errors as ours; a damaged file is put aside, so that the next call finds a new one."""
         try:
-            with _mapped():
+            with mapped():
                 yield
         except IndexDamaged:
             self._put_aside()
@@ -140,7 +141,7 @@ class Database:
 
     def _put_aside(self) -> None:
         if self._file is not None:
-            with _mapped(), self._file.opening():
+            with mapped(), self._file.opening():
                 self._file.set_aside(self._identity)
 
 
@@ -164,14 +165,15 @@ def _engine(url: str) -> Engine:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":
             return _sqlite_engine(url, parsed.database)
-        return _postgres_engine(url)
+        return connect_postgres(url)
     except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
         raise InputError(
             f"the index URL cannot be used ({_line(error)}); give sqlite:///PATH or postgresql+psycopg://..."
         ) from None
 
 
-def _postgres_engine(url: str) -> Engine:
+def connect_postgres(url: str) -> Engine:
+    """An engine that refuses a database whose encoding is not UTF-8, and migrates nothing."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
     # Before SQLAlchemy looks at the connection: it cannot read what a database of SQL_ASCII says, which comes as bytes.
@@ -214,7 +216,7 @@ def downgrade(url: str, revision: str) -> None:
     """
     engine = _engine(url)
     try:
-        with _mapped(), _migrating(engine) as config:
+        with mapped(), _migrating(engine) as config:
             command.downgrade(config, revision)
     except CommandError as error:
         raise InputError(f"the index cannot go back to revision {revision!r}: {_line(error)}") from None
@@ -245,7 +247,7 @@ def _migrating(engine: Engine) -> Iterator[Config]:
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         try:
             config = Config()
-            config.set_main_option("script_location", str(_MIGRATIONS))
+            config.set_main_option("script_location", str(MIGRATIONS))
             config.attributes["connection"] = connection
             yield config
             connection.commit()
@@ -257,7 +259,8 @@ def _migrating(engine: Engine) -> Iterator[Config]:
 
 
 @contextmanager
-def _mapped() -> Iterator[None]:
+def mapped() -> Iterator[None]:
+    """Errors of the database as ours: InputError, IndexDamaged, IndexUnavailable."""
     try:
         yield
     except DataError as error:

@@ -13,7 +13,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Engine, create_engine, inspect, text
 
 from benchmarks.large_index import fill
-from service.index.database import _MIGRATIONS, downgrade
+from service.index.database import MIGRATIONS, downgrade
 from service.index.filters import GraspSort
 from service.index.index import Index
 from service.index.tables import metadata
@@ -22,7 +22,7 @@ from service.model.errors import IndexUnavailable, InputError
 from service.store.store import open_store
 
 _CONFIG = Config()
-_CONFIG.set_main_option("script_location", str(_MIGRATIONS))
+_CONFIG.set_main_option("script_location", str(MIGRATIONS))
 REVISIONS = [script.revision for script in ScriptDirectory.from_config(_CONFIG).walk_revisions()][::-1]
 
 

@@ -1,0 +1,47 @@
+"""Keys, as `graspd doctor` sees them: whether the service is closed where it must be, and opens tomorrow."""
+
+from __future__ import annotations
+
+import stat
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+from api.access.keys import Key, KeyFile, Scope
+from service.model.errors import GraspdError
+from service.model.finding import Finding, bad, good, warning
+from service.settings import Settings
+
+_LOCAL: Final = ("127.0.0.1", "::1", "localhost")
+_SOON: Final = timedelta(days=7)
+_ADD: Final = "graspd keys add admin --scope admin"
+
+
+def keys(settings: Settings) -> Finding:
+    """The file of the API keys."""
+    name, path = "keys", settings.resolved_keys_file
+    try:
+        found = KeyFile(path).list()
+    except GraspdError as error:
+        return bad(name, str(error), f"restore {path}, or make new keys: move it away, then {_ADD}")
+    if not found:
+        if settings.host in _LOCAL:
+            return good(name, f"there are none, and none are needed: the API binds {settings.host}")
+        return bad(name, f"there are none, and the API does not start on {settings.host} without one", _ADD)
+    if stat.S_IMODE(path.stat().st_mode) & 0o007:
+        return bad(
+            name, f"everybody can read {path}, which holds the secret of the browser sessions", f"chmod 600 {path}"
+        )
+    live = [key for key in found if key.is_live]
+    if not live:
+        return bad(name, f"none of the {len(found)} keys opens anything any more", _ADD)
+    if ending := sorted({key.name for key in live} - {key.name for key in live if not _ends_soon(key)}):
+        return warning(
+            name, f"keys that end within a week: {', '.join(ending[:3])}", f"graspd keys rotate {ending[0]} --grace 24h"
+        )
+    if not any(key.scope is Scope.ADMIN for key in live):
+        return warning(name, f"{len(live)} keys, and no admin among them", _ADD)
+    return good(name, f"{len(live)} live keys")
+
+
+def _ends_soon(key: Key) -> bool:
+    return key.expires is not None and datetime.fromisoformat(key.expires) < datetime.now(UTC) + _SOON

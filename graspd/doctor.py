@@ -1,0 +1,112 @@
+"""`graspd doctor`: everything an installation stands on, looked at by one command, with the mend for each fault."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from graspd.cli import missing_extra
+from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.model.errors import InputError
+from service.model.finding import Condition, Finding, skipped
+from service.run.doctor.checks import checks_of
+from service.run.doctor.patience import THREADS, Check, run_checks
+from service.settings import Settings
+
+app = typer.Typer(no_args_is_help=False)
+_COLOURS: Final = {
+    Condition.GOOD: typer.colors.GREEN,
+    Condition.WARNING: typer.colors.YELLOW,
+    Condition.BAD: typer.colors.RED,
+    Condition.SKIPPED: typer.colors.BRIGHT_BLACK,
+}
+
+
+@app.command(epilog="graspd doctor --only redis,store,clocks")
+@reporting_errors
+def doctor(
+    only: Annotated[str | None, typer.Option(help="Checks to run, with commas between; default: all.")] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Compare all of the index with the store, not a sample.")
+    ] = False,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Look at disk, clocks, versions, Redis, store, index, GPU, kernels and ports; say the mend of what is wrong.
+
+    Changes nothing, and may run beside the service. Exit code 1 says that something has to be mended.
+    """
+    settings = load_settings(data_dir=data_dir)
+    logging.basicConfig(level=logging.ERROR)
+    checks = _chosen(all_checks(settings, full=full), only)
+    found = []
+    for finding in run_checks(checks):
+        found.append(finding)
+        if not json:
+            _show(finding)
+    counts = {condition: sum(one.condition is condition for one in found) for condition in Condition}
+    is_well = counts[Condition.BAD] == 0
+    if json:
+        told = [{**dataclasses.asdict(one), "ok": one.ok} for one in found]
+        emit({"ok": is_well, "checks": told, **{condition.value: number for condition, number in counts.items()}})
+    else:
+        typer.echo(", ".join(f"{number} {condition.value}" for condition, number in counts.items() if number), err=True)
+    _end(0 if is_well else 1)
+
+
+def _end(code: int) -> None:
+    """End, also where a check still hangs that nobody waits for."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
+        os._exit(code)
+    raise typer.Exit(code)
+
+
+def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
+    """The checks of all rooms; those of a room that is not installed say so."""
+    return [*checks_of(settings, full=full), *_of_api(settings), *_of_worker(settings)]
+
+
+def _of_api(settings: Settings) -> list[Check]:
+    if missing_extra("api"):
+        return [_absent("keys", "api")]
+    from api.access.doctor import keys
+
+    return [Check("keys", lambda: keys(settings))]
+
+
+def _of_worker(settings: Settings) -> list[Check]:
+    if missing_extra("worker"):
+        return [_absent("gpu", "worker"), _absent("kernels", "worker")]
+    from worker.process.doctor import checks_of as of_worker
+
+    return of_worker(settings)
+
+
+def _absent(name: str, extra: str) -> Check:
+    return Check(name, lambda: skipped(name, f"graspd[{extra}] is not part of this install"))
+
+
+def _chosen(checks: list[Check], only: str | None) -> list[Check]:
+    if only is None:
+        return checks
+    wanted = {name.strip() for name in only.split(",")}
+    if unknown := wanted - {check.name for check in checks}:
+        known = ", ".join(check.name for check in checks)
+        raise InputError(f"there is no check {', '.join(sorted(unknown))}; choose from {known}")
+    return [check for check in checks if check.name in wanted]
+
+
+def _show(finding: Finding) -> None:
+    mark = typer.style(f"{finding.condition.value:8}", fg=_COLOURS[finding.condition])
+    typer.echo(f"{mark} {finding.name:17} {finding.message}")
+    if finding.mend:
+        typer.echo(f"{'':26} mend: {finding.mend}")

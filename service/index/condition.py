@@ -1,0 +1,107 @@
+"""How an index stands, seen from outside: nothing is made, migrated or moved aside, as opening it would."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from sqlalchemy import make_url, text
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+
+from service.index.database import MIGRATIONS, connect_postgres, mapped
+from service.model.errors import IndexDamaged, IndexUnavailable, InputError
+
+_TIMEOUT_S: Final = 5.0
+
+
+@dataclass(frozen=True)
+class IndexCondition:
+    """What the database says of itself."""
+
+    kind: str
+    """sqlite or postgresql, with its version."""
+    revision: str
+    """Of its tables; "" where it has none yet."""
+    newest: str
+    """Revision that this graspd knows."""
+    connections: tuple[int, int] = (0, 0)
+    """Used, and the most there may be; zeros where nobody counts."""
+    may_write: bool = True
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether opening it changes nothing."""
+        return bool(self.revision) and self.revision == self.newest
+
+
+def look(url: str) -> IndexCondition | None:
+    """None where the file of an SQLite index does not exist yet.
+
+    Raises:
+        InputError: the URL names no known database, or one of another encoding than UTF-8.
+        IndexUnavailable: it does not answer.
+        IndexDamaged: the file makes no sense.
+    """
+    try:
+        parsed = make_url(url)
+        if parsed.get_backend_name() == "sqlite":
+            return _look_at_file(Path(str(parsed.database)))
+        return _look_at_postgres(url)
+    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
+        raise InputError(
+            f"the index URL cannot be used ({error}); give sqlite:///PATH or postgresql+psycopg://..."
+        ) from None
+
+
+def newest_revision() -> str:
+    """The schema that this graspd makes."""
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    return str(ScriptDirectory.from_config(config).get_current_head())
+
+
+def _look_at_file(path: Path) -> IndexCondition | None:
+    if not path.exists():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
+            said = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if said != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {said}")
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            rows = (
+                connection.execute("SELECT version_num FROM alembic_version").fetchall()
+                if "alembic_version" in tables
+                else []
+            )
+    except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            raise IndexDamaged(f"the index {path} is damaged: {error}") from None
+        raise IndexUnavailable(f"the index {path} cannot be read: {error}") from None
+    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", newest_revision())
+
+
+def _look_at_postgres(url: str) -> IndexCondition:
+    engine = connect_postgres(url)
+    try:
+        with mapped(), engine.connect() as connection:
+
+            def ask(question: str) -> str:
+                return str(connection.scalar(text(question)))
+
+            found = ask("SELECT to_regclass('alembic_version') IS NOT NULL") == "True"
+            return IndexCondition(
+                f"PostgreSQL {ask('SHOW server_version')}",
+                ask("SELECT version_num FROM alembic_version") if found else "",
+                newest_revision(),
+                (int(ask("SELECT count(*) FROM pg_stat_activity")), int(ask("SHOW max_connections"))),
+                ask("SELECT pg_is_in_recovery()") == "False"
+                and ask("SELECT has_schema_privilege(current_schema(), 'CREATE')") == "True",
+            )
+    finally:
+        engine.dispose()

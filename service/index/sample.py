@@ -1,0 +1,111 @@
+"""A sample of an index that is too large to be compared whole: shards and jobs, from both sides."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Final
+
+from sqlalchemy import Column, Table, select
+
+from service.index.index import Index
+from service.index.tables import jobs, shards
+from service.model import names
+from service.model.domain import Stage
+from service.model.errors import DamagedError, NotFoundError
+from service.model.records import JobRecord
+from service.store.deletions import pending
+from service.store.manifests import ShardManifest
+from service.store.records import read_record
+from service.store.store import Store
+
+#: Rows of a kind from each side.
+_SIZE: Final = 100
+_READERS: Final = 16
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What was drawn."""
+
+    shards: tuple[tuple[Stage, str], ...]
+    jobs: tuple[str, ...]
+
+
+def draw(index: Index, store: Store, *, size: int = _SIZE) -> Sample:
+    """Shards of each kind and jobs from a random name on: `size` that the index has, as many that the store has."""
+    chosen: set[tuple[Stage, str]] = set()
+    for stage, kind in names.SHARD_KINDS.items():
+        chosen |= {(stage, shard) for shard in _rows(index, shards, size, shards.c.kind == kind)}
+        found = (key.rpartition("/")[2] for key in _keys(store, f"{names.SHARDS}/{kind}") if key.endswith(".json"))
+        chosen |= {(stage, name.removesuffix(".json")) for name in islice(found, size)}
+    records = (key.split("/")[1] for key in _keys(store, names.JOBS) if key.endswith("/job.json"))
+    return Sample(tuple(sorted(chosen)), tuple(sorted(_rows(index, jobs, size)) + sorted(set(islice(records, size)))))
+
+
+def compare(index: Index, store: Store, sample: Sample) -> list[str]:
+    """How index and store differ in a sample, one line a shard or job; empty if they do not."""
+    gone = {name for what, name in pending(store) if what == "job"}
+    with index.database.reading() as connection:
+        ids = [shard for _, shard in sample.shards]
+        query = select(shards.c.id, shards.c.sha256, shards.c["count"], shards.c.valid).where(shards.c.id.in_(ids))
+        rows = {shard: (sha256, count, valid) for shard, sha256, count, valid in connection.execute(query)}
+        known = set(connection.scalars(select(jobs.c.id).where(jobs.c.id.in_(sample.jobs))))
+    with ThreadPoolExecutor(_READERS) as pool:
+        manifests = list(pool.map(lambda one: _manifest(store, *one), sample.shards))
+        stored = dict(zip(sample.jobs, pool.map(lambda job: _has_job(store, job), sample.jobs), strict=True))
+    found = []
+    for (_, shard), said in zip(sample.shards, manifests, strict=True):
+        found += [f"shards {shard}: {wrong}" for wrong in _wrong(rows.get(shard), said)]
+    for job in sorted(set(sample.jobs) - gone):
+        if stored[job] != (job in known):
+            found.append(f"jobs {job}: {'not in the index' if stored[job] else 'not in the store'}")
+    return found
+
+
+def _wrong(row: tuple[str, int, int] | None, said: tuple[str, int, int] | None) -> Iterator[str]:
+    if row is None and said is not None:
+        yield "not in the index"
+    elif said is None and row is not None:
+        yield "not in the store"
+    elif row != said:
+        yield f"checksum, count and valid are {row}, the store says {said}"
+
+
+def _rows(index: Index, table: Table, size: int, *conditions: Any) -> list[str]:
+    """Ids from a random one on, and from the first where there are too few behind it."""
+    key: Column[Any] = table.c.id
+    with index.database.reading() as connection:
+        query = select(key).where(*conditions).order_by(key).limit(size)
+        found = list(connection.scalars(query.where(key >= secrets.token_hex(8))))
+        return found if len(found) == size else list(connection.scalars(query))
+
+
+def _keys(store: Store, prefix: str) -> Iterator[str]:
+    """Keys of a folder from a random one on, then those before it."""
+    start = f"{prefix}/{secrets.token_hex(8)}"
+    for entry in store.list(prefix, offset=start):
+        yield entry.key
+    for entry in store.list(prefix):
+        if entry.key <= start:
+            yield entry.key
+
+
+def _manifest(store: Store, stage: Stage, shard: str) -> tuple[str, int, int] | None:
+    try:
+        found = read_record(ShardManifest, store, names.shard_manifest(stage, shard))
+    except (NotFoundError, DamagedError):
+        # A damaged one is for the scrub to tell; the index leaves it out.
+        return None
+    return found.sha256, found.count, found.valid
+
+
+def _has_job(store: Store, job: str) -> bool:
+    try:
+        read_record(JobRecord, store, names.job_record(job))
+    except (NotFoundError, DamagedError):
+        return False
+    return True

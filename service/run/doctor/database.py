@@ -1,0 +1,156 @@
+"""The index: whether it answers, has this graspd's tables, and holds what the store says."""
+
+from __future__ import annotations
+
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from sqlalchemy import func, make_url, select
+
+from service.index.condition import IndexCondition, look
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.index.sample import compare, draw
+from service.index.tables import shards
+from service.model.errors import IndexDamaged, InputError, UnavailableError
+from service.model.finding import Finding, bad, good, skipped, warning
+from service.run.doctor.machine import existing, local_store
+from service.settings import Settings
+from service.store.store import open_store
+
+_NONE_HERE: Final = (
+    "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and keeper need one"
+)
+_REBUILD: Final = "graspd index rebuild --check shows all of it; graspd index rebuild mends it while the service runs"
+_CROWDED: Final = 0.8
+#: With more shards than this only a sample is compared.
+_ALL_SHARDS: Final = 2000
+#: What a keeper has to take up between two looks [s].
+_SETTLES_S: Final = 3.0
+
+
+def index(settings: Settings) -> Finding:
+    """Connection, integrity and schema; changes nothing."""
+    name = "index"
+    try:
+        found = look(settings.resolved_index_url)
+    except IndexDamaged as error:
+        return bad(name, str(error), "graspd index rebuild: it is moved aside and made again from the store")
+    except InputError as error:
+        return bad(name, str(error), "see the message, and GRASPD_INDEX_URL")
+    except UnavailableError as error:
+        mend = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
+        return bad(name, str(error), mend if settings.index_url is not None else "see who may read the file")
+    if found is None:
+        return _absent(name, settings)
+    return _judge(name, settings, found)
+
+
+def _absent(name: str, settings: Settings) -> Finding:
+    if settings.index_url is None:
+        return skipped(name, _NONE_HERE)
+    where = existing(Path(str(make_url(settings.resolved_index_url).database)).resolve())
+    return good(name, f"the index is made at the first start, in {where}")
+
+
+def _judge(name: str, settings: Settings, found: IndexCondition) -> Finding:
+    url = make_url(settings.resolved_index_url).render_as_string(hide_password=True).partition("?")[0]
+    line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
+    if not found.may_write:
+        return bad(name, f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")
+    if found.revision and not found.is_ready and found.revision > found.newest:
+        return bad(
+            name,
+            f"{line}: a newer graspd made it; this one knows {found.newest}",
+            f"install the newer version here, or with it run graspd index downgrade {found.newest}",
+        )
+    if not found.is_ready:
+        return warning(
+            name, f"{line}: this graspd has {found.newest}", "the next start brings it forward; back up first"
+        )
+    used, most = found.connections
+    if most and used > _CROWDED * most:
+        return warning(
+            name, f"{line}: {used} of {most} connections are used", "raise max_connections, or run fewer api processes"
+        )
+    return good(name, line)
+
+
+def _openable(settings: Settings) -> str:
+    """Why the index should not be opened; "" if opening it changes nothing."""
+    try:
+        found = look(settings.resolved_index_url)
+    except (InputError, UnavailableError):
+        return "the index does not answer, or is damaged"
+    if found is None:
+        return "there is no index here"
+    if not found.is_ready:
+        return "the tables of the index are of another version"
+    folder = local_store(settings)
+    return "" if folder is None or folder.exists() else "there is no store yet"
+
+
+def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
+    """Whether the rows are those that follow from the store. What only one of two looks finds is on its way in.
+
+    Args:
+        full: compare all rows, however many there are.
+        settles_s: pause before the second look [s].
+    """
+    name = "index-is-store"
+    if why := _openable(settings):
+        return skipped(name, why)
+    store = open_store(settings.resolved_store_url)
+    with closing(Index(settings.resolved_index_url)) as opened:
+        made = opened.notes.completeness()
+        if made is None:
+            return warning(
+                name, "the index is new, and lacks what the store has", "start graspd keeper: it fills the index"
+            )
+        with opened.database.reading() as connection:
+            count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
+        whole = full or count <= _ALL_SHARDS
+        chosen = None if whole else draw(opened, store)
+        found = differences(opened, store) if chosen is None else compare(opened, store, chosen)
+        if found:
+            time.sleep(settles_s)
+            again = set(differences(opened, store) if chosen is None else compare(opened, store, chosen))
+            found = [line for line in found if line in again]
+    if found:
+        # A shard that is missing changes rows of tasks and jobs: the cause goes first.
+        found.sort(key=lambda line: not line.startswith("shards "))
+        more = f", and {len(found) - 3} more" if len(found) > 3 else ""
+        return bad(name, f"{'; '.join(found[:3])}{more}", _REBUILD)
+    what = f"all rows of {count} shards" if whole else f"a sample of {count} shards (--full compares all)"
+    return good(name, f"{what} are what the store says")
+
+
+def damage(settings: Settings) -> Finding:
+    """What the keeper's reading through the store found, or `graspd store verify`."""
+    name = "damage"
+    if why := _openable(settings):
+        return skipped(name, why)
+    with closing(Index(settings.resolved_index_url)) as opened:
+        count, known = opened.damage.known(limit=1)
+        note, made = opened.notes.scrub_note(), opened.notes.completeness()
+    if count:
+        return bad(
+            name,
+            f"{count} objects of the store are damaged or missing, {known[0].key}: {known[0].what}",
+            "graspd store verify --repair",
+        )
+    if made is not None and made.left_out:
+        mend = "put copies in their place, then graspd index rebuild"
+        return bad(name, f"{made.left_out} damaged records are left out of the index, {made.names[0]}", mend)
+    if not settings.scrub_mb_per_s:
+        return warning(
+            name,
+            "nothing is known, and nobody reads the store through",
+            "GRASPD_SCRUB_MB_PER_S=1, or graspd store verify at times",
+        )
+    when = (
+        f"last read through by {note.ended}" if note.ended else "not read through yet; graspd store verify does at once"
+    )
+    return good(name, f"nothing is known to be damaged; {when}")

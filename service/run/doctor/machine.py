@@ -1,0 +1,197 @@
+"""The machine: room on its disks, the data folder, versions, limits of the process."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import resource
+import shutil
+import stat
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final
+from urllib.parse import unquote, urlsplit
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
+
+from service import user_cache
+from service.model.cores import available_cores, memory_limits
+from service.model.finding import Finding, bad, good, warning
+from service.model.version import PACKAGE_VERSION
+from service.settings import Settings
+
+_GIB: Final = 2**30
+#: Below this a worker's scratch files, a shard and the log of Redis do not fit together with certainty.
+_DISK_BAD: Final = 1 * _GIB
+_DISK_LOW: Final = 5 * _GIB
+_FEW_INODES: Final = 10_000
+_MEMORY_LOW: Final = 2 * _GIB
+_FILES_LOW: Final = 1024
+#: File systems of a network: locks of SQLite and sockets do not work there, or only at times.
+_NETWORK: Final = {
+    "nfs", "nfs4", "cifs", "smb3", "smbfs", "lustre", "gpfs", "beegfs", "ceph", "glusterfs", "9p", "afs", "wekafs",
+    "panfs", "orangefs", "fuse.sshfs", "fuse.s3fs", "fuse.glusterfs", "fuse.ceph-fuse",
+}  # fmt: skip
+#: Extras whose libraries the running service imports; the others are tools.
+_ROOMS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", "view")
+
+
+def local_store(settings: Settings) -> Path | None:
+    """The folder of a store that is one; None for a bucket."""
+    parts = urlsplit(settings.resolved_store_url)
+    return Path(unquote(parts.path)) if parts.scheme == "file" else None
+
+
+def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
+    """Room where data, results, caches and scratch files go.
+
+    Args:
+        usage: total, used and free bytes of the file system of a folder.
+    """
+    found = []
+    for what, folder in _folders(settings):
+        there = existing(folder)
+        free = usage(there)[2]
+        facts = os.statvfs(there)
+        if facts.f_files and facts.f_favail < _FEW_INODES:
+            return bad(
+                "disk", f"{what} ({folder}): only {facts.f_favail} more files fit", f"remove files below {there}"
+            )
+        found.append((free, what, folder))
+    free, what, folder = min(found, key=lambda one: one[0] // _GIB)
+    line = f"{free / _GIB:.1f} GiB free for {what} ({folder})"
+    if free < _DISK_BAD:
+        return bad("disk", f"only {line}", f"make room below {existing(folder)}, or move it: {_mover(what)}")
+    if free < _DISK_LOW:
+        return warning("disk", f"only {line}", f"make room soon, or move it: {_mover(what)}")
+    return good("disk", f"at least {line}")
+
+
+def _folders(settings: Settings) -> Iterable[tuple[str, Path]]:
+    yield "the data folder", settings.data_dir.resolve()
+    if (store := local_store(settings)) is not None:
+        yield "the store", store
+    yield "caches", user_cache.folder("doctor").parent
+    yield "scratch files", Path(tempfile.gettempdir())
+
+
+def _mover(what: str) -> str:
+    return {
+        "the data folder": "GRASPD_DATA_DIR",
+        "the store": "GRASPD_STORE_URL",
+        "caches": "XDG_CACHE_HOME",
+        "scratch files": "TMPDIR",
+    }[what]
+
+
+def existing(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    return next(one for one in (folder, *folder.parents) if one.exists())
+
+
+def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts")) -> Finding:
+    """Whether the data folder can be written, is its user's alone, and lies on a disk of this machine."""
+    name, folder = "data-folder", settings.data_dir.resolve()
+    there = existing(folder)
+    if not os.access(there, os.W_OK | os.X_OK):
+        return bad(
+            name, f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR: {folder}"
+        )
+    kept_here = [what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url))
+                 if url is None]  # fmt: skip
+    kind = filesystem(there, mounts)
+    if kind in _NETWORK and kept_here:
+        return warning(
+            name,
+            f"{folder} is on a network ({kind}), and {' and '.join(kept_here)} would be kept there: locks may fail",
+            "set GRASPD_DATA_DIR to a disk of this machine and GRASPD_STORE_URL=file:///SHARED/FOLDER; or name a "
+            "PostgreSQL and a Redis by GRASPD_INDEX_URL and GRASPD_REDIS_URL",
+        )
+    if there != folder:
+        return good(name, f"{folder} is made at the first start")
+    if stat.S_IMODE(folder.stat().st_mode) & 0o077:
+        return warning(
+            name, f"others can read {folder}: it holds requests, results and hashes of keys", f"chmod 700 {folder}"
+        )
+    return good(name, f"{folder}, {kind or 'a file system of unknown kind'}, for its user alone")
+
+
+def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
+    """Type of the file system that a folder is on; "" where nothing tells."""
+    try:
+        lines = [line.split() for line in mounts.read_text().splitlines()]
+    except OSError:
+        return ""
+    # The last one mounted over the longest path is the one that is seen. Blanks are written as \040.
+    found = [(len(at.parts), number, kind) for number, (_, where, kind, *_) in enumerate(lines)
+             if folder.is_relative_to(at := Path(where.replace("\\040", " ")))]  # fmt: skip
+    return max(found)[2] if found else ""
+
+
+def versions(requirements: Iterable[str] | None = None) -> Finding:
+    """Whether Python and the libraries are those that this graspd was made for.
+
+    Args:
+        requirements: as a package states them; those of the installed graspd by default.
+    """
+    name = "versions"
+    try:
+        own = importlib.metadata.distribution("graspd")
+    except importlib.metadata.PackageNotFoundError:
+        return bad(name, "graspd runs from a folder and is not installed", "pip install -e '.[all]' in that folder")
+    if own.version != PACKAGE_VERSION:
+        mend = "install it again: pip install -e '.[all]', or the wheel"
+        return bad(name, f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", mend)
+    python = SpecifierSet(str(own.metadata["Requires-Python"]))
+    if platform.python_version() not in python:
+        return bad(
+            name, f"Python {platform.python_version()} is none of {python}", "make an environment with Python 3.12"
+        )
+    wrong = [
+        line for text in (requirements if requirements is not None else own.requires or ()) if (line := _unmet(text))
+    ]
+    if wrong:
+        needed = " ".join(f"'{line.partition(' (')[0]}'" for line in wrong)
+        return bad(name, f"libraries that do not fit: {'; '.join(wrong)}", f"pip install {needed}")
+    return good(name, f"graspd {PACKAGE_VERSION}, Python {platform.python_version()}, and libraries that fit")
+
+
+def _unmet(text: str) -> str:
+    """What is wanted and found, where a requirement is not met; an extra that nobody installed is no fault."""
+    wanted = Requirement(text)
+    extra = next((room for room in _ROOMS if wanted.marker and wanted.marker.evaluate({"extra": room})), "")
+    if wanted.marker and not extra and not wanted.marker.evaluate({"extra": ""}):
+        return ""
+    if wanted.name == "graspd":
+        return ""
+    try:
+        found = importlib.metadata.version(wanted.name)
+    except importlib.metadata.PackageNotFoundError:
+        return "" if extra else f"{wanted.name}{wanted.specifier} (absent)"
+    fits = wanted.specifier.contains(Version(found), prereleases=True)
+    return "" if fits else f"{wanted.name}{wanted.specifier} (found {found})"
+
+
+def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
+    """Cores, memory and open files that this process is given.
+
+    Args:
+        files, memory: instead of what the system says.
+    """
+    name = "limits"
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if files is None else files
+    files = 2**31 if files == resource.RLIM_INFINITY else files
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = min([whole, *memory_limits()]) if memory is None else memory
+    line = f"{available_cores()} cores, {memory / _GIB:.1f} GiB of memory, {files} open files"
+    if memory < _MEMORY_LOW:
+        return warning(name, f"{line}: a worker takes up to 2 GiB", "give the container, job or machine more memory")
+    if files < _FILES_LOW:
+        return warning(
+            name, f"{line}: streams and uploads take one each", "ulimit -n 4096, or LimitNOFILE=4096 of systemd"
+        )
+    return good(name, line)

@@ -1,0 +1,58 @@
+"""Checks run side by side, each with a limit of time: one part that hangs must not hide how the others stand."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from service.model.errors import GraspdError
+from service.model.finding import Finding, bad
+
+#: How the names of the threads of checks begin.
+THREADS: Final = "doctor-"
+
+
+@dataclass(frozen=True)
+class Check:
+    """A thing to look at."""
+
+    name: str
+    look: Callable[[], Finding]
+    limit_s: float = 60.0
+    mend_hang: str = "look after the network and the log of that part; what hangs here hangs for the service as well"
+
+
+def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
+    """Findings in the order of the checks, each as soon as it and those before it are there."""
+    started = time.monotonic()
+    runs = [_Run(check) for check in checks]
+    for run in runs:
+        yield run.finding(started + run.check.limit_s)
+
+
+class _Run:
+    """One check in a thread that the process does not wait for when it ends."""
+
+    def __init__(self, check: Check) -> None:
+        self.check = check
+        self._finding: Finding | None = None
+        self._thread = threading.Thread(target=self._run, name=f"{THREADS}{check.name}", daemon=True)
+        self._thread.start()
+
+    def finding(self, deadline: float) -> Finding:
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+        if self._finding is not None:
+            return self._finding
+        return bad(self.check.name, f"no answer within {self.check.limit_s:.0f} s", self.check.mend_hang)
+
+    def _run(self) -> None:
+        try:
+            self._finding = self.check.look()
+        except GraspdError as error:
+            self._finding = bad(self.check.name, str(error), "see the message")
+        except Exception as error:
+            line = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            self._finding = bad(self.check.name, f"the check itself broke off: {line}", "tell the authors of graspd")

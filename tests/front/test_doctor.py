@@ -1,0 +1,58 @@
+"""`graspd doctor`: exit codes, JSON, and what it says of a service that runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from graspd.doctor import all_checks, app
+from service.settings import Settings
+from tests.conftest import REPOSITORY
+from tests.servers import free_ports
+
+QUICK = "disk,data-folder,limits,versions,redis,store,index,port,keys"
+
+
+def run(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "graspd", "doctor", *arguments],
+        capture_output=True, text=True, check=False, timeout=120,
+        env={**os.environ, "GRASPD_DATA_DIR": str(folder), "GRASPD_PORT": str(free_ports(1)[0]), **environment},
+    )  # fmt: skip
+
+
+def test_a_fresh_machine_is_well_and_nothing_is_made_on_it(tmp_path: Path) -> None:
+    done = run("--only", QUICK, "--json", folder=tmp_path / "data")
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["ok"] is True
+    assert [one["name"] for one in told["checks"]] == QUICK.split(",")
+    assert all({"name", "ok", "message", "mend"} <= one.keys() for one in told["checks"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_wrong_ends_it_with_1_and_says_the_mend(tmp_path: Path) -> None:
+    away = f"redis://:hidden@127.0.0.1:{free_ports(1)[0]}/0"
+    done = run("--only", "redis,keys", folder=tmp_path, GRASPD_REDIS_URL=away, GRASPD_HOST="0.0.0.0")
+    assert done.returncode == 1
+    lines = [line.split(maxsplit=2) for line in done.stdout.splitlines()]
+    assert [line[:2] for line in lines if line[0] == "bad"] == [["bad", "redis"], ["bad", "keys"]]
+    assert sum(line[0] == "mend:" for line in lines) == 2
+    assert "hidden" not in done.stdout + done.stderr
+
+
+def test_a_check_that_does_not_exist_is_the_callers_mistake() -> None:
+    done = CliRunner().invoke(app, ["--only", "disk,weather"])
+    assert done.exit_code == 2
+    assert "there is no check weather; choose from disk" in done.output
+
+
+@pytest.mark.parametrize("check", [check.name for check in all_checks(Settings())])
+def test_operations_tells_every_check(check: str) -> None:
+    assert f"| `{check}` |" in (REPOSITORY / "docs" / "operations.md").read_text()

@@ -1,0 +1,1 @@
+"""What graspd doctor finds, against real servers."""

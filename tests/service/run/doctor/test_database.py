@@ -1,0 +1,184 @@
+"""The index as the doctor sees it: real files and a real PostgreSQL, which it never migrates, moves or fills."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from service.index.condition import newest_revision
+from service.index.damage import Damage
+from service.index.database import downgrade
+from service.index.index import Index
+from service.index.rebuild import rebuild
+from service.model import names
+from service.model.domain import Stage
+from service.model.finding import Condition, Finding
+from service.pipeline import job_actions
+from service.pipeline.backends import Parts
+from service.run.doctor import database
+from service.settings import Settings
+from service.store.store import open_store
+from tests.fakes import add_assets, request
+from tests.indexes import empty_index
+from tests.memory_queue import MemoryQueue
+from tests.servers import PostgresServer, free_ports
+from tests.service.index.test_index import fail, run_all
+
+Look = Callable[[], Finding]
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Iterator[Parts]:
+    """A data folder with a job of two batches, done."""
+    settings = Settings(data_dir=tmp_path)
+    index = empty_index(settings.resolved_index_url)
+    parts = Parts(settings, open_store(settings.resolved_store_url), index, MemoryQueue())
+    add_assets(parts)
+    run_all(parts, job_actions.submit(parts, request(grasps=64))[0].id)
+    index.notes.set_complete()
+    yield parts
+    index.close()
+
+
+@pytest.fixture(params=["whole", "sample"])
+def look(request: pytest.FixtureRequest, kept: Parts, monkeypatch: pytest.MonkeyPatch) -> Look:
+    """The comparison of all rows, and that of a sample."""
+    if request.param == "sample":
+        monkeypatch.setattr(database, "_ALL_SHARDS", 0)
+    return lambda: database.index_is_store(kept.settings, settles_s=0.0)
+
+
+def shard_of(parts: Parts) -> Path:
+    return next((parts.settings.data_dir / "store" / names.SHARDS / "base").glob("*.json"))
+
+
+def test_an_index_that_is_what_the_store_says_is_good(kept: Parts, look: Look) -> None:
+    found = look()
+    assert found.condition is Condition.GOOD, found
+    assert database.index(kept.settings).condition is Condition.GOOD
+
+
+def test_a_manifest_that_is_gone_is_bad(kept: Parts, look: Look) -> None:
+    lost = shard_of(kept)
+    lost.unlink()
+    found = look()
+    assert not found.ok
+    assert lost.stem in found.message
+    assert "not in the store" in found.message
+    assert "index rebuild" in found.mend
+
+
+def test_a_row_that_is_gone_is_bad(kept: Parts, look: Look) -> None:
+    with kept.index.database.writing() as connection:
+        connection.exec_driver_sql(f"DELETE FROM shards WHERE id = '{shard_of(kept).stem}'")
+    assert "not in the index" in look().message
+
+
+def test_a_row_that_says_something_else_is_bad(kept: Parts, look: Look) -> None:
+    with kept.index.database.writing() as connection:
+        connection.exec_driver_sql("UPDATE shards SET valid = valid + 1")
+    found = look()
+    assert not found.ok
+    assert "the store says" in found.message
+
+
+def test_what_is_on_its_way_in_is_no_difference(kept: Parts, look: Look, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the two looks a keeper takes up what was written."""
+    key = shard_of(kept)
+    data = key.read_bytes()
+    key.unlink()
+    monkeypatch.setattr(time, "sleep", lambda seconds: key.write_bytes(data))
+    assert look().condition is Condition.GOOD
+
+
+def test_known_damage_is_told_with_its_mend(kept: Parts) -> None:
+    assert database.damage(kept.settings).condition is Condition.GOOD
+    kept.index.damage.mark([Damage("shards/base/x.h5", "has another checksum", "x")])
+    found = database.damage(kept.settings)
+    assert not found.ok
+    assert "shards/base/x.h5" in found.message
+    assert found.mend == "graspd store verify --repair"
+
+
+def test_where_there_is_no_index_none_is_made(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    found = [database.index(settings), database.index_is_store(settings), database.damage(settings)]
+    assert {one.condition for one in found} == {Condition.SKIPPED}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Parts) -> None:
+    kept.index.close()
+    file = kept.settings.data_dir / "index.sqlite"
+    for beside in kept.settings.data_dir.glob("index.sqlite-*"):
+        beside.unlink()
+    file.write_bytes(b"no database" * 1000)
+    found = database.index(kept.settings)
+    assert not found.ok
+    assert "graspd index rebuild" in found.mend
+    assert database.index_is_store(kept.settings).condition is Condition.SKIPPED
+    assert file.read_bytes() == b"no database" * 1000
+
+
+def test_an_older_schema_is_not_migrated_by_a_look(kept: Parts) -> None:
+    kept.index.close()
+    older = f"{int(newest_revision()) - 1:04}"
+    downgrade(kept.settings.resolved_index_url, older)
+    found = database.index(kept.settings)
+    assert (found.ok, found.condition) == (True, Condition.WARNING)
+    assert database.index_is_store(kept.settings).condition is Condition.SKIPPED
+    with sqlite3.connect(kept.settings.data_dir / "index.sqlite") as connection:
+        assert connection.execute("SELECT version_num FROM alembic_version").fetchone() == (older,)
+
+
+def test_a_newer_schema_is_bad_and_the_mend_is_a_downgrade(kept: Parts) -> None:
+    with kept.index.database.writing() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    found = database.index(kept.settings)
+    assert not found.ok
+    assert f"graspd index downgrade {newest_revision()}" in found.mend
+
+
+@pytest.mark.postgres
+def test_a_postgresql_without_tables_and_with_them(tmp_path: Path, postgres_server: PostgresServer) -> None:
+    settings = Settings(data_dir=tmp_path, index_url=postgres_server.database())
+    found = database.index(settings)
+    assert found.condition is Condition.WARNING, found
+    assert "revision none" in found.message
+    Index(settings.resolved_index_url).close()
+    found = database.index(settings)
+    assert found.condition is Condition.GOOD, found
+    assert postgres_server._password not in str(found)
+
+
+@pytest.mark.postgres
+def test_a_postgresql_that_is_away_or_refuses_is_bad(tmp_path: Path, postgres_server: PostgresServer) -> None:
+    away = f"postgresql+psycopg://graspd:hidden@127.0.0.1:{free_ports(1)[0]}/graspd"
+    stranger = f"postgresql+psycopg://graspd:hidden@127.0.0.1:{postgres_server.port}/postgres"
+    for url in (away, stranger):
+        found = database.index(Settings(data_dir=tmp_path, index_url=url))
+        assert not found.ok
+        assert "GRASPD_INDEX_URL" in found.mend
+        assert "hidden" not in str(found)
+
+
+@pytest.mark.postgres
+def test_an_index_in_postgresql_is_compared_too(kept: Parts, postgres_server: PostgresServer) -> None:
+    settings = Settings(data_dir=kept.settings.data_dir, index_url=postgres_server.database())
+    index = Index(settings.resolved_index_url)
+    rebuild(index, kept.store)
+    assert database.index_is_store(settings, settles_s=0.0).condition is Condition.GOOD
+    job = index.jobs.page(limit=1).items[0].id
+    fail(Parts(settings, open_store("memory://"), index, MemoryQueue()), job, 0, 1, last=False)
+    index.close()
+    found = database.index_is_store(settings, settles_s=0.0)
+    assert not found.ok
+    assert "attempts" in found.message
+
+
+def test_the_kinds_of_shards_are_all_sampled() -> None:
+    assert set(names.SHARD_KINDS) == set(Stage) - {Stage.INGEST}

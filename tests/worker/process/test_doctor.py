@@ -1,0 +1,94 @@
+"""GPUs and kernels as the doctor sees them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.model.finding import Condition
+from service.settings import Settings
+from worker.process import doctor
+from worker.process.selfcheck import EngineError
+
+GIB = 2**30
+H100 = {"name": "cuda:0", "model": "H100", "total": 80 * GIB, "free": 79 * GIB}
+
+
+def says(**document: Any) -> Callable[[Sequence[str]], subprocess.CompletedProcess[str]]:
+    return lambda arguments: subprocess.CompletedProcess([], 0, f"a line of a library\n{json.dumps(document)}\n", "")
+
+
+def gpus(*found: dict[str, Any], driver: list[int] | None = None) -> Any:
+    return says(gpus=list(found), driver=driver, toolkit=[13, 4])
+
+
+def test_a_machine_without_a_gpu_works_on_its_processor(tmp_path: Path) -> None:
+    found = doctor.gpu(Settings(data_dir=tmp_path), child=gpus(), has_driver=lambda: False)
+    assert (found.condition, found.message) == (Condition.GOOD, "none; work runs on the CPU")
+
+
+@pytest.mark.parametrize(
+    ("device", "there", "has_driver", "condition", "told"),
+    [
+        ("auto", [H100], True, Condition.GOOD, "79 of 80 GiB free"),
+        ("cuda:0", [H100], True, Condition.GOOD, "H100"),
+        ("cuda:1", [H100], True, Condition.BAD, "there are cuda:0"),
+        ("cuda:0", [], False, Condition.BAD, "no GPU is found"),
+        ("auto", [], True, Condition.BAD, "has an NVIDIA driver"),
+        ("auto", [{**H100, "free": GIB}], True, Condition.WARNING, "1 of 80 GiB free"),
+    ],
+)
+def test_gpus_are_judged(
+    tmp_path: Path, device: str, there: list[dict[str, Any]], has_driver: bool, condition: Condition, told: str
+) -> None:
+    settings = Settings(data_dir=tmp_path, device=device)
+    found = doctor.gpu(settings, child=gpus(*there, driver=[12, 8]), has_driver=lambda: has_driver)
+    assert found.condition is condition, found
+    assert told in found.message
+    assert bool(found.mend) is (condition is not Condition.GOOD)
+
+
+def test_an_engine_that_gives_nonsense_is_bad_with_its_reason(tmp_path: Path) -> None:
+    child = says(device="cpu (CPU)", error="scene: ArithmeticError: a ball floats", cache="/cache/warp")
+    found = doctor.kernels(Settings(data_dir=tmp_path), child=child)
+    assert not found.ok
+    assert "a ball floats" in found.message
+    assert "/cache/warp" in found.mend
+
+
+def test_a_driver_that_crashes_or_hangs_takes_only_the_child_with_it(tmp_path: Path) -> None:
+    def crash(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess([], -signal.SIGSEGV, "", "")
+
+    def hang(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        raise subprocess.TimeoutExpired([], 120.0)
+
+    for look in (doctor.gpu, doctor.kernels):
+        for child, told in ((crash, "signal 11"), (hang, "no answer within 120 s")):
+            found = look(Settings(data_dir=tmp_path), child=child)
+            assert not found.ok
+            assert told in found.message
+
+
+def test_the_child_tells_what_this_machine_has() -> None:
+    done = doctor.run_child(["gpus"])
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert isinstance(told["gpus"], list)
+    assert told["toolkit"][0] >= 12
+
+
+def test_the_child_tells_what_is_wrong_with_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise EngineError("synthesize: OSError: no kernels")
+
+    monkeypatch.setattr("worker.process.selfcheck.check_engine", broken)
+    told = doctor._tell_kernels("cpu")
+    assert told["error"] == "synthesize: OSError: no kernels"
+    assert told["device"].startswith("cpu (")

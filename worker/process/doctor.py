@@ -1,0 +1,164 @@
+"""GPUs and kernels, as `graspd doctor` sees them. Each is tried in a process of its own, which a driver may crash."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from service.model.domain import Stage
+from service.model.finding import Finding, bad, good, warning
+from service.run.doctor.patience import Check
+from service.settings import Settings
+
+_MODULE: Final = "worker.process.doctor"
+_GPU_S: Final = 120.0
+#: All kernels compiled from nothing on a slow machine.
+_KERNELS_S: Final = 900.0
+_GIB: Final = 2**30
+_MEMORY_LOW: Final = 2 * _GIB
+#: Where the driver of a machine that has a GPU shows.
+_TRACES: Final = (Path("/proc/driver/nvidia/version"), Path("/dev/nvidiactl"))
+Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
+
+
+def checks_of(settings: Settings) -> list[Check]:
+    """What the engine runs on."""
+    return [
+        Check(
+            "gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang="restart the driver, or the machine; see dmesg"
+        ),
+        Check("kernels", lambda: kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`; then the same again"),
+    ]
+
+
+def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """This module as a process. Raises subprocess.TimeoutExpired."""
+    limit_s = _GPU_S if arguments[0] == "gpus" else _KERNELS_S
+    command = [sys.executable, "-m", _MODULE, *arguments]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=limit_s, stdin=subprocess.DEVNULL
+    )
+
+
+def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
+    """Which GPUs Warp finds, and whether their memory is free.
+
+    Args:
+        child: runs this module.
+        has_driver: whether the machine looks as if it had a GPU.
+    """
+    name = "gpu"
+    found, wrong = _answer(child, ["gpus"])
+    if wrong:
+        return bad(
+            name, f"the GPUs cannot be asked: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
+        )
+    gpus: list[dict[str, Any]] = found["gpus"]
+    needed = f"the driver says CUDA {_dotted(found['driver'])}, Warp is made for {_dotted(found['toolkit'])}"
+    mend = "a driver of R580 or newer; in containers the NVIDIA container toolkit and --gpus all; CUDA_VISIBLE_DEVICES"
+    if not gpus:
+        if settings.device.startswith("cuda"):
+            return bad(name, f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", mend)
+        if (has_driver or _has_driver)():
+            return bad(name, f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", mend)
+        return good(name, "none; work runs on the CPU")
+    if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
+        return bad(
+            name,
+            f"GRASPD_DEVICE is {settings.device}, there are {', '.join(one['name'] for one in gpus)}",
+            "set it to one of these, or auto",
+        )
+    line = ", ".join(
+        f"{one['name']} {one['model']} {one['free'] / _GIB:.0f} of {one['total'] / _GIB:.0f} GiB free" for one in gpus
+    )
+    if full := [one["name"] for one in gpus if one["free"] < _MEMORY_LOW]:
+        return warning(name, line, f"see nvidia-smi: others fill {', '.join(full)}; launches are halved until they fit")
+    return good(name, f"{line}; {needed}")
+
+
+def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
+    """Whether the engine loads, compiles and gives results that make sense, as a worker tries before its first task."""
+    name = "kernels"
+    found, wrong = _answer(child, ["kernels", settings.device])
+    if wrong:
+        return bad(
+            name,
+            f"the engine does not run: {wrong}",
+            "pip install 'graspd[worker]'; see disk and memory; dmesg tells what was killed",
+        )
+    if found["error"]:
+        mend = f"see the message; for a damaged cache remove {found['cache']}"
+        return bad(name, f"on {found['device']}: {found['error']}", mend)
+    return good(
+        name,
+        f"grasps, scenes and pictures of a ball make sense on {found['device']}; kept in {found['cache']}",
+    )
+
+
+def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """What a child says, and what went wrong with it ("" if nothing)."""
+    try:
+        done = child(arguments)
+    except subprocess.TimeoutExpired as error:
+        return {}, f"no answer within {error.timeout:.0f} s"
+    try:
+        return dict(json.loads(done.stdout.strip().splitlines()[-1])), ""
+    except (ValueError, IndexError):
+        tail = (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:300]
+        return {}, f"ended by signal {-done.returncode}" if done.returncode < 0 else tail
+
+
+def _dotted(version: Sequence[int] | None) -> str:
+    return ".".join(map(str, version)) if version else "nothing"
+
+
+def _has_driver() -> bool:
+    return any(trace.exists() for trace in _TRACES) or shutil.which("nvidia-smi") is not None
+
+
+def _tell_gpus() -> dict[str, Any]:
+    import warp as wp
+
+    from worker.engines import backend
+
+    backend.start()
+    found = [
+        {"name": str(one), "model": str(one.name), "total": int(one.total_memory), "free": int(one.free_memory)}
+        for one in wp.get_cuda_devices()
+    ]
+    return {"driver": wp.get_cuda_driver_version(), "toolkit": wp.get_cuda_toolkit_version(), "gpus": found}
+
+
+def _tell_kernels(wanted: str) -> dict[str, Any]:
+    import warp as wp
+
+    from worker.engines import backend
+    from worker.engines.devices import Device
+    from worker.process.selfcheck import EngineError, check_engine
+
+    backend.start()
+    device, error = Device(wanted), ""
+    try:
+        check_engine(device.resolve, [stage for stage in Stage if stage is not Stage.INGEST])
+    except EngineError as found:
+        error = str(found)
+    return {"device": f"{device.resolve()} ({device.name})", "error": error, "cache": str(wp.config.kernel_cache_dir)}
+
+
+def main(arguments: Sequence[str]) -> None:
+    """One line of JSON on stdout."""
+    told = _tell_gpus() if arguments[0] == "gpus" else _tell_kernels(arguments[1])
+    sys.stdout.write(f"{json.dumps(told)}\n")
+    sys.stdout.flush()
+    # Taking Warp apart takes seconds, and nothing is left to be saved.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
