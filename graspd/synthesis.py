@@ -37,6 +37,7 @@ def synthesize(
     scale_to: float | None = None,
     device: str = "auto",
     threads: int = 0,
+    join: int | Literal["auto"] = "auto",
     progress: Callable[[float], None] | None = None,
 ) -> Grasps:
     """Grasps of a hand on an object, judged and measured as by `graspd synth`: the same seed gives the same ones.
@@ -65,6 +66,8 @@ def synthesize(
         scale_to: longest side of the object [m].
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
+        join: batches of 32 grasps that are planned in one launch; auto: as many as a GPU needs to be busy, 1 on a CPU.
+            The grasps are the same.
         progress: called with the share that is done, 0 to 1.
 
     Raises:
@@ -88,15 +91,6 @@ def synthesize(
     made = synthesized(
         str(hand), str(object), request, place=place, scenes=scenes,
         mesh=object_options(units=units, scale_to=scale_to), device=device, threads=threads,
-        report=_reporter(progress, count) if progress else None,
+        join=join, progress=(lambda done, total, _message: progress(done / total)) if progress else None,
     )  # fmt: skip
     return Grasps(made.arrays, made.attributes)
-
-
-def _reporter(progress: Callable[[float], None], wanted: int) -> Callable[[int, int], Any]:
-    """From a batch's first grasp and number of grasps to what tells the share of all."""
-
-    def of_batch(first: int, size: int) -> Callable[[float, float, str], None]:
-        return lambda done, total, _message: progress((first + size * done / total) / wanted)
-
-    return of_batch

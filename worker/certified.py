@@ -243,7 +243,7 @@ class _Work:
         if self.scenes is None or self.pieces is None:
             return None
         if self._trials is None:
-            threads = self._run.cores if self._run.device.startswith("cuda") else 1
+            threads = self._run.apart().cores if self._run.device.startswith("cuda") else 1
             self._trials = lift_trial(self.hand, self.obj, self.pieces.result, threads=threads)
         return self._trials
 

@@ -8,6 +8,7 @@ from typing import Final
 
 from service.model.cores import available_cores
 from service.model.errors import TaskCancelled
+from worker.meeting import Meeting
 
 Progress = Callable[[float, float, str], None]
 """Told what is done, of how much, and a word on it; from any thread, often."""
@@ -33,11 +34,18 @@ class Run:
     """CPU threads; 0: one per core this process may use."""
     progress: Progress = _silent
     cancelled: Cancelled = _never
+    meeting: Meeting | None = None
+    """Where it meets others like it, to be done with them in one launch; None: it is done by itself."""
 
     @property
     def cores(self) -> int:
-        """CPU threads, the default counted."""
-        return self.threads or available_cores()
+        """CPU threads, the default counted: a fair share of them where others work beside it."""
+        every = self.threads or available_cores()
+        return max(1, every // max(1, self.meeting.members)) if self.meeting is not None else every
+
+    def apart(self) -> Run:
+        """The same without the others: for what is done for all of them."""
+        return replace(self, meeting=None)
 
     def part(self, start: float, end: float) -> Run:
         """The same for a part of the work, whose progress goes from share `start` to share `end` of the whole."""

@@ -24,6 +24,7 @@ def bench(
     object_: Annotated[str, typer.Option("--object", help="A mesh or a built-in object.")] = "mug",
     fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; several times. Default: all offered.")] = None,
     batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; several times.")] = None,
+    join: Annotated[list[int] | None, typer.Option(min=1, help="Batches in one launch; several times.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; several times.")] = None,
     points: Annotated[list[int] | None, typer.Option(min=16, help="Also sweep the fine phase's hand points.")] = None,
     face_error: Annotated[list[float] | None, typer.Option(min=0, help="Also sweep the face error bound [m].")] = None,
@@ -47,6 +48,7 @@ def bench(
         threads=threads or ([1] if resolved != "cpu" else sorted({1, available_cores()})),
         device=resolved,
         repeats=repeats,
+        joins=join or [1],
         say=lambda line: typer.echo(line, err=True),
     )
     if out is not None:

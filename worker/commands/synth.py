@@ -57,6 +57,7 @@ def synth(
     allow_open: AllowOpenOption = False,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core", min=0)] = 0,
+    join: Annotated[str, typer.Option(help="Batches of 32 that are planned in one launch, or auto.")] = "auto",
     scene: Annotated[
         str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
     ] = "free",
@@ -87,10 +88,10 @@ def synth(
     )  # fmt: skip
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
     place = parse_scene(scene, faces=faces, touch=touch, beside=with_ or [])
-    with _bar(grasps, quiet=json) as report:
+    with _bar(quiet=json) as progress:
         made = synthesized(
             hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
-            report=report,
+            join=join, progress=progress,
         )  # fmt: skip
     out.write_bytes(write_shard("base", made.arrays, made.attributes))
     found = {"file": str(out), **made.summary()}
@@ -111,23 +112,19 @@ def _request(want: str, budget: float, referee: str) -> JobOptions:
 
 
 @contextmanager
-def _bar(grasps: int, *, quiet: bool) -> Iterator[Any]:
-    """A progress bar; gives a function that makes the reporter of a batch from its first grasp and their number."""
+def _bar(*, quiet: bool) -> Iterator[Report]:
+    """A progress bar; gives what is told of the grasps that are done."""
     began = time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
-        task = bar.add_task("starting", total=grasps, rate="")
+        task = bar.add_task("starting", total=None, rate="")
 
-        def report(first: int, count: int) -> Report:
-            def tell(done: float, total: float, message: str) -> None:
-                ready = first + count * done / total
-                rate = f"{ready / max(time.perf_counter() - began, 1e-3):.1f} grasps/s"
-                bar.update(task, completed=ready, description=message, rate=rate)
+        def tell(done: float, total: float, message: str) -> None:
+            rate = f"{done / max(time.perf_counter() - began, 1e-3):.1f} grasps/s"
+            bar.update(task, completed=done, total=total, description=message, rate=rate)
 
-            return tell
-
-        yield report
+        yield tell
 
 
 def _said(found: dict[str, Any]) -> str:

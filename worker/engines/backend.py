@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 import threading
+from typing import Any
 
 import warp as wp
 
@@ -14,6 +15,25 @@ from worker.engines.kernel_cache import kernel_cache
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
 _lock = threading.Lock()
 _started = False
+
+
+def _default_of_each_thread() -> None:
+    """Let every thread have a default device of its own. Warp has one for all: a `ScopedDevice` of one thread would put
+    the arrays that another makes meanwhile onto its device, and leave its own behind as the default."""
+    from warp._src.context import Runtime, runtime
+
+    first, own = runtime.default_device, threading.local()
+
+    class Threaded(Runtime):  # type: ignore[misc]
+        @property
+        def default_device(self) -> Any:
+            return getattr(own, "device", first)
+
+        @default_device.setter
+        def default_device(self, device: Any) -> None:
+            own.device = device
+
+    runtime.__class__ = Threaded
 
 
 def start() -> None:
@@ -38,4 +58,5 @@ def start() -> None:
             for line in caught:
                 if _HARMLESS not in line:
                     os.write(2, line)
+        _default_of_each_thread()
         _started = True

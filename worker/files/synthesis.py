@@ -15,8 +15,9 @@ from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
-from worker.certified import Certified, certified_grasps, joined_columns
+from worker.certified import Certified, joined_columns
 from worker.engines.devices import Device
+from worker.engines.joins import batches_at_once, parse_join
 from worker.files.base_attributes import base_attributes
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M, beside_attributes
 from worker.files.origin import remembered
@@ -27,6 +28,7 @@ from worker.objects.prepare import object_from_path
 from worker.planners import planner
 from worker.run import Progress, Run
 from worker.scenes.beside import scenes_of
+from worker.together import certified_batches
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].
@@ -98,7 +100,8 @@ def synthesized(
     mesh: Mapping[str, Any] | None = None,
     device: str = "auto",
     threads: int = 0,
-    report: Callable[[int, int], Progress] | None = None,
+    join: int | str = "auto",
+    progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Synthesized:
     """The grasps of a job in one process, without a queue or a server.
@@ -112,7 +115,8 @@ def synthesized(
         mesh: how the object's file is read: units, scale_to, keep_largest, allow_open.
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
-        report: from a batch's first grasp and number of grasps to what is told of its progress.
+        join: batches of 32 whose grasps are planned in one launch, or auto; the grasps are the same.
+        progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
 
     Raises:
@@ -120,6 +124,7 @@ def synthesized(
         TaskCancelled: `cancelled` answered True.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
+    wanted = parse_join(str(join))
     options = dict(mesh or {})
     model = hand_from_path(hand)
     thing = object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options)
@@ -129,15 +134,12 @@ def synthesized(
     where, poses = None, dict[str, Any]()
     if place.kind != "free":
         where, poses = scenes_of(place, thing, others, count=scenes, seed=request.seed)
-    sizes = [(first, min(BATCH_SIZE, request.grasps - first)) for first in range(0, request.grasps, BATCH_SIZE)]
-    alone = Run(chosen, threads) if cancelled is None else Run(chosen, threads, cancelled=cancelled)
-    batches = [
-        certified_grasps(
-            model, thing, request, count=size, batch=first // BATCH_SIZE, scenes=where,
-            run=alone if report is None else replace(alone, progress=report(first, size)),
-        )
-        for first, size in sizes
-    ]  # fmt: skip
+    sizes = [min(BATCH_SIZE, request.grasps - first) for first in range(0, request.grasps, BATCH_SIZE)]
+    run = Run(chosen, threads)
+    run = run if progress is None else replace(run, progress=progress)
+    run = run if cancelled is None else replace(run, cancelled=cancelled)
+    joined = batches_at_once(chosen, wanted)
+    batches = certified_batches(model, thing, request, sizes=sizes, join=joined, scenes=where, run=run)
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in _KEPT if name in poses}

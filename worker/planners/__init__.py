@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from worker.engines.cuda_errors import check_device
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fitting import fitting_pairs
-from worker.planners.port import Method, Options, Planner, Trial, Wanted
-from worker.planners.registry import GROUP, PLANNERS, method, method_names, planner
+from worker.planners.port import Asked, Finish, Joined, Method, Options, Planner, Trial, Wanted
+from worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
 from worker.run import ALONE, Run
 
 __all__ = [
     "GROUP",
     "PLANNERS",
+    "Asked",
+    "Finish",
+    "Joined",
     "Method",
     "Options",
     "Planner",
@@ -39,10 +43,24 @@ def synthesize(
     method: str = "fast_graspd",
     options: Mapping[str, Any] | None = None,
 ) -> GraspSet:
-    """Grasps by the named method with its own `options`; see `Planner`.
+    """Grasps by the named method with its own `options`; see `Planner`. Where others ask for grasps of the same pair in
+    `run.meeting`, they are made in one launch with theirs, if the method knows how.
 
     Raises:
         InputError: the object does not fit into the gripper; see `fitting_pairs`.
     """
     fitting_pairs(hand, obj)
-    return planner(method, options, in_scenes=wanted.placed is not None)(hand, obj, wanted, run)
+    alone = planner(method, options, in_scenes=wanted.placed is not None)
+    together = joined(method, options) if run.meeting is not None else None
+    if run.meeting is None or together is None:
+        return alone(hand, obj, wanted, run)
+    around = (wanted.placed.fixed, wanted.trial is not None) if wanted.placed is not None else ()
+    key = (hand.content, obj.content, method, repr(options), wanted.fidelity.model_dump_json(), run.device, *around)
+
+    def work(asked: Sequence[Asked]) -> list[Finish | Exception]:
+        found = together(hand, obj, asked)
+        check_device(run.device)  # here, where nobody else has work on it
+        return found
+
+    finish: Finish = run.meeting.ask(key, Asked(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
+    return finish()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -53,6 +53,29 @@ class Planner(Protocol):
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet: ...
 
 
+@dataclass(frozen=True)
+class Asked:
+    """One of several batches that are asked for at once."""
+
+    wanted: Wanted
+    run: Run
+
+
+#: Gives the grasps of a batch once its launch is over: what is left to do for it, for whoever asked.
+Finish = Callable[[], GraspSet]
+
+
+class Joined(Protocol):
+    """Makes several batches of a hand on an object in one launch: of one fidelity, on one device, all around a free
+    object or all in scenes with the same supports and neighbours (`Placed.fixed`).
+
+    Each is as the `Planner` makes it alone; on the CPU bit for bit. What is the matter with one batch is given in its
+    place, a TaskCancelled where its own `run.cancelled()` answers True; the others go on.
+    """
+
+    def __call__(self, hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[Finish | Exception]: ...
+
+
 class Options(BaseModel):
     """Base of a method's own options: those that the fidelity, which all methods share, does not have."""
 
@@ -75,6 +98,8 @@ class Method:
     """The options it takes."""
     uses: tuple[str, ...] = ()
     """Knobs of `Fidelity` that move its grasps; the others are ignored."""
+    joined: Callable[[Any], Joined] | None = None
+    """From the options to what makes several batches in one launch; None: it makes them one after the other."""
     quick: Mapping[str, Any] = field(default_factory=dict)
     """Options with which a call is short: to warm up, and to try things out. Its grasps need not be good."""
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from service.cli import validation_line
 from service.model.errors import InputError
-from worker.planners.port import Method, Options, Planner
+from worker.planners.port import Joined, Method, Options, Planner
 
 #: Entry-point group of planners of other packages.
 GROUP: Final = "graspd.planners"
@@ -64,6 +64,12 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
         able = ", ".join(one for one in method_names() if method(one).in_scenes)
         raise InputError(f"method {name} plans around free objects only; in scenes choose {able}, or scene free")
     return known.planner(_options(name, options))
+
+
+def joined(name: str, options: Mapping[str, Any] | None = None) -> Joined | None:
+    """What makes several batches of a method in one launch; None: the method makes them one after the other."""
+    make = method(name).joined
+    return make(_options(name, options)) if make is not None else None
 
 
 def _options(name: str, options: Mapping[str, Any] | None) -> Options:

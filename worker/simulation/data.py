@@ -120,6 +120,12 @@ class Data:
         self.best.fill_(1e9)
         self.waited.zero_()
 
+    def switch_off(self, hands: NDArray[np.bool_]) -> None:
+        """Hands (n,) that cost nothing from the next iteration on."""
+        active = self.active.numpy()
+        active[: len(hands)][hands] = 0
+        self.active.assign(active)
+
     def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
         """The scene (n,) of each hand, among those of the model's obstacles; -1: none. It stays when states change."""
         padded = np.full(self.capacity, -1, dtype=np.int32)

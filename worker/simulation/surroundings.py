@@ -6,6 +6,7 @@ many as their hulls have faces. Frames: the object's, as everywhere in planning.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -158,6 +159,17 @@ class Placed:
             for number, pose in enumerate(np.asarray(self.object_pose, float))
         )
 
+    @cached_property
+    def fixed(self) -> str:
+        """Digest of what all grasps have around them wherever the object stands: supports and neighbours."""
+        told = hashlib.sha256()
+        solids = [solid for one in self.neighbours for solid in one.solids]
+        for body in (*self.supports, *solids):
+            told.update(f"{body.planes.shape} {body.corners.shape} {body.tips_m} ".encode())
+            told.update(body.planes.tobytes() + body.corners.tobytes())
+        told.update(" ".join(one.obj.content for one in self.neighbours).encode())
+        return told.hexdigest()
+
     @property
     def everywhere(self) -> Scenes:
         """The scenes, without the grasps."""
@@ -180,3 +192,21 @@ class Placed:
         taken = replace(self, index=self.index[rows])
         vars(taken)["scenes"] = self.scenes  # they are the same: not to be made anew
         return taken
+
+
+def placed_together(parts: Sequence[Placed]) -> Placed:
+    """Grasps of several sets, one after the other, each in its own scenes; supports and neighbours are the same."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    before = np.cumsum([0, *(len(part.object_pose) for part in parts)])
+    whole = replace(
+        first,
+        object_pose=np.concatenate([part.object_pose for part in parts]),
+        index=np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)]),
+        neighbour_pose=np.concatenate([part.neighbour_pose for part in parts])
+        if first.neighbours
+        else first.neighbour_pose,
+    )
+    vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not to be made anew
+    return whole

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Sequence
+from itertools import product
 from statistics import median
 from typing import Any
 
@@ -16,8 +17,9 @@ from service.model.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import pairs
-from worker.planners.fast_graspd.planner import optimise_batch
-from worker.planners.port import Wanted
+from worker.planners.fast_graspd.batches import Batches
+from worker.planners.fast_graspd.planner import optimise, optimise_batch
+from worker.planners.port import Asked, Wanted
 from worker.run import Run
 from worker.studies.timing import host_ms, kernel_shares
 
@@ -27,9 +29,9 @@ Say = Callable[[str], None]
 
 def bench(
     hand: HandModel, load: Load, *, fidelities: Sequence[Fidelity], batches: Sequence[int], threads: Sequence[int],
-    device: str, repeats: int, say: Say = lambda line: None,
+    device: str, repeats: int, joins: Sequence[int] = (1,), say: Say = lambda line: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """One run per fidelity x batch x threads.
+    """One run per fidelity x batch x joins x threads.
 
     Args:
         hand: the hand.
@@ -39,6 +41,7 @@ def bench(
         threads: CPU threads per call; a GPU takes the whole batch at once.
         device: Warp device.
         repeats: timed calls per run, after one that is not timed; the median is reported.
+        joins: batches in one launch.
         say: told of each run as it ends.
 
     Returns:
@@ -50,14 +53,13 @@ def bench(
     runs = []
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
-        for batch in batches:
-            for count in threads:
-                run = _run(hand, obj, fidelity, batch, count, device, repeats)
-                runs.append(run)
-                say(
-                    f"{fidelity.name:9s} batch {batch:5d} threads {count}: {run['grasps_per_second']:8.1f} grasps/s, "
-                    f"{run['ms_per_iteration']:7.2f} ms/iteration"
-                )
+        for batch, join, count in product(batches, joins, threads):
+            run = _run(hand, obj, fidelity, batch, join, count, device, repeats)
+            runs.append(run)
+            say(
+                f"{fidelity.name:9s} batch {batch:5d} x {join} threads {count}: {run['grasps_per_second']:8.1f} "
+                f"grasps/s, {run['ms_per_iteration']:7.2f} ms/iteration"
+            )
     pair = pairs.pair_of(hand, load(first.face_error_m), first, device)
     return {
         "device": device_name(device),
@@ -82,27 +84,29 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
 
 
 def _run(
-    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, threads: int, device: str, repeats: int
-) -> dict[str, Any]:
-    seconds = []
+    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, join: int, threads: int, device: str,
+    repeats: int,
+) -> dict[str, Any]:  # fmt: skip
+    seconds, run = [], Run(threads=threads, device=device)
     for seed in range(repeats + 1):
         began = time.perf_counter()
-        optimise_batch(
-            hand, obj, Wanted(count=batch, fidelity=fidelity, seed=seed, batch=0), Run(threads=threads, device=device)
-        )
+        asked = [Asked(Wanted(batch, fidelity, seed, number), run) for number in range(join)]
+        optimise(pairs.pair_of(hand, obj, fidelity, device), Batches(asked, obj), run)
         seconds.append(time.perf_counter() - began)
     typical = median(seconds[1:])
     iterations = fidelity.coarse_iterations + fidelity.fine_iterations
     return {
         "fidelity": fidelity.name,
         "batch": batch,
+        "join": join,
+        "grasps": batch * join,
         "processes": threads,
         "hand_points": fidelity.fine_points,
         "coarse_points": fidelity.coarse_points,
         "faces": len(obj.faces),
         "iterations": iterations,
         "ms_per_iteration": round(1e3 * typical / iterations, 4),
-        "grasps_per_second": round(batch / typical, 3),
+        "grasps_per_second": round(join * batch / typical, 3),
         "seconds": round(typical, 4),
         "spread": round((max(seconds[1:]) - min(seconds[1:])) / typical, 3),
         "peak_memory_mb": round(_peak_memory_mb(device), 1),

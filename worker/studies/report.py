@@ -17,7 +17,7 @@ def table(result: dict[str, Any]) -> str:
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     lines += [
-        f"| {r['fidelity']} | {r['batch']} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
+        f"| {r['fidelity']} | {_batches(r)} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
         f"| {r['faces']} | {r['iterations']} | {r['ms_per_iteration']:.2f} | {r['grasps_per_second']:.1f} "
         f"| {100 * r['spread']:.0f} % | {r['peak_memory_mb']:.0f} |"
         for r in result["runs"]
@@ -35,6 +35,11 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _batches(run: dict[str, Any]) -> str:
+    """The batch, and how many of it were joined in one launch."""
+    return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
+
+
 def write(result: dict[str, Any], folder: Path) -> None:
     """bench.json, bench.md and bench.png in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,10 +55,10 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for key in dict.fromkeys((r["fidelity"], r["processes"]) for r in result["runs"]):
-        runs = sorted((r for r in result["runs"] if (r["fidelity"], r["processes"]) == key), key=lambda r: r["batch"])
+        runs = sorted((r for r in result["runs"] if (r["fidelity"], r["processes"]) == key), key=lambda r: r["grasps"])
         label = f"{key[0]}, {key[1]} thread{'s' if key[1] > 1 else ''}"
-        axes.plot([r["batch"] for r in runs], [r["grasps_per_second"] for r in runs], marker="o", label=label)
-    batches = sorted({r["batch"] for r in result["runs"]})
+        axes.plot([r["grasps"] for r in runs], [r["grasps_per_second"] for r in runs], marker="o", label=label)
+    batches = sorted({r["grasps"] for r in result["runs"]})
     axes.set_xscale("log", base=2)
     axes.set_xticks(batches, [str(batch) for batch in batches], minor=False)
     axes.set_xlabel("grasps per call")

@@ -25,6 +25,7 @@ RUN_KEYS = {
 def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, object], Path]:
     out = tmp_path_factory.mktemp("bench")
     arguments = ["--hand", "barrett", "--object", "block", "--fidelity", "draft", "--batch", "1", "--batch", "4"]
+    arguments += ["--join", "1", "--join", "2"]
     done = CliRunner().invoke(app, [*arguments, "--threads", "1", "--repeats", "1", "--out", str(out), "--json"])
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout.strip().splitlines()[-1]), out
@@ -34,22 +35,24 @@ def test_every_run_has_the_keys_of_the_contract(result: tuple[dict[str, object],
     found, _ = result
     assert found["device"]
     runs = found["runs"]
-    assert isinstance(runs, list) and [run["batch"] for run in runs] == [1, 4]
+    assert isinstance(runs, list) and [(run["batch"], run["join"]) for run in runs] == [
+        (1, 1), (1, 2), (4, 1), (4, 2),
+    ]  # fmt: skip
     assert all(set(run) >= RUN_KEYS for run in runs)
 
 
-def test_the_rate_is_the_batch_over_its_seconds(result: tuple[dict[str, object], Path]) -> None:
+def test_the_rate_is_that_of_all_batches_of_a_launch(result: tuple[dict[str, object], Path]) -> None:
     runs = result[0]["runs"]
     assert isinstance(runs, list)
     for run in runs:
-        assert run["grasps_per_second"] == pytest.approx(run["batch"] / run["seconds"], rel=0.01)
+        assert run["grasps_per_second"] == pytest.approx(run["batch"] * run["join"] / run["seconds"], rel=0.01)
         assert run["ms_per_iteration"] == pytest.approx(1e3 * run["seconds"] / run["iterations"], rel=0.01)
 
 
 def test_json_table_and_plot_are_written(result: tuple[dict[str, object], Path]) -> None:
     found, out = result
     assert json.loads((out / "bench.json").read_text())["runs"] == found["runs"]
-    assert "grasps/s" in (out / "bench.md").read_text()
+    assert "| draft | 2 × 4 |" in (out / "bench.md").read_text()
     assert (out / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -1,28 +1,33 @@
-"""The planner: starts, coarse phase, fine phase, projection. A batch is cut into one part per CPU thread."""
+"""The planner: starts, coarse phase, fine phase, projection, of one batch or of several in one launch.
+
+A launch is cut into one part per CPU thread. Which grasps it holds besides does not matter to a grasp.
+"""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Final
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd import scene_starts, starts
+from worker.planners.fast_graspd.batches import Batches, finalists
 from worker.planners.fast_graspd.candidates import Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.scene_starts import sample_scene_starts
-from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule, in_scene
+from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import best_of_each, merits, ranked
-from worker.planners.fast_graspd.starts import Probe, sample_starts
+from worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.planners.port import Trial, Wanted
-from worker.planners.threads import Steps, cut, run_parts
+from worker.planners.port import Asked, Finish, Wanted
+from worker.planners.threads import cut, run_parts
 from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.launches import Launches
@@ -33,6 +38,7 @@ from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 #: Iterations between two looks at cancellation.
 CHUNK: Final = 10
@@ -42,14 +48,22 @@ PART: Final = 4
 
 @dataclass
 class Part:
-    """Grasps `indices` of a batch, worked on by one thread."""
+    """Grasps of a launch, worked on by one thread."""
 
-    indices: range
-    state: HandState | None = None
-    loss: Floats | None = None
-    curve: list[float] | None = None
+    rows: Rows
+    """(n,) which of the launch."""
+    state: HandState
+    loss: Floats
+    """(n,) L_stable."""
+    curve: list[Floats] = field(default_factory=list)
+    """(n,) L_stable of each grasp's hands in the mean, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
     """With the postures around them, where a trial needed these."""
+
+    def take(self, which: NDArray[np.intp]) -> Part:
+        """Some of the grasps."""
+        grasps = None if self.grasps is None else self.grasps.take(which)
+        return Part(self.rows[which], self.state[which], self.loss[which], [one[which] for one in self.curve], grasps)
 
 
 def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
@@ -59,6 +73,29 @@ def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSe
     return grasps_of(hand, obj, parts, time.perf_counter() - began, wanted.placed)
 
 
+def plan_joined(hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[Finish | Exception]:
+    """See `worker.planners.Joined`."""
+    began = time.perf_counter()
+    batches = Batches(asked, obj)
+    run = asked[0].run.apart()
+    try:
+        parts = optimise(pair_of(hand, obj, asked[0].wanted.fidelity, run.device), batches, run)
+    except Exception:
+        if len(batches.errors) < len(asked):
+            raise
+        parts = []
+    each = (time.perf_counter() - began) / len(batches.owner)
+    found: list[Finish | Exception] = []
+    for owner, one in enumerate(asked):
+        if owner in batches.errors:
+            found.append(batches.errors[owner])
+            continue
+        own = [part.take(np.flatnonzero(batches.owner[part.rows] == owner)) for part in parts]
+        own = [part for part in own if len(part.rows)]
+        found.append(partial(grasps_of, hand, obj, own, each * one.wanted.count, one.wanted.placed))
+    return found
+
+
 def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> list[Part]:
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
     return optimise_pair(pair_of(hand, obj, wanted.fidelity, run.device), wanted, run)
@@ -66,105 +103,163 @@ def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) 
 
 def optimise_pair(pair: Pair, wanted: Wanted, run: Run) -> list[Part]:
     """The same for a pair that is on `run.device` already, and need not be as the fidelity would make it."""
-    if wanted.placed is not None:
-        wanted = replace(wanted, fidelity=in_scene(wanted.fidelity))
-    steps = Steps(wanted.count * (_hands(wanted.fidelity) + 1), run)
-
-    def work(indices: range) -> Part:
-        part = Part(indices)
-        _work(pair, part, wanted, steps)
-        return part
-
-    return run_parts(cut(wanted.count, run, least=PART), work)
+    batches = Batches([Asked(wanted, run)], pair.fine.obj.model)
+    parts = optimise(pair, batches, run)
+    batches.left()
+    return parts
 
 
-def _hands(fidelity: Fidelity) -> int:
-    """Hand iterations that one grasp costs."""
-    return fidelity.starts * fidelity.coarse_iterations + _finalists(fidelity) * fidelity.fine_iterations
+def optimise(pair: Pair, batches: Batches, run: Run) -> list[Part]:
+    """The same for several batches: the parts of those that are not out in the end, and perhaps of others.
+
+    Raises:
+        Exception: what became of the first batch, if all of them are out.
+    """
+    launch = _Launch(pair, batches)
+    begun = _begun(launch, batches.left(), run)
+    rows = _with_place(launch, begun)
+    begun = begun.take(np.flatnonzero(np.isin(begun.rows, rows)), batches.fidelity.starts)
+
+    def work(which: range) -> Part:
+        return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
+
+    return run_parts(cut(len(rows), run, least=PART), work)
 
 
-def _finalists(fidelity: Fidelity) -> int:
-    """Hands of a grasp that enter the fine phase: no more than set out."""
-    return min(fidelity.finalists, fidelity.starts)
+@dataclass(frozen=True)
+class _Launch:
+    """A pair as each phase sees it, and the batches that are made of it; all threads share it."""
+
+    pair: Pair
+    batches: Batches
+    coarse: Model = field(init=False)
+    fine: Model = field(init=False)
+
+    def __post_init__(self) -> None:
+        obstacles = _obstacles(self.pair, self.batches.placed)
+        object.__setattr__(self, "coarse", self.pair.model(self.pair.coarse, obstacles))
+        object.__setattr__(self, "fine", self.pair.model(self.pair.fine, obstacles))
+
+    def placed(self, rows: Rows) -> Placed | None:
+        return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
 
-def _work(pair: Pair, part: Part, wanted: Wanted, steps: Steps) -> None:
-    fidelity, rows = wanted.fidelity, slice(part.indices.start, part.indices.stop)
-    placed = wanted.placed.take(rows) if wanted.placed else None
-    n, hand, obj = len(part.indices), pair.hand.model, pair.fine.obj.model
-    finalists = _finalists(fidelity)
-    obstacles = _obstacles(pair, placed)
-    which: dict[str, Any] = {"seed": wanted.seed, "batch": wanted.batch, "indices": part.indices}
-    which["each"] = fidelity.starts
-    coarse, fine = pair.model(pair.coarse, obstacles), pair.model(pair.fine, obstacles)
-    state = sample_starts(coarse, **which) if placed is None else sample_scene_starts(coarse, placed=placed, **which)
-    touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
-    steps(n, "starts")
-    part.curve = []
-    data = _in_scenes(Data(coarse, n * fidelity.starts), placed, fidelity.starts)
+@dataclass(frozen=True)
+class _Begun:
+    """Where the hands of grasps start, those of one grasp side by side."""
+
+    rows: Rows
+    state: HandState
+    depth: Floats
+    touch: Floats | None
+    """What of the dilation makes each hand touch; None: all of it."""
+
+    def take(self, which: NDArray[np.intp], each: int) -> _Begun:
+        """Some of the grasps, `each` hands of each."""
+        hands = (which[:, None] * each + np.arange(each)).ravel()
+        touch = None if self.touch is None else self.touch[hands]
+        return _Begun(self.rows[which], self.state[hands], self.depth[hands], touch)
+
+
+def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
+    """The starts of grasps."""
+    batches, coarse = launch.batches, launch.coarse
+    fidelity = batches.fidelity
+
+    def work(which: range) -> _Begun:
+        some = rows[which.start : which.stop]
+        placed, generators = launch.placed(some), batches.generators(some)
+        if placed is None:
+            state, depth = starts.clear_starts(coarse, generators)
+        else:
+            state, depth = scene_starts.clear_scene_starts(
+                coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways
+            )
+        touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
+        batches.step(some, 1, "starts")
+        return _Begun(some, state, depth, touch)
+
+    parts = run_parts(cut(len(rows), run, least=PART), work)
+    touch = (
+        np.concatenate([part.touch for part in parts if part.touch is not None]) if parts[0].touch is not None else None
+    )
+    depth = np.concatenate([part.depth for part in parts])
+    return _Begun(np.concatenate([part.rows for part in parts]), _joined_states([p.state for p in parts]), depth, touch)
+
+
+def _with_place(launch: _Launch, begun: _Begun) -> Rows:
+    """Rows of the batches that found where to start.
+
+    Around a free object every grasp must, in scenes one of a batch."""
+    batches = launch.batches
+    deep = begun.depth.reshape(len(begun.rows), -1)
+    owners = batches.owner[begun.rows]
+    for owner in np.unique(owners).tolist():
+        own = deep[owners == owner]
+        if batches.placed is None and own.max() > NO_PLACE:
+            batches.put_out(owner, starts.no_place(launch.coarse))
+        elif batches.placed is not None and own.min() > NO_PLACE:
+            batches.put_out(owner, scene_starts.no_place(launch.coarse))
+    return batches.left()
+
+
+def _work(launch: _Launch, begun: _Begun) -> Part:
+    batches, pair, rows = launch.batches, launch.pair, begun.rows
+    fidelity, placed, n = batches.fidelity, launch.placed(rows), len(rows)
+    hand, obj, last = pair.hand.model, pair.fine.obj.model, finalists(fidelity)
+    data = _in_scenes(Data(launch.coarse, n * fidelity.starts), placed, fidelity.starts)
     data.set_schedule(coarse_schedule(fidelity))
-    data.set_state(state, dilation=touch)
+    data.set_state(begun.state, dilation=begun.touch)
     # The coarse phase changes its own task as the dilation shrinks: nothing has converged before its end.
-    launches = pair.iteration(coarse, data, fidelity.optimizer, patience=0)
-    state = _descend(launches, data, n * fidelity.starts, fidelity.coarse_iterations, steps, "coarse", part.curve)
-    losses = _losses(data, state)
+    launches = pair.iteration(launch.coarse, data, fidelity.optimizer, patience=0)
+    curve: list[Floats] = []
+    state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse", curve)
+    losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
-    if finalists < fidelity.starts:
+    if last < fidelity.starts:
         merit = merits(hand, obj, state, losses)
         if placed is not None:
-            merit += hindrance(coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
-        order = ranked(merit, n)[:, :finalists]
-    seats = _Seats(pair, fine, fidelity, state, losses, placed, steps, part.curve)
-    if finalists > 1 and placed is not None and wanted.trial is not None:
-        taken = tried(hand, obj, order, seats.seated, placed, _stoppable(wanted.trial, steps))
-        part.state, part.loss, part.grasps = taken.state, taken.losses, taken.joined()
-        return
+            merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
+        order = ranked(merit, n)[:, :last]
+    seats = _Seats(launch, rows, state, losses, curve)
+    if last > 1 and placed is not None and batches.has_trial:
+        taken = tried(hand, obj, order, seats.seated, placed, batches.trial)
+        return Part(rows, taken.state, taken.losses, curve, taken.joined())
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
-    winners = best_of_each(seated.merit, n, 1) if finalists > 1 else np.arange(n)
-    part.state, part.loss = seated.state[winners], seated.losses[winners]
+    winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
+    return Part(rows, seated.state[winners], seated.losses[winners], curve)
 
 
 @dataclass
 class _Seats:
     """The fine phase and the projection of hands that set out."""
 
-    pair: Pair
-    fine: Model
-    fidelity: Fidelity
+    launch: _Launch
+    rows: Rows
     state: HandState
     losses: Floats
-    placed: Placed | None
-    steps: Steps
-    curve: list[float]
+    curve: list[Floats]
     """Goes on with the loss of the first that are seated."""
 
     def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Seated:
         """Hands `rows` (k, each) of the grasps `which` (k,) of this part."""
-        fidelity, flat = self.fidelity, rows.ravel()
+        launch, flat = self.launch, rows.ravel()
+        fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
-        placed = self.placed.take(which) if self.placed is not None else None
-        data = _in_scenes(Data(self.fine, len(flat)), placed, rows.shape[1])
+        data = _in_scenes(Data(launch.fine, len(flat)), launch.placed(mine), rows.shape[1])
         data.set_schedule(fine_schedule(fidelity))
         data.set_state(state)
-        launches = self.pair.iteration(self.fine, data, fidelity.optimizer, patience=fidelity.patience)
+        launches = launch.pair.iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
         curve, self.curve = self.curve, []
-        state = _descend(launches, data, len(flat), fidelity.fine_iterations, self.steps, "fine", curve)
+        state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "fine", curve)
         if fidelity.fine_iterations:
-            losses = _losses(data, state)
+            losses = _losses(data, len(flat))
         # Without iterations this only tells how deep each hand is.
-        state, depths = Projection(self.fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
+        state, depths = Projection(launch.fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
         if rows.shape[1] == 1:
             return Seated(state, losses, np.zeros(len(flat)))
-        hand, obj = self.pair.hand.model, self.pair.fine.obj.model
+        hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
         return Seated(state, losses, merits(hand, obj, state, losses, depths))
-
-
-def _stoppable(trial: Trial, steps: Steps) -> Trial:
-    def asked(grasps: GraspSet, placed: Placed) -> Floats:
-        steps(0, "trial")
-        return trial(grasps, placed)
-
-    return asked
 
 
 def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:
@@ -181,38 +276,43 @@ def _in_scenes(data: Data, placed: Placed | None, each: int) -> Data:
     return data
 
 
-def _losses(data: Data, state: HandState) -> Floats:
+def _losses(data: Data, n: int) -> Floats:
     """L_stable (n,) of the last iteration."""
-    return data.loss.numpy()[: len(state.pivot)].mean(axis=1).astype(float)
+    return data.loss.numpy()[:n].mean(axis=1).astype(float)
 
 
 def _descend(
-    launches: Launches, data: Data, n: int, iterations: int, steps: Steps, name: str, curve: list[float]
+    launches: Launches, data: Data, batches: Batches, rows: Rows, iterations: int, name: str, curve: list[Floats]
 ) -> HandState:
-    """The first n hands after so many iterations."""
-    done = 0
+    """All hands of the grasps `rows` after so many iterations; those of batches that are out on the way stay behind."""
+    done, out = 0, len(batches.errors)
+    each = data.capacity // len(rows)
     while done < iterations:
         chunk = min(CHUNK, iterations - done)
         launches.run(chunk)
         done += chunk
-        steps(n * chunk, name)
+        batches.step(rows, each * chunk, name)
+        if len(batches.errors) > out:
+            out = len(batches.errors)
+            data.switch_off(np.repeat(~batches.going(rows), each))
         if not wp.get_device(data.device).is_cuda:
-            curve.append(float(data.loss.numpy()[:n].mean()))
-    return data.state(n)
+            curve.append(_losses(data, data.capacity).reshape(len(rows), each).mean(axis=1))
+    return data.state(data.capacity)
+
+
+def _joined_states(states: Sequence[HandState]) -> HandState:
+    return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
 
 
 def grasps_of(
     hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float, placed: Placed | None = None
 ) -> GraspSet:
     """The parts of a batch as grasps with the postures around them."""
-    curves = [part.curve for part in parts if part.curve]
-    curve = np.mean(curves, axis=0).round(5).tolist() if curves else []
+    curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]
     if len(known) == len(parts):
         grasps = joined(known)
     else:
-        states = [part.state for part in parts if part.state is not None]
-        state = HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
-        loss = np.concatenate([part.loss for part in parts if part.loss is not None])
-        grasps = with_postures(hand, obj, state, loss, placed)
-    return replace(grasps, seconds=seconds, info={"loss_curve": curve, "chunk": CHUNK})
+        loss = np.concatenate([part.loss for part in parts])
+        grasps = with_postures(hand, obj, _joined_states([part.state for part in parts]), loss, placed)
+    return replace(grasps, seconds=seconds, info={"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK})

@@ -6,6 +6,7 @@ A start keeps `ROOM` from obstacles besides the margin it has later, so that the
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +19,7 @@ from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import Openings, across
-from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe, start_generator
+from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
@@ -79,23 +80,38 @@ def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
-def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, each: int, placed: Placed) -> HandState:
-    """Starts of the grasps `indices` of a batch in their scenes, `each` per grasp, those of one grasp side by side.
+def no_place(model: Model) -> InputError:
+    """What to say of a batch none of whose starts is clear."""
+    hand, obj = model.hand.model, model.obj.model
+    return InputError(
+        f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
+        "around it leaves no room"
+    )
 
-    `model` has the scenes' obstacles.
 
-    Raises:
-        InputError: a scene leaves no way to the object, or not one draw of any start came within 10 mm of being clear.
+def clear_scene_starts(
+    model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
+) -> tuple[HandState, Floats]:
+    """A start of each generator, `each` per grasp, the least deep of its draws, and how deep it is (n,) [m].
+
+    Some find a place in a narrow scene and some do not: these end blocked, and the others are what there is.
+
+    Args:
+        model: hand and object, with the scenes' obstacles.
+        generators: of the starts, those of one grasp side by side.
+        each: starts of a grasp.
+        placed: scenes of the grasps.
+        ways: what `free_ways` finds in each scene.
     """
     hand, obj = model.hand.model, model.obj.model
-    probe = Probe(model, len(indices) * each, room=ROOM)
-    ways = [free_ways(scene, obj) for scene in placed.scenes]
-    openings = [Openings.of(oppositions_of(hand), obj, scene) for scene in placed.scenes]
+    probe = Probe(model, len(generators), room=ROOM)
+    used = set(placed.index.tolist())
+    known = oppositions_of(hand)
+    openings = {s: Openings.of(known, obj, scene) for s, scene in enumerate(placed.scenes) if s in used}
     scene = np.repeat(placed.index, each)
     reaching = np.arange(len(scene)) % each % EVERY < REACHING
-    reaching &= np.array([len(openings[s].sums) > 0 for s in scene], bool)
+    reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
     count, around = len(scene), _Around(hand, obj, _Surface.of(obj), ways, openings)
-    generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.array([g.standard_normal((DRAWS, 2 + hand.dofs)) for g in generators])
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
@@ -120,13 +136,7 @@ def sample_scene_starts(model: Model, *, seed: int, batch: int, indices: range, 
             taken.rotation,
             taken.q,
         )
-    # Some starts find a place in a narrow scene and some do not: these end blocked, and the others are what there is.
-    if depth.min() > 0.01:
-        raise InputError(
-            f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
-            "around it leaves no room"
-        )
-    return best
+    return best, depth
 
 
 def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp]) -> Floats:
@@ -168,9 +178,10 @@ class _Around:
     hand: HandModel
     obj: ObjectModel
     surface: _Surface
-    ways: list[Floats]
+    ways: Sequence[Floats]
     """Free directions of each scene."""
-    openings: list[Openings]
+    openings: Mapping[int, Openings]
+    """Of each scene."""
 
     def draws(
         self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]

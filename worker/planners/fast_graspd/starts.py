@@ -36,6 +36,8 @@ POSTURE_NOISE: Final = 0.08
 CLEAR: Final = 0.001
 #: Draws per grasp before the least penetrating one is taken.
 DRAWS: Final = 48
+#: A start that is deeper than this is none [m].
+NO_PLACE: Final = 0.01
 
 
 def start_generator(seed: int, batch: int, index: int, start: int) -> np.random.Generator:
@@ -164,12 +166,28 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     Raises:
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
+    state, depth = clear_starts(model, [start_generator(seed, batch, i, k) for i in indices for k in range(each)])
+    if depth.max() > NO_PLACE:
+        raise no_place(model)
+    return state
+
+
+def no_place(model: Model) -> InputError:
+    """What to say of a grasp none of whose starts is clear."""
+    hand, obj = model.hand.model, model.obj.model
+    return InputError(
+        f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
+        "check the object's units"
+    )
+
+
+def clear_starts(model: Model, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
+    """A start of each generator, the least deep of its draws, and how deep it is (n,) [m]; most are clear."""
     hand, obj = model.hand.model, model.obj.model
     jaws = JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else jaw_starts.RETREATS
-    probe = Probe(model, len(indices) * each * len(retreats))
+    probe = Probe(model, len(generators) * len(retreats))
     pair = _Pair.of(hand, obj)
-    generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     best: HandState | None = None
     deepest = np.full(len(generators), np.inf)
     open_ = np.arange(len(generators))
@@ -190,12 +208,8 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
         open_ = open_[deepest[open_] > CLEAR]
         if not len(open_):
             break
-    if best is None or deepest.max() > 0.01:
-        raise InputError(
-            f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
-            "check the object's units"
-        )
-    return best
+    assert best is not None
+    return best, deepest
 
 
 def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> HandState:

@@ -1,0 +1,125 @@
+"""Batches that are made in one launch: each comes out as by itself, whatever becomes of the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.model.domain import resolve_fidelity
+from service.model.errors import InputError, MeshError, TaskCancelled
+from service.model.scene_spec import SceneSpec
+from worker.grasps import GraspSet
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners import Asked, Wanted, synthesize
+from worker.planners.fast_graspd import planner
+from worker.planners.fast_graspd.planner import plan_joined
+from worker.run import Run
+from worker.scenes.kinds import rest_poses, supports_of
+from worker.simulation.surroundings import Placed
+
+QUICK = resolve_fidelity("draft").model_copy(
+    update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
+)
+TABLE = SceneSpec(kind="table")
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
+
+
+def made(pair, asked: list[Asked]) -> list[GraspSet | Exception]:
+    return [one if isinstance(one, Exception) else one() for one in plan_joined(*pair, asked)]
+
+
+def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
+    """Bit for bit, with what the planner remarks."""
+    assert isinstance(one, GraspSet)
+    columns, others = one.to_columns(), other.to_columns()
+    assert columns.keys() == others.keys()
+    for name, values in columns.items():
+        np.testing.assert_array_equal(values, others[name], err_msg=name)
+    np.testing.assert_array_equal(one.stability_loss, other.stability_loss)
+    assert one.info == other.info
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_joined_batches_are_those_of_separate_launches_bit_for_bit(pair, threads: int) -> None:
+    wanted = [Wanted(5, QUICK, 1, 0), Wanted(3, QUICK, 1, 1), Wanted(4, QUICK, 7, 1 << 20)]
+    joined = made(pair, [Asked(one, Run(threads=threads)) for one in wanted])
+    for one, alone in zip(joined, wanted, strict=True):
+        assert_same(one, synthesize(*pair, alone, Run(threads=1)))
+
+
+def test_a_launch_for_which_memory_does_not_suffice_is_halved_across_batches(
+    pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = [Wanted(3, QUICK, 1, 0), Wanted(3, QUICK, 1, 1)]
+    alone = [synthesize(*pair, one, Run(threads=1)) for one in wanted]
+
+    class Small(planner.Data):
+        """Of a device with room for two grasps."""
+
+        def __init__(self, model: object, capacity: int) -> None:
+            if capacity > 2 * QUICK.starts:
+                raise RuntimeError("Failed to allocate 8589934592 bytes on device 'cuda:0'")
+            super().__init__(model, capacity)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(planner, "Data", Small)
+    for one, other in zip(made(pair, [Asked(one, Run(threads=1)) for one in wanted]), alone, strict=True):
+        assert_same(one, other)
+
+
+def on_table(obj, count: int, seed: int) -> Placed:
+    poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
+    return Placed(supports_of(TABLE), poses, np.arange(count) % 2)
+
+
+def good_enough(grasps: GraspSet, placed: Placed) -> np.ndarray:
+    return np.zeros(len(grasps))
+
+
+def test_what_is_the_matter_with_one_batch_leaves_the_others_as_they_are(pair) -> None:
+    hand, obj = pair
+    below = on_table(obj, 2, 3)
+    below = replace(below, object_pose=below.object_pose - np.array([0, 0, 1.0, 0, 0, 0, 0]))
+
+    def torn(grasps: GraspSet, placed: Placed) -> np.ndarray:
+        raise MeshError("no pieces")
+
+    wanted = [
+        Wanted(2, QUICK, 1, 0, below, good_enough),
+        Wanted(3, QUICK, 1, 1, on_table(obj, 3, 3), good_enough),
+        Wanted(2, QUICK, 1, 2, on_table(obj, 2, 3), torn),
+        Wanted(2, QUICK, 1, 3, on_table(obj, 2, 3), good_enough),
+        Wanted(3, QUICK, 2, 0, on_table(obj, 3, 4), good_enough),
+    ]
+    asked = [Asked(one, Run(threads=1, cancelled=lambda k=k: k == 3)) for k, one in enumerate(wanted)]
+    buried, first, broken, stopped, last = made(pair, asked)
+    assert isinstance(buried, InputError) and "nothing can reach" in str(buried)
+    assert isinstance(broken, MeshError)
+    assert isinstance(stopped, TaskCancelled)
+    for joined, alone in ((first, wanted[1]), (last, wanted[4])):
+        assert_same(joined, synthesize(hand, obj, alone, Run(threads=1)))
+
+
+def test_a_batch_that_is_cancelled_on_the_way_leaves_the_others_as_they_are(pair) -> None:
+    wanted = [Wanted(2, QUICK, 1, 0), Wanted(2, QUICK, 1, 1)]
+    told: list[str] = []
+    stopping = Run(
+        threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: "coarse" in told
+    )
+    stopped, kept = made(pair, [Asked(wanted[0], stopping), Asked(wanted[1], Run(threads=1))])
+    assert isinstance(stopped, TaskCancelled)
+    assert told == ["starts", "coarse"]
+    assert_same(kept, synthesize(*pair, wanted[1], Run(threads=1)))
+
+
+def test_where_all_are_cancelled_the_launch_ends(pair) -> None:
+    wanted, told = Wanted(2, QUICK), list[str]()
+    run = Run(threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told))
+    assert all(isinstance(one, TaskCancelled) for one in made(pair, [Asked(wanted, run), Asked(wanted, run)]))
+    assert told == ["starts"]

@@ -1,0 +1,132 @@
+"""Who is served together in a meeting, when, and what becomes of each."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from service.model.errors import TaskCancelled
+from worker.meeting import Meeting
+from worker.run import Run
+
+#: Long enough that no test sees its end.
+NEVER_S = 1000.0
+
+
+def doubled(items: Sequence[Any]) -> list[Any]:
+    return [ValueError("odd") if item % 2 else 2 * item for item in items]
+
+
+def asked(
+    meeting: Meeting, items: Sequence[int], work: Callable[[Sequence[Any]], Sequence[Any]] = doubled, key: str = "same"
+) -> list[Any]:
+    """What each of several members gets, in their order: a result or what was raised."""
+
+    def one(item: int) -> Any:
+        try:
+            return meeting.ask(key, item, work, size=1, cancelled=lambda: False)
+        except Exception as error:
+            return error
+
+    with ThreadPoolExecutor(len(items)) as pool:
+        return list(pool.map(one, items))
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.meeting.FIRST_WAIT_S", NEVER_S)
+
+
+def test_all_members_who_wait_are_served_at_once() -> None:
+    with Meeting(4, 100) as meeting:
+        assert asked(meeting, [0, 2, 4, 6]) == [0, 4, 8, 12]
+    assert meeting.served == [4]
+
+
+def test_what_becomes_of_one_is_its_own() -> None:
+    with Meeting(3, 100) as meeting:
+        first, second, third = asked(meeting, [2, 3, 4])
+    assert (first, third) == (4, 8)
+    assert isinstance(second, ValueError)
+
+
+def test_work_that_fails_for_all_is_tried_for_each() -> None:
+    def fragile(items: Sequence[Any]) -> list[Any]:
+        if 3 in items:
+            raise ArithmeticError("three")
+        return [2 * item for item in items]
+
+    with Meeting(3, 100) as meeting:
+        first, second, third = asked(meeting, [2, 3, 4], fragile)
+    assert (first, third) == (4, 8)
+    assert isinstance(second, ArithmeticError)
+
+
+def test_no_launch_is_larger_than_the_most() -> None:
+    with Meeting(5, 2) as meeting:
+        assert asked(meeting, [0, 2, 4, 6, 8]) == [0, 4, 8, 12, 16]
+        assert max(meeting.served) == 2
+
+
+def test_a_full_launch_waits_for_nobody() -> None:
+    with Meeting(9, 2) as meeting:
+        assert asked(meeting, [0, 2]) == [0, 4]
+
+
+def test_who_leaves_is_not_waited_for() -> None:
+    with Meeting(2, 100) as meeting:
+        meeting.leave()
+        assert asked(meeting, [2]) == [4]
+
+
+def test_nobody_waits_longer_than_a_launch_takes() -> None:
+    now = [0.0]
+
+    def slow(items: Sequence[Any]) -> list[Any]:
+        now[0] += 0.02
+        return doubled(items)
+
+    with Meeting(3, 2, clock=lambda: now[0]) as meeting:
+        asked(meeting, [0, 2], slow)
+        with ThreadPoolExecutor(1) as pool:
+            alone: Future[Any] = pool.submit(meeting.ask, "same", 8, slow, size=1, cancelled=lambda: False)
+            now[0] += 0.03
+            assert alone.result(timeout=20) == 16
+
+
+def test_what_differs_is_not_done_together() -> None:
+    seen: list[list[int]] = []
+
+    def noting(items: Sequence[Any]) -> list[Any]:
+        seen.append(sorted(items))
+        return doubled(items)
+
+    with Meeting(4, 100) as meeting, ThreadPoolExecutor(2) as pool:
+        one = pool.submit(asked, meeting, [0, 2], noting, "a")
+        two = pool.submit(asked, meeting, [4, 6], noting, "b")
+        assert (one.result(), two.result()) == ([0, 4], [8, 12])
+    assert sorted(seen) == [[0, 2], [4, 6]]
+
+
+def test_who_is_cancelled_waits_no_longer_and_is_not_served() -> None:
+    stop = threading.Event()
+    with Meeting(2, 100) as meeting, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(meeting.ask, "same", 2, doubled, size=1, cancelled=stop.is_set)
+        stop.set()
+        with pytest.raises(TaskCancelled):
+            waiting.result(timeout=20)
+        meeting.leave()
+        assert asked(meeting, [4]) == [8]
+    assert meeting.served == [1]
+
+
+def test_members_share_the_cores() -> None:
+    meeting = Meeting(3, 100)
+    assert Run(threads=8, meeting=meeting).cores == 2
+    assert Run(threads=8, meeting=meeting).apart().cores == 8
+    meeting.leave()
+    assert Run(threads=8, meeting=meeting).cores == 4

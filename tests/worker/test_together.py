@@ -1,0 +1,80 @@
+"""Several batches of a job at once: the same grasps, and one failure for all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.model.domain import JobOptions, resolve_fidelity
+from service.model.errors import InputError, MeshError, TaskCancelled
+from worker import together
+from worker.engines.joins import batches_at_once, fitting, parse_join
+from worker.files.synthesis import synthesized
+from worker.hands.load import hand_from_path
+from worker.meeting import Meeting
+from worker.objects.prepare import object_from_path
+from worker.run import Run
+from worker.together import certified_batches
+
+REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return hand_from_path("barrett"), object_from_path("block", face_error_m=REQUEST.knobs.face_error_m)
+
+
+def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    launches: list[Meeting] = []
+
+    class Noted(Meeting):
+        def __init__(self, *given: int) -> None:
+            super().__init__(*given)
+            launches.append(self)
+
+    monkeypatch.setattr(together, "Meeting", Noted)
+    told: list[tuple[float, float]] = []
+    alone = certified_batches(*pair, REQUEST, sizes=[2, 2, 2], run=Run(threads=2))
+    run = Run(threads=2, progress=lambda done, total, message: told.append((done, total)))
+    joined = certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=3, run=run)
+    assert launches[0].served[0] == 3, "the first launch has all three"
+    for one, other in zip(joined, alone, strict=True):
+        assert (one.tried, one.rejected, one.planned, one.verdict_key) == (
+            other.tried, other.rejected, other.planned, other.verdict_key,
+        )  # fmt: skip
+        columns = one.grasps.to_columns() | one.columns
+        for name, values in (other.grasps.to_columns() | other.columns).items():
+            np.testing.assert_array_equal(columns[name], values, err_msg=name)
+    assert told[-1] == (6, 6)
+    assert all(done <= total for done, total in told)
+
+
+def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
+    def torn(obj: object) -> object:
+        raise MeshError("no pieces")
+
+    with pytest.raises(MeshError, match="no pieces"):
+        certified_batches(*pair, REQUEST, sizes=[2, 2], join=2, pieces=torn, run=Run(threads=1))  # type: ignore[arg-type]
+
+
+def test_a_job_that_is_cancelled_stops_all_its_batches(pair) -> None:
+    told: list[str] = []
+    run = Run(threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told))
+    with pytest.raises(TaskCancelled):
+        certified_batches(*pair, REQUEST, sizes=[2, 2], join=2, run=run)
+
+
+def test_how_many_are_joined_where_nobody_says() -> None:
+    assert [parse_join(text) for text in ("auto", "1", "32")] == [None, 1, 32]
+    assert batches_at_once("cpu", None) == 1
+    assert batches_at_once("cpu", 4) == 4
+    # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
+    assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "many", "1.5", ""])
+def test_what_is_no_number_of_batches_is_refused(text: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--join takes a number of batches"):
+        synthesized("barrett", str(tmp_path / "none.stl"), REQUEST, join=text)

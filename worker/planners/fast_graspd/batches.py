@@ -1,0 +1,133 @@
+"""Batches that are made in one launch: which grasp of it is whose, and which of them are out.
+
+A batch is out when it was cancelled or when something is the matter with it alone; the others go on without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.domain import Fidelity
+from service.model.errors import InputError, TaskCancelled
+from worker.grasps import GraspSet
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.scene_starts import free_ways
+from worker.planners.fast_graspd.schedule import in_scene
+from worker.planners.fast_graspd.starts import start_generator
+from worker.planners.port import Asked
+from worker.planners.threads import Steps
+from worker.simulation.surroundings import Placed, placed_together
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+class Batches:
+    """The grasps of several batches, one batch after the other; a row is a grasp."""
+
+    def __init__(self, asked: Sequence[Asked], obj: ObjectModel) -> None:
+        """All batches have one fidelity, and all or none of them are in scenes with the same fixed surroundings."""
+        self.asked = asked
+        wanted = [one.wanted for one in asked]
+        in_scenes = wanted[0].placed is not None
+        self.fidelity: Fidelity = in_scene(wanted[0].fidelity) if in_scenes else wanted[0].fidelity
+        counts = [one.count for one in wanted]
+        self.owner = np.repeat(np.arange(len(asked)), counts)
+        """(n,) the batch of each row."""
+        self.index = np.concatenate([np.arange(count) for count in counts])
+        """(n,) number of each row within its batch."""
+        self.errors: dict[int, Exception] = {}
+        """What became of the batches that are out."""
+        self._steps = [Steps(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
+        placed = [one.placed for one in wanted if one.placed is not None]
+        self.placed: Placed | None = placed_together(placed) if placed else None
+        self._owner_of_scene = np.repeat(np.arange(len(placed)), [len(scenes.object_pose) for scenes in placed])
+        self.ways: list[Floats] = []
+        """Free ways of each scene."""
+        for owner, scenes in enumerate(placed):
+            self._find_ways(owner, scenes, obj)
+
+    def _find_ways(self, owner: int, scenes: Placed, obj: ObjectModel) -> None:
+        try:
+            # Whole or not at all: those of a scene are found by its number.
+            self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
+        except InputError as error:
+            self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
+            self.put_out(owner, error)
+
+    @property
+    def has_trial(self) -> bool:
+        """Whether candidates go through a trial."""
+        return self.placed is not None and all(one.wanted.trial is not None for one in self.asked)
+
+    def put_out(self, owner: int, error: Exception) -> None:
+        """The batch is made no further; what became of it first stands."""
+        self.errors.setdefault(owner, error)
+
+    def going(self, rows: Rows) -> NDArray[np.bool_]:
+        """(n,) whether the batches of these rows are still made."""
+        return ~np.isin(self.owner[rows], list(self.errors))
+
+    def left(self) -> Rows:
+        """Rows of the batches that are still made.
+
+        Raises:
+            Exception: what became of the first batch, if all of them are out.
+        """
+        rows = np.flatnonzero(self.going(np.arange(len(self.owner))))
+        if not len(rows):
+            raise self.errors[min(self.errors)]
+        return rows
+
+    def step(self, rows: Rows, work: float, message: str) -> None:
+        """So much work was done for each of the rows; batches that are cancelled are put out.
+
+        Raises:
+            Exception: what became of the first batch, if all of them are out.
+        """
+        owners, counts = np.unique(self.owner[rows], return_counts=True)
+        for owner, count in zip(owners.tolist(), counts.tolist(), strict=True):
+            if owner not in self.errors:
+                try:
+                    self._steps[owner](count * work, message)
+                except TaskCancelled as error:
+                    self.put_out(owner, error)
+        if len(self.errors) == len(self.asked):
+            raise self.errors[min(self.errors)]
+
+    def generators(self, rows: Rows) -> list[np.random.Generator]:
+        """Random numbers of the starts of these rows, those of one grasp side by side."""
+        each = range(self.fidelity.starts)
+        wanted = [self.asked[owner].wanted for owner in self.owner[rows].tolist()]
+        indices = self.index[rows].tolist()
+        return [
+            start_generator(one.seed, one.batch, i, k) for one, i in zip(wanted, indices, strict=True) for k in each
+        ]
+
+    def trial(self, grasps: GraspSet, placed: Placed) -> Floats:
+        """Scores (n,) of grasps in scenes of this launch, each by the trial of its own batch; of a batch that is out
+        every grasp is good enough."""
+        owners, scores = self._owner_of_scene[placed.index], np.zeros(len(grasps))
+        for owner in np.unique(owners).tolist():
+            trial, own = self.asked[owner].wanted.trial, np.flatnonzero(owners == owner)
+            if trial is None or owner in self.errors:
+                continue
+            try:
+                self._steps[owner](0, "trial")
+                scores[own] = trial(grasps.take(own), placed.take(own))
+            except Exception as error:
+                self.put_out(owner, error)
+        return scores
+
+
+def finalists(fidelity: Fidelity) -> int:
+    """Hands of a grasp that enter the fine phase: no more than set out."""
+    return min(fidelity.finalists, fidelity.starts)
+
+
+def hands(fidelity: Fidelity) -> int:
+    """Hand iterations that one grasp costs."""
+    return fidelity.starts * fidelity.coarse_iterations + finalists(fidelity) * fidelity.fine_iterations

@@ -1,0 +1,110 @@
+"""Several batches of a job at once: each in a thread of its own, with their planning done in common launches."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from service.model.domain import BATCH_SIZE, JobOptions
+from worker.certified import Certified, certified_grasps
+from worker.hands.model import HandModel
+from worker.meeting import Meeting
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.run import ALONE, Progress, Run
+from worker.simulation.surroundings import Scenes
+
+#: Batches at work for each one in a launch: while one half is on the device, the other is judged and measured.
+PER_LAUNCH: Final = 2
+
+
+@dataclass
+class _Shares:
+    """How far all batches are, told in grasps."""
+
+    sizes: Sequence[int]
+    told: Progress
+    _done: dict[int, float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def of(self, batch: int) -> Progress:
+        """What a batch tells its progress to."""
+
+        def tell(done: float, total: float, message: str) -> None:
+            with self._lock:
+                self._done[batch] = self.sizes[batch] * (done / total if total > 0 else 0.0)
+                self.told(sum(self._done.values()), sum(self.sizes), message)
+
+        return tell
+
+
+def certified_batches(
+    hand: HandModel,
+    obj: ObjectModel,
+    request: JobOptions,
+    *,
+    sizes: Sequence[int],
+    join: int = 1,
+    scenes: Scenes | None = None,
+    pieces: Callable[[ObjectModel], ConvexPieces] = decompose,
+    run: Run = ALONE,
+) -> list[Certified]:
+    """The first batches of a job; see `certified_grasps`, which makes the same of each.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        request: see `certified_grasps`.
+        sizes: grasps wanted of each batch.
+        join: batches whose grasps are planned in one launch; 1: one batch after the other.
+        scenes: see `certified_grasps`.
+        pieces: gives the object's convex pieces.
+        run: told of the grasps that are done.
+
+    Raises:
+        Exception: what became of the first batch that failed; the others are stopped.
+    """
+    shares = _Shares(sizes, run.progress)
+
+    def batch(number: int, own: Run) -> Certified:
+        own = replace(own, progress=shares.of(number))
+        made = certified_grasps(
+            hand, obj, request, count=sizes[number], batch=number, scenes=scenes, pieces=pieces, run=own
+        )
+        own.progress(1.0, 1.0, "done")
+        return made
+
+    if join == 1 or len(sizes) == 1:
+        return [batch(number, run) for number in range(len(sizes))]
+    if request.referee != "none":
+        pieces(obj)  # once, and not by every batch at the same time
+    return _together(batch, len(sizes), join, run)
+
+
+def _together(work: Callable[[int, Run], Certified], count: int, join: int, run: Run) -> list[Certified]:
+    members = min(count, PER_LAUNCH * join)
+    stop, left = threading.Event(), iter(range(count))
+    found: dict[int, Certified] = {}
+    with Meeting(members, join * BATCH_SIZE) as meeting:
+        own = replace(run, meeting=meeting, cancelled=lambda: stop.is_set() or run.cancelled())
+
+        def member() -> None:
+            try:
+                while not stop.is_set() and (number := next(left, None)) is not None:
+                    found[number] = work(number, own)
+            finally:
+                meeting.leave()
+
+        try:
+            with ThreadPoolExecutor(members, thread_name_prefix="batch") as pool:
+                futures = [pool.submit(member) for _ in range(members)]
+                done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+                stop.set()
+        finally:
+            stop.set()
+    if failed := [error for one in done if (error := one.exception()) is not None]:
+        raise failed[0]
+    return [found[number] for number in range(count)]
