@@ -14,7 +14,6 @@ from service.model.transforms import quat_rotate
 from worker.grasps import Posture
 from worker.hands.jacobian import generalized_forces
 from worker.hands.jaws import jaws_of, slides
-from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.contact import choose_contacts, finger_of_body
@@ -222,33 +221,24 @@ def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     A hand whose fingers have all been `CLEARANCE_M` away is not looked at farther on its way: -inf there.
     """
     count, steps, _ = paths.shape
-    finger = _finger_of_body(probe.hand)[probe.points.body]
-    points = np.flatnonzero(finger >= 0)
+    finger = _finger_of_body(probe.hand)
     out = np.full((count, steps, _fingers(probe.hand)), -np.inf)
     going = np.arange(count)
     for first in range(0, steps, _LOOK_STEPS):
         look = paths[going, first : first + _LOOK_STEPS]
         joints = probe.hand.expand(look).reshape(-1, len(probe.hand.joint_names))
         poses = np.repeat(hand_pose[going], look.shape[1], axis=0)
-        distance = _distances(probe, poses, joints, points, reach=CLEARANCE_M)
-        found = np.full((len(distance), out.shape[2]), np.inf)
+        gaps = probe.body_gaps(poses, joints, reach=CLEARANCE_M)
+        found = np.full((len(gaps), out.shape[2]), np.inf)
         for f in range(out.shape[2]):
-            mine = finger[points] == f
+            mine = finger == f
             if mine.any():
-                found[:, f] = distance[:, mine].min(axis=1)
+                found[:, f] = gaps[:, mine].min(axis=1)
         out[going, first : first + _LOOK_STEPS] = found.reshape(len(going), look.shape[1], -1)
         going = going[(out[going].max(axis=1) < CLEARANCE_M).any(axis=1)]
         if not len(going):
             break
     return out
-
-
-def _distances(
-    probe: Probe, hand_pose: Floats, joints: Floats, points: NDArray[np.intp] | None = None, *, reach: float
-) -> Floats:
-    """(B, P) signed distances of the hand's points, or of some of them, at B postures, at most `reach` [m]."""
-    posed = probe.posed_points(body_poses(probe.hand, hand_pose, joints), points)
-    return probe.signed_distance(posed.reshape(-1, 3), reach=reach)[0].reshape(posed.shape[:2])
 
 
 def _first_clear(clearance: Floats, wanted: float) -> NDArray[np.intp]:
@@ -287,8 +277,7 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     count, steps, _ = paths.shape
     finger = _finger_of_body(probe.hand)
     joints = probe.hand.expand(paths).reshape(count * steps, -1)
-    bodies = body_poses(probe.hand, np.repeat(hand_pose, steps, axis=0), joints)
-    depth = probe.self_depth(bodies, probe.posed_points(bodies)).reshape(count, steps, -1).max(axis=1)
+    depth = probe.body_depths(np.repeat(hand_pose, steps, axis=0), joints).reshape(count, steps, -1).max(axis=1)
     out = np.zeros((count, _fingers(probe.hand)))
     for f in range(out.shape[1]):
         mine = finger == f
@@ -302,15 +291,11 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     count, steps, _ = paths.shape
     finger = _finger_of_body(hand)
     out = np.full((count, _fingers(hand)), np.inf)
-    for number, scene in enumerate(placed.scenes):
-        rows = np.flatnonzero(placed.index == number)
-        if not len(rows):
-            continue
-        joints = hand.expand(paths[rows]).reshape(len(rows) * steps, -1)
-        found = body_room(hand, Posture(np.repeat(hand_pose[rows], steps, axis=0), joints), scene)
-        found = found.reshape(len(rows), steps, -1).min(axis=1)
-        for f in np.unique(finger[finger >= 0]):
-            out[rows, f] = found[:, finger == f].min(axis=1)
+    postures = Posture(np.repeat(hand_pose, steps, axis=0), hand.expand(paths).reshape(count * steps, -1))
+    found = body_room(hand, postures, placed.scenes, np.repeat(placed.index, steps))
+    found = found.reshape(count, steps, -1).min(axis=1)
+    for f in np.unique(finger[finger >= 0]):
+        out[:, f] = found[:, finger == f].min(axis=1)
     return out
 
 
@@ -321,7 +306,7 @@ def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
     poses[..., :3] += np.array(RETREATS_M)[None, :, None] * back[:, None]
     joints = probe.hand.expand(q)
     joined = np.repeat(joints, choices, axis=0)
-    distance = _distances(probe, poses.reshape(-1, 7), joined, reach=PALM_CLEARANCE_M)
+    distance = probe.body_gaps(poses.reshape(-1, 7), joined, reach=PALM_CLEARANCE_M)
     chosen = _first_clear(distance.min(axis=1).reshape(count, choices), PALM_CLEARANCE_M)
     return Posture(poses[np.arange(count), chosen], joints)
 

@@ -1,4 +1,4 @@
-"""Distances between a posed hand and an object, for many grasps at once. On the CPU, in parallel threads."""
+"""Distances between a posed hand and an object, for many grasps at once, on a GPU or on the CPU."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import distance as kernels
+from worker.simulation.posed import PosedBodies
 from worker.simulation.sampling import object_samples
 
 Floats = NDArray[np.float64]
@@ -75,37 +76,51 @@ class Probe:
         *,
         hand_points: int = HAND_POINTS,
         object_points: int = OBJECT_POINTS,
+        device: str = "cpu",
     ) -> None:
-        self.hand, self.obj = hand, obj
+        self.hand, self.obj, self.device = hand, obj, device
         self.points: SurfacePoints = sample_surface(hand, hand_points, seed=SEED)
         self.samples: Floats = object_samples(obj, object_points, seed=SEED)
-        self._pieces = DeviceHand.create(hand, "cpu").pieces
+        self.pieces = DeviceHand.create(hand, device).pieces
         self._piece_body = np.array([p.body for p in hand.pieces], np.intp)
         self._piece_frame = np.array([_kernel_frame(p.kind, p.pose, p.vertices) for p in hand.pieces])
-        margin = 1e-4
-        self._low = wp.vec3(*(obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin))
-        self._high = wp.vec3(*(obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin))
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(device):
             # Loading here keeps threads from compiling the same module at once.
-            wp.load_module(module=kernels, device="cpu")
+            wp.load_module(module=kernels, device=device)
             self._body = wp.array(self.points.body, dtype=wp.int32)
+            self._of_bodies = _by_body(self.points, hand.bodies)
+            self._origin = wp.vec3d(*obj.centre_of_mass)
+            self._frames = [
+                wp.array(self._piece_frame[:, :3], dtype=wp.vec3d),
+                wp.array(to_xyzw(self._piece_frame[:, 3:]), dtype=wp.quatd),
+            ]
             self._samples = wp.array(self.samples - obj.centre_of_mass, dtype=wp.vec3)
-            self._corner_normals = wp.array(obj.corner_normals.reshape(-1, 3), dtype=wp.vec3)
             self._mesh = wp.Mesh(
                 points=wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3),
                 indices=wp.array(obj.faces.ravel(), dtype=wp.int32),
                 support_winding_number=not obj.watertight,
             )
-            self._coarse = wp.zeros((0, 0, 0), dtype=wp.float32)
-        size = np.subtract(self._high, self._low)
-        self._spacing = float(size.max()) / COARSE_CELLS
-        nodes = np.stack(
-            np.meshgrid(*(np.arange(int(length / self._spacing) + 2) for length in size), indexing="ij"), axis=-1
-        )
-        points = np.asarray(self._low) + self._spacing * nodes + obj.centre_of_mass
-        coarse = self._query(points.reshape(-1, 3))[0].reshape(nodes.shape[:3])
-        with wp.ScopedDevice("cpu"):
-            self._coarse = wp.array(coarse, dtype=wp.float32)
+        self.skin = self._skin()
+
+    def _skin(self) -> Any:
+        """The object's surface with a coarse grid of distances."""
+        obj, margin = self.obj, 1e-4
+        low = obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin
+        high = obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin
+        skin = self.skin = kernels.Skin()
+        skin.mesh, skin.winding = self._mesh.id, int(not obj.watertight)
+        skin.low, skin.high = wp.vec3(*low), wp.vec3(*high)
+        skin.spacing, skin.coarse_reach = float((high - low).max()) / COARSE_CELLS, REACH_M
+        with wp.ScopedDevice(self.device):
+            skin.corner_normal = wp.array(obj.corner_normals.reshape(-1, 3), dtype=wp.vec3)
+            skin.coarse = wp.zeros((0, 0, 0), dtype=wp.float32)
+            low, size = np.asarray(skin.low), np.subtract(skin.high, skin.low)
+            counts = [int(length / skin.spacing) + 2 for length in size]
+            nodes = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
+            points = low + skin.spacing * nodes + obj.centre_of_mass
+            coarse = self._query(points.reshape(-1, 3))[0].reshape(counts)
+            skin.coarse = wp.array(coarse, dtype=wp.float32)
+        return skin
 
     @cached_property
     def sample_spacing(self) -> float:
@@ -122,37 +137,49 @@ class Probe:
 
     def _query(self, points: Floats, reach: float = REACH_M) -> tuple[Floats, Floats, Floats]:
         count = len(points)
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(self.device):
             given = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             distance = wp.empty(count, dtype=wp.float32)
             closest = wp.empty(count, dtype=wp.vec3)
             normal = wp.empty(count, dtype=wp.vec3)
             wp.launch(
-                kernels.mesh_distance,
-                dim=count,
-                inputs=[
-                    self._mesh.id,
-                    int(not self.obj.watertight),
-                    self._corner_normals,
-                    self._low,
-                    self._high,
-                    self._coarse,
-                    self._spacing,
-                    REACH_M,
-                    reach,
-                    given,
-                ],
-                outputs=[distance, closest, normal],
-                device="cpu",
+                kernels.mesh_distance, count, inputs=[self.skin, reach, given], outputs=[distance, closest, normal]
             )
         place = closest.numpy().astype(float) + self.obj.centre_of_mass
         return distance.numpy().astype(float), place, normal.numpy().astype(float)
 
-    def posed_points(self, bodies: Floats, rows: NDArray[np.intp] | None = None) -> Floats:
-        """(B, N, 3) hand points, or those of `rows`, in the object frame for body poses (B, L, 7)."""
+    def body_gaps(self, hand_pose: Floats, joint_positions: Floats, *, reach: float = REACH_M) -> Floats:
+        """(P, L) least signed distance of each body's points from the object in P postures, at most `reach`; inf
+        where a body has none: as `signed_distance` of `posed_points` tells it, for many postures."""
+        posed, shape = (
+            PosedBodies.of(self.hand, hand_pose, joint_positions, self.device),
+            (len(hand_pose), self.hand.bodies),
+        )
+        with wp.ScopedDevice(self.device):
+            gap = wp.full(shape, np.inf, dtype=wp.float32)
+            inputs = [self.skin, self._of_bodies, self._origin, reach, posed.position, posed.rotation]
+            wp.launch(kernels.body_gaps, shape, inputs=inputs, outputs=[gap])
+        return gap.numpy().astype(float)
+
+    def body_depths(self, hand_pose: Floats, joint_positions: Floats) -> Floats:
+        """(P, L) as `self_depth`, for many postures."""
+        posed, shape = (
+            PosedBodies.of(self.hand, hand_pose, joint_positions, self.device),
+            (len(hand_pose), self.hand.bodies),
+        )
+        bodies, frames = [posed.position, posed.rotation], (len(hand_pose), len(self._piece_body))
+        with wp.ScopedDevice(self.device):
+            piece = [wp.empty(frames, dtype=wp.vec3), wp.empty(frames, dtype=wp.quat)]
+            inputs = [self.pieces, self._origin, *self._frames, *bodies]
+            wp.launch(kernels.place_pieces, frames, inputs=inputs, outputs=piece)
+            depth = wp.zeros(shape, dtype=wp.float32)
+            inputs = [self.pieces, self._of_bodies, self._origin, *bodies, *piece]
+            wp.launch(kernels.body_depths, shape, inputs=inputs, outputs=[depth])
+        return depth.numpy().astype(float)
+
+    def posed_points(self, bodies: Floats) -> Floats:
+        """(B, N, 3) hand points in the object frame for body poses (B, L, 7)."""
         body, position = self.points.body, self.points.position
-        if rows is not None:
-            body, position = body[rows], position[rows]
         return _turned(bodies, body, position) + bodies[:, body, :3]
 
     def touch(self, posture: Posture, *, reach: float = REACH_M) -> Touch:
@@ -199,28 +226,28 @@ class Probe:
 
     def self_depth(self, bodies: Floats, points: Floats) -> Floats:
         """(B, L) depth of each body in others whose contact counts, or of others in it [m]."""
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(self.device):
             own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)
             inputs = [*self._posed_pieces(bodies), self._body, own]
-            wp.launch(kernels.self_distance, points.shape[:2], inputs=inputs, outputs=[depth], device="cpu")
+            wp.launch(kernels.self_distance, points.shape[:2], inputs=inputs, outputs=[depth])
         return depth.numpy().astype(float)
 
     def _piece_distances(self, bodies: Floats) -> Floats:
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(self.device):
             least = wp.full((len(bodies), len(self._piece_body)), REACH_M, dtype=wp.float32)
             inputs = [*self._posed_pieces(bodies), REACH_M, self._samples]
             dim = (len(bodies), len(self.samples))
-            wp.launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least], device="cpu")
+            wp.launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least])
         return least.numpy().astype(float)
 
     def _posed_pieces(self, bodies: Floats) -> list[Any]:
         """The pieces with their positions and rotations, as the kernels take them."""
         frames = compose(bodies[:, self._piece_body], self._piece_frame[None])
-        with wp.ScopedDevice("cpu"):
+        with wp.ScopedDevice(self.device):
             position: Any = wp.array(frames[..., :3] - self.obj.centre_of_mass, dtype=wp.vec3)
             rotation: Any = wp.array(to_xyzw(frames[..., 3:]), dtype=wp.quat)
-        return [self._pieces, position, rotation]
+        return [self.pieces, position, rotation]
 
 
 def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
@@ -228,6 +255,23 @@ def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> 
     rotation = quat_to_matrix(bodies[..., 3:])
     turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], vectors)
     return turned
+
+
+def _by_body(points: SurfacePoints, bodies: int) -> Any:
+    """Points of a hand as `kernels.distance.BodyPoints`, on the present device."""
+    order = np.argsort(points.body, kind="stable")
+    first = np.searchsorted(points.body[order], np.arange(bodies + 1))
+    position, middle, extent = points.position[order], np.zeros((bodies, 3)), np.zeros(bodies)
+    for body in range(bodies):
+        mine = position[first[body] : first[body + 1]]
+        if len(mine):
+            middle[body] = (mine.min(axis=0) + mine.max(axis=0)) / 2
+            # A hair more than the farthest: kernels round.
+            extent[body] = np.linalg.norm(mine - middle[body], axis=1).max() + 1e-6
+    out = kernels.BodyPoints()
+    out.first, out.position = wp.array(first, dtype=wp.int32), wp.array(position, dtype=wp.vec3d)
+    out.middle, out.extent = wp.array(middle, dtype=wp.vec3d), wp.array(extent, dtype=wp.float32)
+    return out
 
 
 def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
@@ -238,16 +282,16 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
     return np.concatenate([middle, [1.0, 0, 0, 0]])
 
 
-_probes: LRUCache[tuple[str, str, int, int], Probe] = LRUCache(8)
+_probes: LRUCache[tuple[str, str, int, int, str], Probe] = LRUCache(8)
 _lock = threading.Lock()
 
 
-def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int) -> Probe:
+def probe_of(hand: HandModel, obj: ObjectModel, *, hand_points: int, object_points: int, device: str = "cpu") -> Probe:
     """The probe of a pair, from memory where it was used lately."""
-    key = (hand.content, obj.content, hand_points, object_points)
+    key = (hand.content, obj.content, hand_points, object_points, device)
     with _lock:
         probe = _probes.get(key)
         if probe is None:
-            probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points)
+            probe = Probe(hand, obj, hand_points=hand_points, object_points=object_points, device=device)
             _probes[key] = probe
         return probe

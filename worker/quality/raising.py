@@ -31,22 +31,26 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -
     """Pregrasps (N) whose root went against gravity by what the hand lacks of its room on the straight way from there
     to the grasp; those that lack nothing, or too much, are as they were."""
     poses = np.array(pregrasp.hand_pose, float)
-    for number, scene in enumerate(placed.scenes):
-        rows = np.flatnonzero(placed.index == number)
-        if not len(rows) or all(one.tips_m is None for one in scene.obstacles):
-            continue
-        lack = np.stack([_lack(hand, grasp.take(rows), pregrasp.take(rows), placed, number, t) for t in LOOKS])
-        # What the root is raised by at first is less and less on the way.
-        height = (lack / (1 - np.array(LOOKS))[:, None]).max(axis=0)
-        height = np.where(height <= HIGHEST_M, height, 0.0)
-        poses[rows, :3] += height[:, None] * scene.up
+    near = np.array([any(one.tips_m is not None for one in scene.obstacles) for scene in placed.scenes], bool)
+    rows = np.flatnonzero(near[placed.index])
+    if not len(rows):
+        return pregrasp
+    lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
+    # What the root is raised by at first is less and less on the way.
+    height = (lack / (1 - np.array(LOOKS))).max(axis=1)
+    height = np.where(height <= HIGHEST_M, height, 0.0)
+    up = np.array([scene.up for scene in placed.scenes])[placed.index[rows]]
+    poses[rows, :3] += height[:, None] * up
     return Posture(poses, pregrasp.joint_positions)
 
 
-def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed, scene: int, share: float) -> Floats:
-    """(n,) what hands lack of their room at a share of their way."""
-    pose = (1 - share) * pregrasp.hand_pose + share * grasp.hand_pose
-    pose[:, 3:] = pregrasp.hand_pose[:, 3:]  # a pregrasp is never turned against its grasp
-    joints = (1 - share) * pregrasp.joint_positions + share * grasp.joint_positions
-    room = obstacle_room(hand, Posture(pose, joints), placed.scenes[scene])
-    return np.maximum(0.0, (CLOSING_M if share else OPEN_M) - room)
+def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: Placed) -> Floats:
+    """(n, looks) what hands lack of their room at the shares `LOOKS` of their way."""
+    share = np.array(LOOKS)[None, :, None]
+    pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
+    pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp is never turned against its grasp
+    joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
+    postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
+    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(LOOKS)))
+    wanted = np.where(np.array(LOOKS) > 0, CLOSING_M, OPEN_M)
+    return np.maximum(0.0, wanted - room.reshape(len(grasp), -1))

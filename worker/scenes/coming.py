@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from service.model.transforms import quat_rotate
 from worker.grasps import Posture
-from worker.hands.kinematics import body_poses
 from worker.quality.contact import finger_of_body
 from worker.quality.probe import Probe
 from worker.scenes.clearance import MARGIN_M
@@ -23,6 +22,8 @@ Floats = NDArray[np.float64]
 #: looked at, and where the object's convex pieces stand out, it is nearer.
 OBJECT_MARGIN_M: Final = 0.001
 OBJECT_WANTED_M: Final = 0.004
+#: By this much the hand may come nearer to the object than its pregrasp is [m].
+NEARER_M: Final = 5e-4
 #: Postures stored on the approach, the standoff first, the pregrasp last; so many are looked at between two, and
 #: while the hand then closes to the pregrasp.
 WAYPOINTS: Final = 6
@@ -76,17 +77,17 @@ def _seen(probe: Probe, pregrasp: Posture, opened: Floats, way: Floats, scene: S
     share = np.concatenate([np.zeros(looks), np.arange(1, _CLOSING + 1) / _CLOSING])
     joints = opened[:, None] + share[:, None] * (pregrasp.joint_positions - opened)[:, None]
     postures = Posture(poses.reshape(-1, 7), joints.reshape(len(share) * count, -1))
-    bodies = body_poses(probe.hand, postures.hand_pose, postures.joint_positions)
     coming = np.tile(share == 0, count)
-    room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), scene).reshape(count, looks)
-    points = probe.posed_points(bodies)
-    gap = probe.signed_distance(points.reshape(-1, 3))[0].reshape(count, len(share), -1)
-    fingers = finger_of_body(probe.hand)[probe.points.body] >= 0
+    room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), [scene]).reshape(count, looks)
+    # What is farther than this counts alike.
+    reach = OBJECT_WANTED_M + 2 * NEARER_M
+    gap = probe.body_gaps(postures.hand_pose, postures.joint_positions, reach=reach).reshape(count, len(share), -1)
+    fingers = finger_of_body(probe.hand) >= 0
     least = np.full(count, np.inf)
     for part in (fingers, ~fingers):
         if part.any():
             near = gap[..., part].min(axis=2)
             # The pregrasp itself may stand nearer than wanted: coming must not be nearer than it is.
-            short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - 5e-4)
+            short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - NEARER_M)
             least = np.minimum(least, OBJECT_WANTED_M + short)
     return room.min(axis=1), least

@@ -83,10 +83,10 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         if not len(rows):
             continue
         mine = grasps.take(rows)
-        between = obstacle_room(hand, approach(mine.grasp, mine.pregrasp), scene).reshape(len(rows), -1)
+        between = obstacle_room(hand, approach(mine.grasp, mine.pregrasp), [scene]).reshape(len(rows), -1)
         path[rows], came[rows], coming[rows], touching[rows] = come_open(probe, mine.pregrasp, wide[rows], scene)
         opened = Posture(mine.pregrasp.hand_pose, came[rows])
-        before = obstacle_room(hand, approach(mine.pregrasp, opened), scene).reshape(len(rows), -1)
+        before = obstacle_room(hand, approach(mine.pregrasp, opened), [scene]).reshape(len(rows), -1)
         contact[rows], closing[rows] = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
         rise = RISE_M * scene.up
         raised[rows, :3] += rise
@@ -94,7 +94,7 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
         lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise
         joints = np.repeat(mine.grasp.joint_positions, WAYPOINTS, axis=0)
         lifting[rows] = (
-            obstacle_room(hand, Posture(lifted.reshape(-1, 7), joints), scene).reshape(len(rows), -1).min(axis=1)
+            obstacle_room(hand, Posture(lifted.reshape(-1, 7), joints), [scene]).reshape(len(rows), -1).min(axis=1)
         )
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
     return Way(path, came, lift, contact, closing, coming, lifting, touching)
@@ -162,7 +162,7 @@ def _coming(
         poses[..., :3] += np.linspace(STANDOFF_M, 0.0, looks)[:, None] * way[:, None]
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
-        room = obstacle_room(probe.hand, postures, scene).reshape(len(open_), looks).min(axis=1)
+        room = obstacle_room(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
         gap = _gaps(probe, postures).reshape(len(open_), looks)
         # The pregrasp itself may stand nearer than the margin: coming must not be nearer than it is.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,8 +17,10 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.simulation.device import DeviceHand, to_xyzw
+from worker.simulation.kernels import chain as chain_kernels
 from worker.simulation.kernels import obstacles as kernels
 from worker.simulation.kernels import solids as solid_kernels
+from worker.simulation.posed import PosedBodies
 from worker.simulation.surroundings import CLEAR_M, Obstacle, Surroundings
 
 Floats = NDArray[np.float64]
@@ -65,16 +67,8 @@ def body_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> F
     Against half-spaces it is exact, and against solids that the hand is apart from, but for links that are hulls near
     an edge or a corner: there it is a lower bound. Farther than `FAR_M` from a solid counts as that.
     """
-    posed = PosedFeatures.of(hand, postures)
-    least = np.full((len(posed.centre), len(hand.features)), np.inf)
-    for obstacle in scene.obstacles:
-        if not len(obstacle.corners):
-            least = np.minimum(least, posed.distance(obstacle))
-    out = np.full((len(least), hand.bodies), np.inf)
-    for body in np.unique(hand.features.body):
-        out[:, body] = least[:, hand.features.body == body].min(axis=1)
-    solids = tuple(o for o in scene.obstacles if len(o.corners))
-    return np.minimum(out, _solid_distances(hand, postures, Surroundings(solids, scene.up))) if solids else out
+    alike = Surroundings(tuple(replace(o, tips_m=None) for o in scene.obstacles), scene.up)
+    return body_room(hand, postures, [alike])
 
 
 def _solid_distances(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
@@ -112,21 +106,51 @@ def obstacle_distances(hand: HandModel, postures: Posture, scene: Surroundings) 
     return np.asarray(body_distances(hand, postures, scene).min(axis=1))
 
 
-def body_room(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
-    """(P, L) as `body_distances`, but fingertips count as farther from supports that they may come near: by what makes
-    `CLEAR_M` of the distance that they are to keep [m]. So a hand is clear where nothing of it is below `CLEAR_M`."""
+def body_room(
+    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]] | None = None
+) -> Floats:
+    """(P, L) as `body_distances`, in the scene `which` (P,) of each posture or else in the first, but fingertips count
+    as farther from supports that they may come near: by what makes `CLEAR_M` of the distance that they are to keep [m].
+    So a hand is clear where nothing of it is below `CLEAR_M`."""
+    which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
+    out = _half_space_room(hand, postures, scenes, which)
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
-    out = np.full((len(postures), hand.bodies), np.inf)
-    for tips_m in sorted({o.tips_m for o in scene.obstacles}, key=lambda value: (value is None, value or 0.0)):
-        alike = Surroundings(tuple(o for o in scene.obstacles if o.tips_m == tips_m), scene.up)
-        more = 0.0 if tips_m is None else CLEAR_M - tips_m
-        out = np.minimum(out, body_distances(hand, postures, alike) + more * tips)
+    for number, scene in enumerate(scenes):
+        solids = [o for o in scene.obstacles if len(o.corners)]
+        rows = np.flatnonzero(which == number) if solids else np.zeros(0, np.intp)
+        for more in sorted({_more(o) for o in solids} if len(rows) else ()):
+            alike = Surroundings(tuple(o for o in solids if _more(o) == more), scene.up)
+            out[rows] = np.minimum(out[rows], _solid_distances(hand, postures.take(rows), alike) + more * tips)
     return out
 
 
-def obstacle_room(hand: HandModel, postures: Posture, scene: Surroundings) -> Floats:
+def _more(obstacle: Obstacle) -> float:
+    """By what fingertips count as farther from an obstacle [m]."""
+    return 0.0 if obstacle.tips_m is None else CLEAR_M - obstacle.tips_m
+
+
+def _half_space_room(
+    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.int32]
+) -> Floats:
+    """(P, L) as `body_room`, of the half-spaces alone."""
+    every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
+    flat, count = [o for one in every for o in one], len(postures)
+    posed, spaces = PosedBodies.of(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
+    with wp.ScopedDevice("cpu"):
+        spaces.first = wp.array(_starts([len(one) for one in every]), dtype=wp.int32)
+        spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
+        spaces.more = wp.array([_more(o) for o in flat], dtype=wp.float64)
+        room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
+        inputs = [posed.chain, spaces, wp.array(which, dtype=wp.int32), posed.position, posed.rotation]
+        wp.launch(chain_kernels.rooms, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
+    return np.asarray(room.numpy())
+
+
+def obstacle_room(
+    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]] | None = None
+) -> Floats:
     """(P,) least of the `body_room` of each posture [m]."""
-    return np.asarray(body_room(hand, postures, scene).min(axis=1))
+    return np.asarray(body_room(hand, postures, scenes, which).min(axis=1))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.simulation.obstacles import body_distances, body_room, obstacle_distances, obstacle_room
+from worker.simulation.obstacles import PosedFeatures, body_distances, body_room, obstacle_distances, obstacle_room
 from worker.simulation.surroundings import CLEAR_M, Obstacle, Placed, Surroundings
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4]) / [1, 1, 1, 1, 1, 1, 1]
@@ -91,11 +91,29 @@ def test_fingertips_have_more_room_over_what_they_may_touch_and_nothing_else_has
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
     alone, beside = (body_distances(hand, posture, Surroundings((one,), up))[0] for one in (table, wall))
     to_touch = replace(table, tips_m=-0.0005)
-    found = body_room(hand, posture, Surroundings((to_touch, wall), up))[0]
+    found = body_room(hand, posture, [Surroundings((to_touch, wall), up)])[0]
     np.testing.assert_array_equal(found, np.minimum(alone + np.where(tips, 0.0025, 0.0), beside))
-    assert obstacle_room(hand, posture, Surroundings((to_touch, wall), up))[0] == found.min()
+    assert obstacle_room(hand, posture, [Surroundings((to_touch, wall), up)])[0] == found.min()
     pose = np.array([0.1, 0, 0, 0.6, 0, 0.8, 0])
     assert to_touch.seen_from(pose).tips_m == -0.0005, "a support keeps what it says wherever it is seen from"
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
+def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
+    """Against NumPy's features; both in double precision."""
+    hand, rng = hand_from_path(name), np.random.default_rng(4)
+    turned = rng.normal(size=(9, 4))
+    pose = np.column_stack([rng.normal(size=(9, 3)) * 0.1, turned / np.linalg.norm(turned, axis=1, keepdims=True)])
+    postures = Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (9, hand.dofs))))
+    one, other = Obstacle.half_space([0.3, -0.5, 0.8], -0.1), Obstacle.half_space([0, 1, 0], 0.05)
+    up, which = np.array([0.0, 0, 1]), np.arange(9) % 3
+    scenes = [Surroundings((one,), up), Surroundings((one, other), up), Surroundings((), up)]
+    posed = PosedFeatures.of(hand, postures)
+    wanted = np.full(9, np.inf)
+    for number, around in enumerate([[one], [one, other], []]):
+        for obstacle in around:
+            wanted[which == number] = np.minimum(wanted, posed.distance(obstacle).min(axis=1))[which == number]
+    np.testing.assert_allclose(obstacle_room(hand, postures, scenes, which), wanted, atol=1e-12)
 
 
 def parted(hand: HandModel) -> tuple[HandModel, HandModel]:

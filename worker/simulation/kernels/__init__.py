@@ -29,6 +29,7 @@ MODULES: Final = (
     "projection",
     "obstacles",
     "solids",
+    "chain",
 )
 _lock = threading.Lock()
 

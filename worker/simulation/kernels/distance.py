@@ -18,72 +18,71 @@ BLEND = wp.constant(2.0e-4)
 ROUNDING = wp.constant(1.0e-6)
 
 
-@wp.kernel
-def mesh_distance(
-    # Model:
-    mesh_in: wp.uint64,
-    winding_in: wp.int32,
-    corner_normal_in: wp.array(dtype=wp.vec3),
-    low_in: wp.vec3,
-    high_in: wp.vec3,
-    coarse_in: wp.array3d(dtype=wp.float32),
-    spacing_in: wp.float32,
-    coarse_reach_in: wp.float32,
-    # In:
-    reach_in: wp.float32,
-    point_in: wp.array(dtype=wp.vec3),
-    # Out:
-    distance_out: wp.array(dtype=wp.float32),
-    closest_out: wp.array(dtype=wp.vec3),
-    normal_out: wp.array(dtype=wp.vec3),
-):
-    """Signed distance, closest point and the distance's gradient, an outward unit normal. Launch over points.
+@wp.struct
+class Skin:
+    """An object's surface, about its centre of mass."""
+
+    mesh: wp.uint64
+    winding: wp.int32  # 1: open, the sign is that of the winding number
+    corner_normal: wp.array(dtype=wp.vec3)  # (3 F,)
+    low: wp.vec3  # box around the object
+    high: wp.vec3
+    coarse: wp.array3d(dtype=wp.float32)  # distances at nodes, the first one at `low`; empty: not known
+    spacing: wp.float32
+    coarse_reach: wp.float32  # distances of `coarse` from here on are not exact [m]
+
+
+@wp.struct
+class Nearest:
+    """What is nearest to a point."""
+
+    distance: wp.float32
+    closest: wp.vec3
+    normal: wp.vec3  # gradient of the distance, unit; 0: beyond reach
+
+
+@wp.func
+def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
+    """Signed distance, closest point and the distance's gradient, an outward unit normal.
 
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
-    The sign is ray parity, or the winding number where `winding` is 1 (open meshes): both are right near creases.
-    `coarse` has the distance at nodes `spacing` apart, the first one at `low`, at least `coarse_reach` where it is not
-    exact; empty: not known. Between a node and a point the distance changes at most by the way between them: what is
-    beyond reach by that is looked up no further, no face is looked for beyond it, and no sign where it cannot change.
+    The sign is ray parity, or the winding number for open meshes: both are right near creases. Between a node of
+    `coarse` and a point the distance changes at most by the way between them: what is beyond reach by that is looked up
+    no further, no face is looked for beyond it, and no sign where it cannot change.
     """
-    i = wp.tid()
-    p = point_in[i]
-    distance_out[i] = reach_in
-    closest_out[i] = p
-    normal_out[i] = wp.vec3(0.0)
+    out = Nearest()
+    out.distance = reach
+    out.closest = p
+    out.normal = wp.vec3(0.0)
+    low = skin.low
+    high = skin.high
     # The box encloses the object, so inside it the diagonal bounds the distance: no deep point is ever missed.
-    inside = (
-        p[0] > low_in[0]
-        and p[1] > low_in[1]
-        and p[2] > low_in[2]
-        and p[0] < high_in[0]
-        and p[1] < high_in[1]
-        and p[2] < high_in[2]
-    )
+    inside = p[0] > low[0] and p[1] > low[1] and p[2] > low[2] and p[0] < high[0] and p[1] < high[1] and p[2] < high[2]
     known = float(0.0)
-    within = reach_in
+    within = reach
     if inside:
-        within = wp.length(high_in - low_in)
-    if inside and coarse_in.shape[0] > 0:
-        at = (p - low_in) / spacing_in
-        x = wp.min(int(at[0] + 0.5), coarse_in.shape[0] - 1)
-        y = wp.min(int(at[1] + 0.5), coarse_in.shape[1] - 1)
-        z = wp.min(int(at[2] + 0.5), coarse_in.shape[2] - 1)
-        way = wp.length(p - (low_in + spacing_in * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
-        coarse = coarse_in[x, y, z]
-        if coarse - way > reach_in:
-            return
+        within = wp.length(high - low)
+    if inside and skin.coarse.shape[0] > 0:
+        at = (p - low) / skin.spacing
+        x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
+        y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
+        z = wp.min(int(at[2] + 0.5), skin.coarse.shape[2] - 1)
+        way = wp.length(p - (low + skin.spacing * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
+        coarse = skin.coarse[x, y, z]
+        if coarse - way > reach:
+            return out
         if wp.abs(coarse) > way:
             known = wp.sign(coarse)
-        if coarse < coarse_reach_in:
+        if coarse < skin.coarse_reach:
             within = wp.min(within, wp.abs(coarse) + way)
     if not inside or known != 0.0:
-        query = wp.mesh_query_point_no_sign(mesh_in, p, within)
-    elif winding_in == 1:
-        query = wp.mesh_query_point_sign_winding_number(mesh_in, p, within)
+        query = wp.mesh_query_point_no_sign(skin.mesh, p, within)
+    elif skin.winding == 1:
+        query = wp.mesh_query_point_sign_winding_number(skin.mesh, p, within)
     else:
-        query = wp.mesh_query_point(mesh_in, p, within)
+        query = wp.mesh_query_point(skin.mesh, p, within)
     if query.result:
-        closest = wp.mesh_eval_position(mesh_in, query.face, query.u, query.v)
+        closest = wp.mesh_eval_position(skin.mesh, query.face, query.u, query.v)
         sign = float(1.0)
         if known != 0.0:
             sign = known
@@ -93,19 +92,40 @@ def mesh_distance(
         u = query.u
         v = query.v
         face = query.face
-        distance_out[i] = sign * gap
-        closest_out[i] = closest
+        out.distance = sign * gap
+        out.closest = closest
         smooth = wp.normalize(
-            u * corner_normal_in[3 * face]
-            + v * corner_normal_in[3 * face + 1]
-            + (1.0 - u - v) * corner_normal_in[3 * face + 2]
+            u * skin.corner_normal[3 * face]
+            + v * skin.corner_normal[3 * face + 1]
+            + (1.0 - u - v) * skin.corner_normal[3 * face + 2]
         )
         # Beside an edge the face's normal says nothing about how a body touches it; the direction to the edge does.
         share = wp.min(gap / BLEND, 1.0)
         direction = (1.0 - share) * smooth
         if gap > 1.0e-9:
             direction = direction + (share * sign / gap) * (p - closest)
-        normal_out[i] = wp.normalize(direction)
+        out.normal = wp.normalize(direction)
+    return out
+
+
+@wp.kernel
+def mesh_distance(
+    # Model:
+    skin_in: Skin,
+    # In:
+    reach_in: wp.float32,
+    point_in: wp.array(dtype=wp.vec3),
+    # Out:
+    distance_out: wp.array(dtype=wp.float32),
+    closest_out: wp.array(dtype=wp.vec3),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    """`nearest` of points. Launch over them."""
+    i = wp.tid()
+    found = nearest(skin_in, point_in[i], reach_in)
+    distance_out[i] = found.distance
+    closest_out[i] = found.closest
+    normal_out[i] = found.normal
 
 
 @wp.kernel
@@ -157,3 +177,124 @@ def self_distance(
                 if nd[3] < 0.0:
                     wp.atomic_max(depth_inout, b, body_in[i], -nd[3])
                     wp.atomic_max(depth_inout, b, pieces_in.body[piece], -nd[3])
+
+
+@wp.func
+def known_beyond(skin: Skin, p: wp.vec3, reach: wp.float32):
+    """Whether the grid tells that p, a point within it, is farther than this from the surface [m]."""
+    at = (p - skin.low) / skin.spacing
+    x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
+    y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
+    z = wp.min(int(at[2] + 0.5), skin.coarse.shape[2] - 1)
+    way = wp.length(p - (skin.low + skin.spacing * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
+    return skin.coarse[x, y, z] - way > reach
+
+
+@wp.struct
+class BodyPoints:
+    """Points of a hand in the order of its bodies."""
+
+    first: wp.array(dtype=wp.int32)  # (L + 1,)
+    position: wp.array(dtype=wp.vec3d)  # body frame
+    middle: wp.array(dtype=wp.vec3d)  # (L,) of a ball around a body's points
+    extent: wp.array(dtype=wp.float32)  # (L,) radius of it
+
+
+@wp.func
+def placed_at(origin: wp.vec3d, place: wp.vec3d, turned: wp.quatd, point: wp.vec3d):
+    """A body's point [m] from `origin`, as kernels have it."""
+    x = place + wp.quat_rotate(turned, point) - origin
+    return wp.vec3(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
+
+
+@wp.kernel
+def body_gaps(
+    # Model:
+    skin_in: Skin,
+    points_in: BodyPoints,
+    origin_in: wp.vec3d,
+    # In:
+    reach_in: wp.float32,
+    body_p_in: wp.array2d(dtype=wp.vec3d),
+    body_q_in: wp.array2d(dtype=wp.quatd),
+    # Out:
+    gap_inout: wp.array2d(dtype=wp.float32),
+):
+    """Lower `gap_inout` (P, L) to the least signed distance of each body's points from the object, of bodies that have
+    any at most `reach`. Launch over (P, L)."""
+    p, body = wp.tid()
+    if points_in.first[body] == points_in.first[body + 1]:
+        return
+    place, turned = body_p_in[p, body], body_q_in[p, body]
+    least = wp.min(gap_inout[p, body], reach_in)
+    gap_inout[p, body] = least
+    middle = placed_at(origin_in, place, turned, points_in.middle[body])
+    beyond = wp.max(skin_in.low - middle, middle - skin_in.high)
+    outside = wp.length(wp.max(beyond, wp.vec3(0.0)))
+    if outside > points_in.extent[body] and reach_in <= skin_in.coarse_reach:
+        return
+    if outside == 0.0 and known_beyond(skin_in, middle, reach_in + points_in.extent[body]):
+        return
+    for i in range(points_in.first[body], points_in.first[body + 1]):
+        x = placed_at(origin_in, place, turned, points_in.position[i])
+        least = wp.min(least, nearest(skin_in, x, reach_in).distance)
+    gap_inout[p, body] = least
+
+
+@wp.kernel
+def place_pieces(
+    # Model:
+    pieces_in: Pieces,
+    origin_in: wp.vec3d,
+    frame_p_in: wp.array(dtype=wp.vec3d),
+    frame_q_in: wp.array(dtype=wp.quatd),
+    # In:
+    body_p_in: wp.array2d(dtype=wp.vec3d),
+    body_q_in: wp.array2d(dtype=wp.quatd),
+    # Out:
+    piece_p_out: wp.array2d(dtype=wp.vec3),
+    piece_q_out: wp.array2d(dtype=wp.quat),
+):
+    """Frames of the pieces from those of the bodies. Launch over (B, pieces)."""
+    b, piece = wp.tid()
+    body = pieces_in.body[piece]
+    piece_p_out[b, piece] = placed_at(origin_in, body_p_in[b, body], body_q_in[b, body], frame_p_in[piece])
+    q = body_q_in[b, body] * frame_q_in[piece]
+    piece_q_out[b, piece] = wp.quat(wp.float32(q[0]), wp.float32(q[1]), wp.float32(q[2]), wp.float32(q[3]))
+
+
+@wp.kernel
+def body_depths(
+    # Model:
+    pieces_in: Pieces,
+    points_in: BodyPoints,
+    origin_in: wp.vec3d,
+    # In:
+    body_p_in: wp.array2d(dtype=wp.vec3d),
+    body_q_in: wp.array2d(dtype=wp.quatd),
+    piece_p_in: wp.array2d(dtype=wp.vec3),
+    piece_q_in: wp.array2d(dtype=wp.quat),
+    # Out:
+    depth_inout: wp.array2d(dtype=wp.float32),
+):
+    """As `self_distance`, from the poses of the bodies on. Launch over (B, L)."""
+    b, body = wp.tid()
+    if points_in.first[body] == points_in.first[body + 1]:
+        return
+    place, turned = body_p_in[b, body], body_q_in[b, body]
+    middle = placed_at(origin_in, place, turned, points_in.middle[body])
+    for piece in range(pieces_in.body.shape[0]):
+        if pieces_in.apart[body, pieces_in.body[piece]] == 1:
+            centre = piece_p_in[b, piece]
+            bound = wp.length(pieces_in.half[piece])
+            about = bound + points_in.extent[body]
+            if wp.length_sq(middle - centre) < about * about:
+                deepest = float(0.0)
+                for i in range(points_in.first[body], points_in.first[body + 1]):
+                    offset = placed_at(origin_in, place, turned, points_in.position[i]) - centre
+                    if wp.dot(offset, offset) < bound * bound:
+                        nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(piece_q_in[b, piece], offset))
+                        deepest = wp.max(deepest, -nd[3])
+                if deepest > 0.0:
+                    wp.atomic_max(depth_inout, b, body, deepest)
+                    wp.atomic_max(depth_inout, b, pieces_in.body[piece], deepest)
