@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from service.model.transforms import quat_rotate
 from worker.grasps import Posture
+from worker.hands.features import HandFeatures
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.simulation.device import DeviceHand, to_xyzw
@@ -130,7 +131,7 @@ def _more(obstacle: Obstacle) -> float:
 
 
 def _half_space_room(
-    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.int32]
+    hand: HandModel, postures: Posture, scenes: Sequence[Surroundings], which: NDArray[np.integer[Any]]
 ) -> Floats:
     """(P, L) as `body_room`, of the half-spaces alone."""
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
@@ -159,8 +160,6 @@ class DeviceObstacles:
 
     features: Any
     solids: Any
-    count: int
-    """Features."""
     any_solid: bool
     """Whether an obstacle is no half-space."""
 
@@ -200,6 +199,9 @@ class DeviceObstacles:
             features.weight = wp.ones(len(found), dtype=wp.float32)
             features.tip = wp.array(np.isin(found.body, hand.fingertips), dtype=wp.int32)
             features.first = wp.array(found.first, dtype=wp.int32)
+            balls = [_feature_ball(found, k) for k in range(len(found.first) - 1)]
+            features.middle = wp.array(np.array([ball[0] for ball in balls]).reshape(-1, 3), dtype=wp.vec3)
+            features.extent = wp.array([ball[1] for ball in balls], dtype=wp.float32)
             features.first_edge = wp.array(found.first_edge, dtype=wp.int32)
             features.start = wp.array(found.edges[:, 0], dtype=wp.vec3)
             features.end = wp.array(found.edges[:, 1], dtype=wp.vec3)
@@ -217,11 +219,19 @@ class DeviceObstacles:
             edges = np.concatenate([np.zeros((0, 2, 3)), *(o.corners[o.edges] for o in obstacles)]) - centre
             solids.first_edge = wp.array(_starts([len(o.edges) for o in obstacles]), dtype=wp.int32)
             solids.start, solids.end = (wp.array(edges[:, k], dtype=wp.vec3) for k in (0, 1))
-        return cls(features, solids, len(found), any(len(o.corners) for o in obstacles))
+        return cls(features, solids, any(len(o.corners) for o in obstacles))
 
 
 def _starts(lengths: Sequence[int]) -> NDArray[np.int32]:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+
+
+def _feature_ball(features: HandFeatures, piece: int) -> tuple[Floats, float]:
+    """Middle, body frame, and radius [m] of a ball that the features of a piece do not leave."""
+    rows = slice(features.first[piece], features.first[piece + 1])
+    middle, radius = _sphere(features.centre[rows])
+    # A hair more: kernels round.
+    return middle, radius + float(features.radius[rows].max(initial=0.0)) + 1e-6
 
 
 def _sphere(corners: Floats) -> tuple[Floats, float]:

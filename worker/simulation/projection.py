@@ -147,7 +147,7 @@ class Projection:
         )  # fmt: skip
         if m.obstacles is not None:
             wp.launch(
-                obstacles.residuals, (d.capacity, m.obstacles.count),
+                obstacles.residuals, (d.capacity, m.pieces),
                 inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, *pose, o.obstacle_near,
                         o.obstacle_target],
                 outputs=[r], device=m.device,

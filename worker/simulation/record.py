@@ -126,7 +126,7 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
     if m.obstacles is not None:
         out.add(obstacles.clear, d.capacity, inputs=[d.active], outputs=[d.depths.obstacles])
         out.add(
-            obstacles.penalty, (d.capacity, m.obstacles.count),
+            obstacles.penalty, (d.capacity, m.pieces),
             inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, d.iteration, d.schedule.penetration,
                     d.body_p, d.body_q, room],
             outputs=[*wrench, d.depths.obstacles],

@@ -26,6 +26,8 @@ class Features:
     weight: wp.array(dtype=wp.float32)
     tip: wp.array(dtype=wp.int32)  # 1: of a fingertip
     first: wp.array(dtype=wp.int32)  # (P + 1,) features of a piece
+    middle: wp.array(dtype=wp.vec3)  # (P,) of a ball around what features of a piece reach, body frame
+    extent: wp.array(dtype=wp.float32)  # (P,) its radius [m]
     first_edge: wp.array(dtype=wp.int32)  # (P + 1,)
     start: wp.array(dtype=wp.vec3)  # (E,) ends of an edge, body frame
     end: wp.array(dtype=wp.vec3)
@@ -118,6 +120,27 @@ def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, roo
     return out
 
 
+@wp.func
+def may_meet(
+    features: Features, obstacles: Obstacles, piece: wp.int32, scene: wp.int32, b: wp.int32, more: wp.float32,
+    room: wp.float32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat),
+):  # fmt: skip
+    """Whether a piece's ball is nearer to a half-space of its scene than what it keeps and `more`."""
+    if features.first[piece] == features.first[piece + 1]:
+        return False
+    i = features.first[piece]
+    body = features.body[i]
+    middle = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.middle[piece])
+    for k in range(obstacles.first[scene], obstacles.first_solid[scene]):
+        beyond = float(-1.0e9)
+        for p in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
+            plane = obstacles.planes[p]
+            beyond = wp.max(beyond, wp.dot(wp.vec3(plane[0], plane[1], plane[2]), middle) - plane[3])
+        if beyond - features.extent[piece] < kept(features, obstacles, i, k, room) + more:
+            return True
+    return False
+
+
 @wp.kernel
 def clear(
     # Data in:
@@ -150,22 +173,25 @@ def penalty(
     torque_inout: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Half-spaces: gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, F)."""
-    b, i = wp.tid()
+    """Half-spaces: gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, P)."""
+    b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
-    f = posed(features_in, i, b, body_p_in, body_q_in)
-    weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
-    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
-        nd = obstacle_distance(obstacles_in, k, f)
-        short = nd[3] - kept(features_in, obstacles_in, i, k, room_in)
-        if short < 0.0:
-            n = wp.vec3(nd[0], nd[1], nd[2])
-            if weight != 0.0:
-                force = (weight * short) * n
-                wp.atomic_add(force_inout, b, f.body, force)
-                wp.atomic_add(torque_inout, b, f.body, wp.cross(lowest_point(f, n), force))
-            wp.atomic_max(depth_inout, b, -short)
+    if not may_meet(features_in, obstacles_in, piece, scene_in[b], b, 0.0, room_in, body_p_in, body_q_in):
+        return
+    for i in range(features_in.first[piece], features_in.first[piece + 1]):
+        f = posed(features_in, i, b, body_p_in, body_q_in)
+        weight = 2.0 * weight_in[iteration_in[0]] * features_in.weight[i]
+        for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
+            nd = obstacle_distance(obstacles_in, k, f)
+            short = nd[3] - kept(features_in, obstacles_in, i, k, room_in)
+            if short < 0.0:
+                n = wp.vec3(nd[0], nd[1], nd[2])
+                if weight != 0.0:
+                    force = (weight * short) * n
+                    wp.atomic_add(force_inout, b, f.body, force)
+                    wp.atomic_add(torque_inout, b, f.body, wp.cross(lowest_point(f, n), force))
+                wp.atomic_max(depth_inout, b, -short)
 
 
 @wp.kernel
@@ -184,14 +210,17 @@ def residuals(
     # Out:
     residuals_out: Residuals,
 ):
-    """Features nearer to a half-space than margin + near go to margin + target. Over (B, F)."""
-    b, i = wp.tid()
+    """Features nearer to a half-space than margin + near go to margin + target. Over (B, P)."""
+    b, piece = wp.tid()
     if active_in[b] == 0 or scene_in[b] < 0:
         return
-    f = posed(features_in, i, b, body_p_in, body_q_in)
-    for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
-        nd = obstacle_distance(obstacles_in, k, f)
-        margin = kept(features_in, obstacles_in, i, k, 0.0)
-        if nd[3] < margin + near_in:
-            n = wp.vec3(nd[0], nd[1], nd[2])
-            emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, nd[3] - margin - target_in, 1.0)
+    if not may_meet(features_in, obstacles_in, piece, scene_in[b], b, near_in, 0.0, body_p_in, body_q_in):
+        return
+    for i in range(features_in.first[piece], features_in.first[piece + 1]):
+        f = posed(features_in, i, b, body_p_in, body_q_in)
+        for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
+            nd = obstacle_distance(obstacles_in, k, f)
+            margin = kept(features_in, obstacles_in, i, k, 0.0)
+            if nd[3] < margin + near_in:
+                n = wp.vec3(nd[0], nd[1], nd[2])
+                emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, nd[3] - margin - target_in, 1.0)
