@@ -1,0 +1,181 @@
+"""How often the first judge says what the certificate says, and how many grasps it judges a second.
+
+usage: python benchmarks/first_judge.py DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
+           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/first-judge]
+DATA_DIR holds hands/ and objects/. The first judge and the certificate judge the same raw grasps; agreement is that of
+the first judge's clear verdicts. `--speed N` times N grasps (those of the first cell of each hand, moved at random by
+up to a tenth of a millimetre) in pools of `--worlds`. Prints Markdown; `--out` gets .json and .md. Stopped
+runs go on (see cells.py); the first judge's own verdicts are made anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cells import HANDS, Cell, cells, write_json
+
+from worker.engines.devices import Device, cpu_name
+from worker.engines.mujoco_warp import mujoco_warp
+from worker.grasps import GraspSet, Posture
+from worker.quality.intervals import wilson
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.first.trials import FirstTrials
+from worker.quality.referee.first.worlds import WorldPool
+from worker.quality.referee.model import MujocoOptions, build
+
+OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")
+#: Largest shift of a grasp that is judged again for its time [m].
+JITTER_M = 1e-4
+
+
+def pool_of(cell: Cell, device: str, worlds: int) -> WorldPool:
+    return WorldPool(build(cell.hand, cell.obj, decompose(cell.obj), MujocoOptions()), device, worlds)
+
+
+def agreement(cell: Cell, device: str) -> dict[str, Any]:
+    """What the first judge says of a cell's grasps beside what the certificate says."""
+    certificate = cell.verdicts("certificate", False)
+    grasps, held = cell.grasps, np.array(certificate["success"]) == 1
+    cpu = time.process_time()
+    found = pool_of(cell, device, len(grasps)).judge(grasps)
+    cpu = time.process_time() - cpu
+    holds, fails = found.clearly_held, found.clearly_failed
+    return {
+        "hand": cell.hand_name,
+        "object": cell.object_name,
+        "n": len(grasps),
+        "held": int(held.sum()),
+        "same": int((found.held == held).sum()),
+        "clear_holds": int(holds.sum()),
+        "clear_failures": int(fails.sum()),
+        "false_accepts": int((holds & ~held).sum()),
+        "false_refusals": int((fails & held).sum()),
+        "overflows": int(found.overflow.sum()),
+        "ticks": int(found.ticks.sum()),
+        "cpu_seconds": round(cpu, 2),
+        "certificate_cpu_seconds": round(certificate["cpu_seconds"], 2),
+    }
+
+
+def together(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The cells of one hand, or of all, as one row."""
+    total = {key: sum(row[key] for row in rows) for key in rows[0] if key not in ("hand", "object")}
+    clear = total["clear_holds"] + total["clear_failures"]
+    wrong = total["false_accepts"] + total["false_refusals"]
+    low, high = wilson(clear - wrong, clear)
+    return total | {
+        "hand": rows[0]["hand"] if len({row["hand"] for row in rows}) == 1 else "all",
+        "clear_share": clear / total["n"],
+        "agreement_without_band": total["same"] / total["n"],
+        "agreement": (clear - wrong) / clear,
+        "interval": [round(low, 4), round(high, 4)],
+    }
+
+
+def many(grasps: GraspSet, count: int) -> GraspSet:
+    """`count` grasps: these again and again, each moved a little."""
+    rng, rows = np.random.default_rng(7), np.arange(count) % len(grasps)
+    shift = np.zeros((count, 7))
+    shift[len(grasps) :, :3] = rng.uniform(-JITTER_M, JITTER_M, (max(0, count - len(grasps)), 3))
+
+    def moved(part: Posture) -> Posture:
+        return Posture(part.hand_pose[rows] + shift, part.joint_positions[rows])
+
+    return GraspSet(moved(grasps.grasp), moved(grasps.pregrasp), moved(grasps.squeeze), grasps.stability_loss[rows])
+
+
+def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Iterator[dict[str, Any]]:
+    """Grasps a second, kernels loaded; the pool's making is told beside it."""
+    for size in worlds:
+        began = time.perf_counter()
+        pool = pool_of(cell, device, size)
+        pool.judge(many(cell.grasps, min(size, 32)))
+        made = time.perf_counter() - began
+        for count in counts:
+            grasps = many(cell.grasps, count)
+            pool.judge(grasps)  # arrays and graph of this number of grasps
+            began = time.perf_counter()
+            found: FirstTrials = pool.judge(grasps)
+            seconds = time.perf_counter() - began
+            yield {
+                "hand": cell.hand_name, "object": cell.object_name, "device": device, "worlds": size, "grasps": count,
+                "seconds": round(seconds, 3), "grasps_per_second": round(count / seconds, 1),
+                "world_steps_per_second": round(10 * float(found.ticks.sum()) / seconds),
+                "launches": pool.launches, "seconds_per_launch": round(seconds / max(1, pool.launches), 5),
+                "overflows": int(found.overflow.sum()), "held": int(found.held.sum()),
+                "clear": int((found.clearly_held | found.clearly_failed).sum()), "seconds_to_make": round(made, 2),
+            }  # fmt: skip
+
+
+AGREEMENT = (
+    "| hand | grasps | hold | agreement of all | clear | agreement of clear ones (95 %) | false accepts, refusals "
+    "| overflows |\n| --- | --: | --: | --: | --: | --- | --- | --: |"
+)
+SPEED = (
+    "| hand | object | worlds | grasps | grasps/s | world steps/s | ms a tick |\n"
+    "| --- | --- | --: | --: | --: | --: | --: |"
+)
+
+
+def agreement_line(r: dict[str, Any]) -> str:
+    low, high = (f"{100 * bound:.1f}" for bound in r["interval"])
+    return (
+        f"| {r['hand']} | {r['n']} | {r['held'] / r['n']:.2f} | {100 * r['agreement_without_band']:.1f} % "
+        f"| {100 * r['clear_share']:.1f} % | {100 * r['agreement']:.2f} % ({low} to {high}) "
+        f"| {r['false_accepts']}, {r['false_refusals']} | {r['overflows']} |"
+    )
+
+
+def speed_line(r: dict[str, Any]) -> str:
+    return (
+        f"| {r['hand']} | {r['object']} | {r['worlds']} | {r['grasps']} | {r['grasps_per_second']:.0f} "
+        f"| {r['world_steps_per_second']} | {1e3 * r['seconds_per_launch']:.2f} |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+", default=list(OBJECTS))
+    parser.add_argument("--grasps", type=int, default=48)
+    parser.add_argument("--speed", nargs="*", type=int, default=[])
+    parser.add_argument("--worlds", nargs="+", type=int, default=[256])
+    parser.add_argument("--no-agreement", action="store_true", help="speed alone")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    device = Device(args.device)
+    used = device.resolve()
+    rows: list[dict[str, Any]] = []
+    timed: list[dict[str, Any]] = []
+    text: list[str] = []
+    for hand in args.hands:
+        of_hand = list(cells(args.data, args.work, hand, args.grasps, args.objects))
+        for cell in [] if args.no_agreement else of_hand:
+            rows.append(agreement(cell, used))
+            sys.stderr.write(f"{rows[-1]}\n")
+        for row in speeds(of_hand[0], used, args.speed, args.worlds) if args.speed else ():
+            timed.append(row)
+            sys.stderr.write(f"{row}\n")
+    totals = [together([row for row in rows if row["hand"] == hand]) for hand in args.hands] if rows else []
+    if rows:
+        text += [AGREEMENT, *map(agreement_line, [*totals, *([together(rows)] if len(totals) > 1 else [])]), ""]
+    if timed:
+        text += [SPEED, *map(speed_line, timed), ""]
+    engine = f"mujoco_warp {mujoco_warp().__version__} on {device.name if used != 'cpu' else cpu_name()}"
+    sys.stdout.write("\n".join([f"{engine}", "", *text]))
+    if args.out:
+        write_json(args.out.with_suffix(".json"), {"engine": engine, "cells": rows, "hands": totals, "speed": timed})
+        args.out.with_suffix(".md").write_text("\n".join([f"# The first judge\n\n{engine}\n", *text]).rstrip() + "\n")
+
+
+if __name__ == "__main__":
+    main()
