@@ -55,7 +55,7 @@ dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources
 	$(BIN)/python docker/dist.py dist
 
 pins: $(STAMP) ## versions that the images install: those of .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
 	$(BIN)/python docker/pin.py > docker/constraints.txt.new && mv docker/constraints.txt.new docker/constraints.txt
 
 audit: $(STAMP) ## known vulnerabilities of what .venv and the images install (asks PyPI)

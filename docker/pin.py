@@ -16,7 +16,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What the images are made of; `graspd up` and its embedded Redis do not run there.
-EXTRAS = ("api", "worker", "postgres", "otel")
+EXTRAS = ("api", "worker", "postgres", "otel", "gpu")
 
 
 def requirements(*extras: str) -> list[Requirement]:
