@@ -61,14 +61,18 @@ print(json.dumps({"valid": valid, "raw": count // 32 * 32, "ms": {stage: 1e3 * s
 """
 
 
+def environment_of(root: Path) -> dict[str, str]:
+    """The surroundings in which a program uses the code of a checkout, whatever is installed."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
+    return environment | {"PYTHONPATH": str(root)}
+
+
 def run(root: Path, *arguments: str) -> dict[str, Any]:
     """The numbers of one checkout; ends the program if it fails."""
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
-    environment["PYTHONPATH"] = str(root)
     done = subprocess.run(
         [sys.executable, "-c", CHILD, *arguments],
         cwd=root,
-        env=environment,
+        env=environment_of(root),
         capture_output=True,
         text=True,
         check=False,

@@ -161,6 +161,12 @@ class HandModel:
 
     def reduce(self, joints: Floats) -> Floats:
         """Dof values (..., D) from joint positions (..., J): each dof read off the first joint it drives."""
-        first = [int(np.flatnonzero(self.dof[self.joint_body] == d)[0]) for d in range(self.dofs)]
+        first = self._first_joint
         body = self.joint_body[first]
         return (np.asarray(joints)[..., first] - self.offset[body]) / self.multiplier[body]
+
+    @cached_property
+    def _first_joint(self) -> NDArray[np.intp]:
+        """(D,) the first joint that each dof drives."""
+        drives = self.dof[self.joint_body]
+        return np.array([int(np.flatnonzero(drives == d)[0]) for d in range(self.dofs)], np.intp)

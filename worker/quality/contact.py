@@ -50,6 +50,56 @@ def choose_contacts(
     return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
 
 
+def spread_contacts(
+    near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """`choose_contacts` of many sets at once.
+
+    Args:
+        near: (B, T, N) points to choose from, of B grasps at T thresholds.
+        place: (B, N, 3) contact points [m].
+        normal: (B, N, 3) unit normals.
+        scale: length to weigh places against directions [m].
+        limit: most contacts wanted.
+
+    Returns:
+        (B, T, limit) indices, of which the first (B, T) count; the others mean nothing.
+    """
+    grasps, sets, _ = near.shape
+    count = near.sum(axis=2)
+    width = max(int(count.max(initial=0)), limit)
+    # The points of each set moved to the front, in their order.
+    order = np.argsort(~near, axis=2, kind="stable")[..., :width].reshape(grasps * sets, -1)
+    inside = np.arange(order.shape[1]) < count.reshape(-1, 1)
+    rows = np.repeat(np.arange(grasps), sets)[:, None]
+    features = np.concatenate([place[rows, order] / scale, normal[rows, order]], axis=-1)
+    chosen = np.where(
+        count.reshape(-1, 1) > limit,
+        _farthest(features, inside, limit),
+        np.minimum(np.arange(limit), order.shape[1] - 1),
+    )
+    index = np.take_along_axis(order, chosen, axis=1)
+    return index.reshape(grasps, sets, limit), np.minimum(count, limit)
+
+
+def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
+    """(S, count) of each set (S, W, K) the points `farthest_points` chooses among those that are `inside` (S, W)."""
+    rows = np.arange(len(points))
+    mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
+    start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
+    chosen = np.empty((len(points), count), np.intp)
+    chosen[:, 0] = np.argmax(start, axis=1)
+    squares = np.einsum("swk,swk->sw", points, points)
+    nearest = np.where(inside, np.inf, -1.0)
+    for i in range(1, count):
+        last = points[rows, chosen[:, i - 1]]
+        apart = squares - 2 * np.matmul(points, last[..., None])[..., 0] + np.einsum("sk,sk->s", last, last)[:, None]
+        np.minimum(nearest, apart, out=nearest)
+        nearest[rows, chosen[:, i - 1]] = -1.0
+        chosen[:, i] = np.argmax(nearest, axis=1)
+    return chosen
+
+
 def contact_links(body_distance: Floats) -> NDArray[np.int32]:
     """(B,) number of bodies nearer than `LINK_CONTACT_M`, from (B, L) distances [m]."""
     return (body_distance < LINK_CONTACT_M).sum(axis=1).astype(np.int32)

@@ -95,7 +95,7 @@ class Probe:
                 wp.array(to_xyzw(self._piece_frame[:, 3:]), dtype=wp.quatd),
             ]
             self._samples = wp.array(self.samples - obj.centre_of_mass, dtype=wp.vec3)
-            self._mesh = wp.Mesh(
+            self.mesh = wp.Mesh(
                 points=wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3),
                 indices=wp.array(obj.faces.ravel(), dtype=wp.int32),
                 support_winding_number=not obj.watertight,
@@ -108,7 +108,7 @@ class Probe:
         low = obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin
         high = obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin
         skin = self.skin = kernels.Skin()
-        skin.mesh, skin.winding = self._mesh.id, int(not obj.watertight)
+        skin.mesh, skin.winding = self.mesh.id, int(not obj.watertight)
         skin.low, skin.high = wp.vec3(*low), wp.vec3(*high)
         skin.spacing, skin.coarse_reach = float((high - low).max()) / COARSE_CELLS, REACH_M
         with wp.ScopedDevice(self.device):

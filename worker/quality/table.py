@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,11 +18,12 @@ from service.store.manifests import INDEX_THRESHOLD_M
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.quality.contact import MAX_CONTACTS, choose_contacts, contact_area_cm2, contact_links
+from worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
+from worker.quality.overlap import Overlap
 from worker.quality.penetration import penetration_depth
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from worker.quality.volume import SharedVolume
-from worker.quality.wrench_space import Norm, epsilon_of_space, measure_space, wrenches
+from worker.quality.wrench_space import Norm, measure_spaces, wrenches
 from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
@@ -100,9 +100,10 @@ class _Pair:
     ) -> None:
         self.obj, self.friction, self.thresholds, self.norm = obj, friction, thresholds, norm
         told = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
-        self.with_volume = {t for t in range(len(thresholds)) if every_volume or t == told}
+        self.with_volume = (np.arange(len(thresholds)) == told) | every_volume
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
         self.volume = SharedVolume(hand, obj)
+        self.overlap = Overlap(hand, self.probe)
 
     def empty(self) -> dict[str, NDArray[np.generic]]:
         """Columns of no grasps."""
@@ -115,26 +116,22 @@ class _Pair:
 
     def spaces(self, found: Distances) -> tuple[Floats, Floats]:
         """(B, T) epsilon and volume of the wrench space of B grasps."""
-        shape = (len(found.distance), len(self.thresholds))
-        epsilon, volume = np.zeros(shape), np.full(shape, np.nan)
-        facing = self.probe.facing(found)
-        for b in range(shape[0]):
-            place, normal, near = found.closest[b], found.normal[b], np.abs(found.distance[b])
-            for t in range(shape[1]):
-                chosen = choose_contacts(
-                    facing[b] & (near < self.thresholds[t]), place, normal, scale=self.obj.radius, limit=MAX_CONTACTS
-                )
-                epsilon[b, t], volume[b, t] = self._space(place[chosen], normal[chosen], t in self.with_volume)
-        return epsilon, volume
-
-    def _space(self, place: Floats, normal: Floats, with_volume: bool) -> tuple[float, float]:
-        """Epsilon and volume, nan if it is not wanted, of contacts at (C, 3) with outward normals (C, 3)."""
-        if not len(place):
-            return 0.0, 0.0
-        edges = wrenches(place, -normal, friction=self.friction, centre=self.obj.centre_of_mass, radius=self.obj.radius)
-        if with_volume:
-            return measure_space(edges, norm=self.norm)
-        return epsilon_of_space(edges, norm=self.norm), math.nan
+        near = self.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < self.thresholds[:, None])
+        chosen, count = spread_contacts(
+            near, found.closest, found.normal, scale=self.obj.radius, limit=MAX_CONTACTS
+        )  # fmt: skip
+        rows = np.arange(len(chosen))[:, None, None]
+        counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
+        inward = np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
+        edges = wrenches(
+            found.closest[rows, chosen], inward, friction=self.friction, centre=self.obj.centre_of_mass,
+            radius=self.obj.radius,
+        )  # fmt: skip
+        wanted = np.broadcast_to(self.with_volume, count.shape)
+        epsilon, volume = measure_spaces(
+            edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel(), norm=self.norm
+        )  # fmt: skip
+        return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
 
 @dataclass(frozen=True)
@@ -151,6 +148,8 @@ class _Chunk:
     def shared_volume(self) -> Floats:
         # An object's face may enter a piece between two object points, half a diagonal of their grid away from either.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
+        if self.pair.volume.exact:
+            near = self.pair.overlap.of(self.found, near)
         return self.pair.volume.of(self.found.bodies, near)
 
 

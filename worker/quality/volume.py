@@ -54,7 +54,8 @@ class SharedVolume:
             return 0.0
         if self._object is None:
             return self._voxels.volume_cm3(bodies, pieces)
-        posed = [self._pieces[p].transform(self._matrix(bodies[self._body[p]])) for p in pieces]
+        matrices = self._matrices(bodies[self._body[pieces]])
+        posed = [self._pieces[p].transform(matrix) for p, matrix in zip(pieces, matrices, strict=True)]
         parts = [part for part in (self._object ^ solid for solid in posed) if not part.is_empty()]
         if not parts:
             return 0.0
@@ -62,10 +63,11 @@ class SharedVolume:
         whole = parts[0] if len(parts) == 1 else m3d.Manifold.batch_boolean(parts, m3d.OpType.Add)
         return float(whole.volume()) / _UNIT**3 * 1e6
 
-    def _matrix(self, pose: Floats) -> Floats:
-        matrix = pose_to_matrix(pose)[:3]
-        matrix[:, 3] = (matrix[:, 3] - self.obj.centre_of_mass) * _UNIT
-        return matrix
+    def _matrices(self, poses: Floats) -> Floats:
+        """(K, 3, 4) of body poses (K, 7), as manifold3d takes them."""
+        matrices = pose_to_matrix(poses)[:, :3]
+        matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
+        return matrices
 
     @cached_property
     def _voxels(self) -> VoxelVolume:

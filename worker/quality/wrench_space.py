@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from service.model.errors import InputError
 from service.model.transforms import cross
-from worker.quality.hull import MAX_POINTS, radius, radius_and_volume
+from worker.quality.hull import MAX_POINTS, measure_hulls
 
 Floats = NDArray[np.float64]
 Norm = Literal["l1", "linf"]
@@ -90,31 +90,53 @@ def measure_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> tuple[float, f
     Raises:
         InputError: linf with more than `MAX_LINF_CONTACTS` contacts.
     """
-    points = _points(edge_wrenches, norm)
-    if _is_ours(points):
-        found = radius_and_volume(points)
-        if found is not None:
-            return max(0.0, found[0]), found[1]
-    hull = _hull(points)
+    (epsilon,), (volume,) = measure_spaces(
+        edge_wrenches[None], np.array([len(edge_wrenches)]), np.ones(1, bool), norm=norm
+    )
+    return float(epsilon), float(volume)
+
+
+def measure_spaces(
+    edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_], *, norm: Norm = "l1"
+) -> tuple[Floats, Floats]:
+    """Epsilon and volume of many wrench spaces.
+
+    Args:
+        edge_wrenches: (S, N, E, D) edge wrenches; of each space the first `contacts` contacts are its own.
+        contacts: (S,).
+        with_volume: (S,) whether the volume is wanted: epsilon alone is as exact, in a tenth of the time.
+        norm: l1 or linf.
+
+    Returns:
+        (S,) epsilon; (S,) volume, nan where it is not wanted.
+
+    Raises:
+        InputError: linf with more than `MAX_LINF_CONTACTS` contacts.
+    """
+    epsilon, volume = np.full((2, len(edge_wrenches)), np.nan)
+    none = np.asarray(contacts) == 0
+    epsilon[none], volume[none] = 0.0, 0.0
+    if norm == "l1" and edge_wrenches.shape[-1] == 6:
+        clouds = edge_wrenches.reshape(len(edge_wrenches), -1, 6)
+        count = np.asarray(contacts) * edge_wrenches.shape[2]
+        ours = np.flatnonzero((count >= MANY) & (count <= MAX_POINTS))
+        most = int(count[ours].max(initial=0))
+        epsilon[ours], volume[ours] = measure_hulls(clouds[ours, :most], count[ours], np.asarray(with_volume)[ours])
+    for row in np.flatnonzero(np.isnan(epsilon)):
+        epsilon[row], volume[row] = _measure_by_qhull(edge_wrenches[row, : contacts[row]], norm)
+    return np.maximum(epsilon, 0.0), np.where(with_volume | none, volume, np.nan)
+
+
+def _measure_by_qhull(edge_wrenches: Floats, norm: Norm) -> tuple[float, float]:
+    """Epsilon and volume of contacts that our own hull does not take: few, flat ones, or too many."""
+    hull = _hull(_points(edge_wrenches, norm))
     if hull is None:
         return 0.0, 0.0
-    return max(0.0, float(-hull.equations[:, -1].max())), float(hull.volume)
-
-
-def epsilon_of_space(edge_wrenches: Floats, *, norm: Norm = "l1") -> float:
-    """Epsilon alone, as in `measure_space` and as exact, in a tenth of the time where there are many contacts."""
-    points = _points(edge_wrenches, norm)
-    found = radius(points) if _is_ours(points) else None
-    return max(0.0, found) if found is not None else measure_space(edge_wrenches, norm=norm)[0]
+    return float(-hull.equations[:, -1].max()), float(hull.volume)
 
 
 def _points(edge_wrenches: Floats, norm: Norm) -> Floats:
     return edge_wrenches.reshape(-1, edge_wrenches.shape[-1]) if norm == "l1" else _minkowski(edge_wrenches)
-
-
-def _is_ours(points: Floats) -> bool:
-    """Whether our own hull takes these points, and is the faster one."""
-    return points.shape[1] == 6 and MANY <= len(points) <= MAX_POINTS and not _flat(points)
 
 
 def _hull(points: Floats) -> ConvexHull | None:

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from worker.quality import hull
-from worker.quality.hull import MAX_POINTS, radius, radius_and_volume
+from worker.quality.hull import MAX_POINTS, measure_hulls, radius, radius_and_volume
 from worker.quality.wrench_space import measure_space, wrenches
 
 #: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
@@ -84,7 +84,9 @@ def test_too_many_facets_are_no_hull(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wrench_space_takes_qhull_where_ours_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     edges = contacts(12).reshape(12, 8, 6)
     wanted = measure_space(edges)
-    monkeypatch.setattr("worker.quality.wrench_space.radius_and_volume", lambda points: None)
+    monkeypatch.setattr(
+        "worker.quality.wrench_space.measure_hulls", lambda clouds, *_: np.full((2, len(clouds)), np.nan)
+    )
     assert measure_space(edges) == pytest.approx(wanted, rel=JOGGLED)
 
 
@@ -119,3 +121,18 @@ def test_the_radius_alone_of_a_cloud_beside_the_origin_is_not_positive(seed: int
     found = radius(points)
     assert found is not None
     assert found <= 0
+
+
+def test_many_hulls_at_once_are_those_of_each_alone() -> None:
+    """Clouds of different sizes, a flat one and one too small among them; a volume only where it is asked for."""
+    sets = [contacts(count, seed=count) for count in (4, 20, 9)]
+    sets += [np.hstack([np.random.default_rng(3).normal(size=(40, 5)), np.zeros((40, 1))]), sets[0][:6]]
+    clouds = np.full((5, 160, 6), 7.0)  # what lies behind a cloud is none of its points
+    for row, points in enumerate(sets):
+        clouds[row, : len(points)] = points
+    whole = np.array([True, False, True, True, True])
+    radii, volumes = measure_hulls(clouds, np.array([len(points) for points in sets]), whole)
+    for row in (0, 2):
+        assert (radii[row], volumes[row]) == radius_and_volume(sets[row])
+    assert radii[1] == radius(sets[1]) and np.isnan(volumes[1])
+    assert np.isnan(radii[3:]).all() and np.isnan(volumes[3:]).all()

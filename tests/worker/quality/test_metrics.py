@@ -18,7 +18,12 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.surface import sample_surface
-from worker.quality.contact import choose_contacts, contact_distance_consistency_mm, finger_of_body
+from worker.quality.contact import (
+    choose_contacts,
+    contact_distance_consistency_mm,
+    finger_of_body,
+    spread_contacts,
+)
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from worker.quality.table import MEASURES, measure
@@ -236,3 +241,15 @@ def test_bodies_of_many_postures_are_as_far_and_as_deep_as_their_points_say(reac
     deep = probe.self_depth(bodies, points)
     assert (deep > 0).any()
     np.testing.assert_allclose(probe.body_depths(pose, joints), deep, atol=1e-7)
+
+
+def test_contacts_of_many_sets_are_those_chosen_one_set_at_a_time() -> None:
+    rng = np.random.default_rng(5)
+    place, normal = rng.normal(size=(3, 300, 3)), rng.normal(size=(3, 300, 3))
+    near = rng.uniform(size=(3, 4, 300)) < np.array([0.0, 0.02, 0.3, 1.0])[:, None]
+    index, count = spread_contacts(near, place, normal, scale=0.5, limit=12)
+    for b in range(3):
+        for t in range(4):
+            alone = choose_contacts(near[b, t], place[b], normal[b], scale=0.5, limit=12)
+            assert index[b, t, : count[b, t]].tolist() == alone.tolist()
+    assert (count[:, 0] == 0).all() and (count[:, 1] > 0).all() and (count[:, 1] <= 12).all()

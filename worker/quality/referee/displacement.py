@@ -19,6 +19,7 @@ from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.quality.referee.compiled import slipping_model
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.model import add_object, add_shape
 from worker.run import ALONE, Run
@@ -40,7 +41,7 @@ def simulated_displacement_cm(
     Raises:
         MeshError: the object has no usable convex pieces.
     """
-    model = _build(hand, obj, pieces or decompose(obj))
+    model = slipping_model(hand, obj, pieces or decompose(obj), _build)
     bodies = body_poses(hand, grasp.hand_pose, grasp.joint_positions)
     centre = obj.centre_of_mass
 

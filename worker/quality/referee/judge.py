@@ -17,9 +17,10 @@ from service.model.errors import InputError
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import Level, postures_key, verdict_key
-from worker.quality.referee.model import COARSE, MujocoOptions, build
+from worker.quality.referee.model import COARSE, MujocoOptions
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
 from worker.run import ALONE, Run
 
@@ -133,8 +134,8 @@ class _Bench:
         self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
         self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
         levels = [MujocoOptions().hardened(), COARSE.hardened()] if hard else [MujocoOptions(), COARSE]
-        full = build(hand, obj, pieces, levels[0])
-        coarse = build(hand, obj, pieces, levels[1]) if level == "screen" else None
+        full = scene_of(hand, obj, pieces, levels[0])
+        coarse = scene_of(hand, obj, pieces, levels[1]) if level == "screen" else None
         for _ in range(threads):
             self._full.put(Test(full))
             if coarse is not None:

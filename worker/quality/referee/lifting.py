@@ -20,10 +20,11 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality import postures
 from worker.quality.referee import lift as protocol
+from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lift import Lift, LiftOutcome, LiftTrial
-from worker.quality.referee.model import DENSITY, TOUCH_ROUNDING_M, MujocoOptions, build
+from worker.quality.referee.model import DENSITY, TOUCH_ROUNDING_M, MujocoOptions
 from worker.run import ALONE, Run
 from worker.simulation import surroundings
 from worker.simulation.surroundings import Placed
@@ -94,7 +95,7 @@ def judge_lifts(
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
-    scene = build(hand, obj, pieces, physics, placed.supports, placed.neighbours)
+    scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
     tests: queue.SimpleQueue[Lift] = queue.SimpleQueue()
     workers = max(1, min(run.cores, len(grasps)))
     for _ in range(workers):

@@ -19,9 +19,10 @@ from worker.engines.mujoco_warnings import void
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import Lift, LiftOutcome
-from worker.quality.referee.model import MujocoOptions, Scene, blend, build
+from worker.quality.referee.model import MujocoOptions, Scene, blend
 from worker.quality.referee.protocol import LOST_ROTATION, MAX_DISPLACEMENT_M, PUSH, STAGE_S
 from worker.simulation.surroundings import Placed
 
@@ -90,5 +91,5 @@ class ShortLifts:
         with self._lock:
             if self._scene is None:
                 pieces = self._pieces()
-                self._scene = build(self.hand, self.obj, pieces, PHYSICS, placed.supports, placed.neighbours)
+                self._scene = scene_of(self.hand, self.obj, pieces, PHYSICS, placed.supports, placed.neighbours)
             return self._scene

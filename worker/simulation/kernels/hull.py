@@ -1,10 +1,11 @@
 """Convex hulls in six dimensions, grown point by point (beneath-beyond), for wrench spaces.
 
-A facet is a simplex of 6 points with its plane n x = d, n outward, and the 6 facets across its ridges:
-`neighbour[f, k]` shares all corners of f but `vertex[f, k]`. A new point sees the facets whose plane it is above; they
-go, and every ridge between a seen and an unseen facet spans a new one with the point. Its plane is the positive
-combination of the two old planes that holds the point; its area follows from the simplex that the point and an old
-facet span. No system of equations is solved.
+A facet is a simplex of 6 points with the 6 facets across its ridges: `neighbour[f, k]` shares all corners of f but
+`vertex[f, k]`. Its plane n x = d, n outward, has a scale that says its size: n x - d is 6! times the volume of the
+simplex of the facet and x, negative inside. A new point sees the facets whose plane it is above; they go, and every
+ridge between a seen and an unseen facet spans a new one with the point. Its plane is a positive combination of the two
+old planes, by the relation between the determinants of six points taken from eight (Grassmann, Pluecker), so no system
+of equations is solved and no root is drawn.
 """
 
 import warp as wp
@@ -16,8 +17,7 @@ vec6 = wp.types.vector(length=6, dtype=wp.float64)
 DEAD = wp.constant(0)
 LIVE = wp.constant(1)
 SEEN = wp.constant(2)
-FRESH = wp.constant(3)
-UNKNOWN = wp.constant(-1)
+HORIZON = wp.constant(3)
 
 
 @wp.struct
@@ -28,11 +28,12 @@ class Hull:
     neighbour: wp.array2d(dtype=wp.int32)
     normal: wp.array(dtype=vec6)
     offset: wp.array(dtype=wp.float64)
-    area: wp.array(dtype=wp.float64)
     height: wp.array(dtype=wp.float64)
+    distance: wp.array(dtype=wp.float64)
     state: wp.array(dtype=wp.int32)
     seen: wp.array(dtype=wp.int32)
     fresh: wp.array(dtype=wp.int32)
+    side: wp.array(dtype=wp.int32)
     spare: wp.array(dtype=wp.int32)
     ridge: wp.array(dtype=wp.int64)
     holder: wp.array(dtype=wp.int32)
@@ -40,48 +41,49 @@ class Hull:
 
 
 @wp.func
-def look(hull: Hull, top: int, x: vec6):
-    """Mark and list the facets that a point sees; their number."""
-    count = wp.int32(0)
-    for f in range(top):
-        if hull.state[f] == LIVE:
-            height = wp.dot(hull.normal[f], x) - hull.offset[f]
-            hull.height[f] = height
-            if height > wp.float64(0.0):
-                hull.state[f] = SEEN
-                hull.seen[count] = f
-                count = count + 1
-    return count
+def climb(hull: Hull, start: int, x: vec6):
+    """A facet that x is above, or -1 if it is inside; the hull's inside holds the origin.
+
+    Of all planes, scaled to 1 at the origin, the one that x is highest above is a corner of the polar polytope that a
+    linear function is greatest at: neighbour by neighbour upwards ends there, as the simplex method does.
+    """
+    here = start
+    best = wp.dot(hull.normal[here], x) / hull.offset[here]
+    at = wp.int32(-1)
+    while at != here and best <= wp.float64(1.0):
+        at = here
+        for k in range(6):
+            g = hull.neighbour[at, k]
+            share = wp.dot(hull.normal[g], x) / hull.offset[g]
+            if share > best:
+                best = share
+                here = g
+    found = wp.int32(-1)
+    if best > wp.float64(1.0):
+        found = here
+    return found
 
 
 @wp.func
 def span(hull: Hull, e: int, f: int, k: int, p: int, point: wp.array(dtype=vec6)):
     """Facet e from point p and the ridge that seen facet f shares with its unseen neighbour k."""
     g = hull.neighbour[f, k]
-    apex = hull.vertex[f, k]
-    beyond = wp.int32(0)
+    back = wp.int32(0)
     for j in range(6):
         hull.vertex[e, j] = hull.vertex[f, j]
         if hull.neighbour[g, j] == f:
-            hull.neighbour[g, j] = e
-            beyond = hull.vertex[g, j]
+            back = j
     hull.vertex[e, k] = p
     hull.neighbour[e, k] = g
-    up = hull.height[f]
-    down = -hull.height[g]
-    normal = up * hull.normal[g] + down * hull.normal[f]
-    size = wp.length(normal)
-    normal = normal / size
-    offset = (up * hull.offset[g] + down * hull.offset[f]) / size
-    hull.normal[e] = normal
-    hull.offset[e] = offset
-    # The simplex of p and an old facet has the new one as a face too, and area times height of either is the same. The
-    # point stands well above at least one of the two old facets.
-    if up > down:
-        hull.area[e] = up * hull.area[f] / wp.abs(offset - wp.dot(normal, point[apex]))
-    else:
-        hull.area[e] = down * hull.area[g] / wp.abs(offset - wp.dot(normal, point[beyond]))
-    hull.state[e] = FRESH
+    # Depth of either facet's far corner under the other's plane: the same determinant, and the larger one rounds less.
+    under = hull.offset[f] - wp.dot(hull.normal[f], point[hull.vertex[g, back]])
+    over = hull.offset[g] - wp.dot(hull.normal[g], point[hull.vertex[f, k]])
+    scale = wp.float64(1.0) / wp.max(under, over)
+    up = hull.height[f] * scale
+    down = -hull.height[g] * scale
+    hull.normal[e] = up * hull.normal[g] + down * hull.normal[f]
+    hull.offset[e] = up * hull.offset[g] + down * hull.offset[f]
+    hull.neighbour[g, back] = e
 
 
 @wp.func
@@ -99,19 +101,20 @@ def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, m
             while hull.stamp[at] == now and hull.ridge[at] != key:
                 at = int(wp.int64(at + 1) & mask)
             if hull.stamp[at] == now:
-                other = hull.holder[at] / 6
-                side = hull.holder[at] - 6 * other
-                pending = pending - 1
-                if hull.neighbour[other, side] != UNKNOWN:
+                held = hull.holder[at]
+                other = held / 8
+                if held < 0:
                     # A third facet at one ridge: never made up for, so the hull counts as failed.
                     pending = pending + 1000000
-                hull.neighbour[other, side] = e
-                hull.neighbour[e, j] = other
+                else:
+                    pending = pending - 1
+                    hull.neighbour[other, held - 8 * other] = e
+                    hull.neighbour[e, j] = other
+                    hull.holder[at] = -1
             else:
                 hull.stamp[at] = now
                 hull.ridge[at] = key
-                hull.holder[at] = 6 * e + j
-                hull.neighbour[e, j] = UNKNOWN
+                hull.holder[at] = 8 * e + j
                 pending = pending + 1
     return pending
 
@@ -120,23 +123,39 @@ def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, m
 def insert(
     hull: Hull,
     p: int,
+    start: int,
     point: wp.array(dtype=vec6),
     mark: wp.array(dtype=wp.int64),
-    mask: wp.int64,
     stamp: int,
     top: int,
     spares: int,
 ):
-    """Put point p into the hull; facets ever used, spare ones among them, and 1 if that failed."""
+    """Put point p, above facet `start`, into the hull; facets ever used, spare and fresh ones, and 1 if that failed."""
     capacity = hull.state.shape[0]
     failed = wp.int32(0)
-    count = look(hull, top, point[p])
+    x = point[p]
+    hull.state[start] = SEEN
+    hull.height[start] = wp.dot(hull.normal[start], x) - hull.offset[start]
+    hull.seen[0] = start
+    count = wp.int32(1)
     born = wp.int32(0)
-    pending = wp.int32(0)
-    for i in range(count):
+    i = wp.int32(0)
+    while i < count:
         f = hull.seen[i]
+        i = i + 1
         for k in range(6):
-            if failed == 0 and hull.state[hull.neighbour[f, k]] == LIVE:
+            g = hull.neighbour[f, k]
+            state = hull.state[g]
+            if state == LIVE:
+                height = wp.dot(hull.normal[g], x) - hull.offset[g]
+                hull.height[g] = height
+                state = HORIZON
+                if height > wp.float64(0.0):
+                    state = SEEN
+                    hull.seen[count] = g
+                    count = count + 1
+                hull.state[g] = state
+            if state == HORIZON and failed == 0:
                 e = top
                 if spares > 0:
                     spares = spares - 1
@@ -146,101 +165,180 @@ def insert(
                 else:
                     top = top + 1
                 span(hull, e, f, k, p, point)
-                pending = pending + link(hull, e, k, mark, stamp, mask)
                 hull.fresh[born] = e
+                hull.side[born] = k
                 born = born + 1
+    # A table that is little larger than what goes in stays in the nearest cache.
+    size = wp.int32(1024)
+    while size < 6 * born and size < hull.stamp.shape[0]:
+        size = 2 * size
+    pending = wp.int32(0)
+    if 5 * born > size:
+        failed = 1
+    else:
+        for n in range(born):
+            pending = pending + link(hull, hull.fresh[n], hull.side[n], mark, stamp, wp.int64(size - 1))
     if pending != 0:
         failed = 1
-    for i in range(count):
-        hull.state[hull.seen[i]] = DEAD
-        hull.spare[spares] = hull.seen[i]
+    for n in range(born):
+        e = hull.fresh[n]
+        hull.state[e] = LIVE
+        hull.state[hull.neighbour[e, hull.side[n]]] = LIVE
+    for n in range(count):
+        hull.state[hull.seen[n]] = DEAD
+        hull.spare[spares] = hull.seen[n]
         spares = spares + 1
-    for i in range(born):
-        hull.state[hull.fresh[i]] = LIVE
-    return top, spares, failed
+    return top, spares, born, failed
 
 
-@wp.kernel
-def grow_hull(
-    # In:
-    point_in: wp.array(dtype=vec6),
-    order_in: wp.array(dtype=wp.int32),
-    mark_in: wp.array(dtype=wp.int64),
-    mask_in: wp.int64,
-    stamp_in: int,
-    # Out:
-    hull_inout: Hull,
-    result_out: wp.array(dtype=wp.float64),
+@wp.func
+def distance_of(hull: Hull, f: int, origin: vec6):
+    """Signed distance of facet f's plane from a point, positive inside."""
+    normal = hull.normal[f]
+    return (hull.offset[f] - wp.dot(normal, origin)) / wp.length(normal)
+
+
+@wp.func
+def is_corner(corner: wp.array(dtype=wp.int32), p: int):
+    found = wp.int32(0)
+    for i in range(7):
+        if corner[i] == p:
+            found = 1
+    return found
+
+
+@wp.func
+def grow_whole(
+    hull: Hull,
+    point: wp.array(dtype=vec6),
+    count: int,
+    corner: wp.array(dtype=wp.int32),
+    origin: vec6,
+    mark: wp.array(dtype=wp.int64),
+    stamp: int,
 ):
-    """Insert points in the given order into a hull that has 7 facets.
-
-    `result_out`: least distance of a facet from the origin, negative where the origin is outside; volume; 1 if sound.
-    """
-    hull = hull_inout
+    """Insert all points but the corners of the first simplex; least distance of a facet from `origin`, volume, and 1
+    if that failed."""
     top = wp.int32(7)
     spares = wp.int32(0)
     failed = wp.int32(0)
-    for turn in range(order_in.shape[0]):
-        if failed == 0:
-            top, spares, failed = insert(hull, order_in[turn], point_in, mark_in, mask_in, stamp_in + turn, top, spares)
+    start = wp.int32(0)
+    half = (count + 1) / 2
+    for turn in range(count):
+        # Neighbours in a list are neighbours in space: every other one first leaves less to be replaced.
+        p = 2 * turn
+        if turn >= half:
+            p = 2 * (turn - half) + 1
+        seen = wp.int32(-1)
+        if failed == 0 and is_corner(corner, p) == 0:
+            seen = climb(hull, start, point[p])
+        if seen >= 0:
+            top, spares, _born, failed = insert(hull, p, seen, point, mark, stamp + p, top, spares)
+            start = hull.fresh[0]
     least = wp.float64(1.0e30)
     volume = wp.float64(0.0)
     for f in range(top):
         if hull.state[f] == LIVE:
-            least = wp.min(least, hull.offset[f])
-            volume = volume + hull.offset[f] * hull.area[f]
-    result_out[0] = least
-    result_out[1] = volume / wp.float64(6.0)
-    result_out[2] = wp.float64(1 - failed)
+            least = wp.min(least, distance_of(hull, f, origin))
+            volume = volume + hull.offset[f]
+    return least, volume / wp.float64(720.0), failed
 
 
-@wp.kernel
+@wp.func
 def grow_to_nearest(
-    # In:
-    point_in: wp.array(dtype=vec6),
-    rounding_in: wp.float64,
-    mark_in: wp.array(dtype=wp.int64),
-    mask_in: wp.int64,
-    stamp_in: int,
-    # Out:
-    hull_inout: Hull,
-    result_out: wp.array(dtype=wp.float64),
+    hull: Hull,
+    point: wp.array(dtype=vec6),
+    count: int,
+    origin: vec6,
+    rounding: wp.float64,
+    mark: wp.array(dtype=wp.int64),
+    stamp: int,
 ):
-    """Grow a hull that has 7 facets where it is nearest to the origin, until its nearest facet is the whole hull's.
+    """Grow where the hull is nearest to the origin, until its nearest facet is the whole hull's; its distance, and 1 if
+    that failed.
 
     A facet with no point above it is a facet of the hull of all points; no facet of the part that is built is nearer,
     and the whole contains the part. So its distance is that of the whole hull, of which little has to be built (Zheng,
-    "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013).
-
-    `result_out`: least distance of a facet from the origin, at most 0 where the origin is outside; nan; 1 if sound.
+    "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013). At most 0 where the origin is outside.
     """
-    hull = hull_inout
     top = wp.int32(7)
     spares = wp.int32(0)
+    born = wp.int32(0)
     failed = wp.int32(0)
     done = wp.int32(0)
     least = wp.float64(0.0)
-    for turn in range(point_in.shape[0]):
+    for f in range(7):
+        hull.distance[f] = distance_of(hull, f, origin)
+    for turn in range(count):
         if failed == 0 and done == 0:
             nearest = wp.int32(-1)
             least = wp.float64(1.0e30)
             for f in range(top):
-                if hull.state[f] == LIVE and hull.offset[f] < least:
-                    least = hull.offset[f]
+                if hull.state[f] == LIVE and hull.distance[f] < least:
+                    least = hull.distance[f]
                     nearest = f
             far = wp.int32(-1)
-            height = rounding_in
-            for i in range(point_in.shape[0]):
-                above = wp.dot(hull.normal[nearest], point_in[i]) - least
-                if above > height:
-                    height = above
+            normal = hull.normal[nearest]
+            highest = hull.offset[nearest] + rounding * wp.length(normal)
+            for i in range(count):
+                height = wp.dot(normal, point[i])
+                if height > highest:
+                    highest = height
                     far = i
             if far < 0:
                 done = 1
             else:
-                top, spares, failed = insert(hull, far, point_in, mark_in, mask_in, stamp_in + turn, top, spares)
+                top, spares, born, failed = insert(hull, far, nearest, point, mark, stamp + turn, top, spares)
+                for n in range(born):
+                    hull.distance[hull.fresh[n]] = distance_of(hull, hull.fresh[n], origin)
     if done == 0:
         failed = 1
-    result_out[0] = least
-    result_out[1] = wp.float64(wp.nan)
-    result_out[2] = wp.float64(1 - failed)
+    return least, failed
+
+
+@wp.kernel
+def measure_hulls(
+    # In:
+    point_in: wp.array2d(dtype=vec6),
+    count_in: wp.array(dtype=wp.int32),
+    whole_in: wp.array(dtype=wp.int32),
+    corner_in: wp.array2d(dtype=wp.int32),
+    normal_in: wp.array2d(dtype=vec6),
+    offset_in: wp.array2d(dtype=wp.float64),
+    origin_in: wp.array(dtype=vec6),
+    rounding_in: wp.array(dtype=wp.float64),
+    mark_in: wp.array(dtype=wp.int64),
+    stamp_in: int,
+    # Out:
+    hull_inout: Hull,
+    result_out: wp.array2d(dtype=wp.float64),
+):
+    """One hull after the other, each from 7 facets: facet i leaves out corner i, and lies across it from all others.
+
+    Points are about a point inside the first simplex; `origin_in` is where distances are taken from. `result_out`:
+    least distance of a facet, at most 0 where the origin is outside; volume, nan where `whole_in` is 0; 1 if sound.
+    """
+    hull = hull_inout
+    for h in range(count_in.shape[0]):
+        for i in range(7):
+            for j in range(6):
+                other = j
+                if j >= i:
+                    other = j + 1
+                hull.vertex[i, j] = corner_in[h, other]
+                hull.neighbour[i, j] = other
+            hull.normal[i] = normal_in[h, i]
+            hull.offset[i] = offset_in[h, i]
+            hull.state[i] = LIVE
+        count = count_in[h]
+        stamp = stamp_in + h * point_in.shape[1]
+        volume = wp.float64(wp.nan)
+        least = wp.float64(0.0)
+        failed = wp.int32(0)
+        if whole_in[h] != 0:
+            least, volume, failed = grow_whole(hull, point_in[h], count, corner_in[h], origin_in[h], mark_in, stamp)
+        else:
+            least, failed = grow_to_nearest(hull, point_in[h], count, origin_in[h], rounding_in[h], mark_in, stamp)
+        result_out[h, 0] = least
+        result_out[h, 1] = volume
+        result_out[h, 2] = wp.float64(1 - failed)

@@ -1,0 +1,80 @@
+"""Whether faces of a mesh reach into convex pieces."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: What is apart by less than this may as well overlap: positions of some decimetres round by a tenth of it [m].
+SLACK = wp.constant(wp.float32(1.0e-7))
+
+
+@wp.struct
+class Solids:
+    """Convex solids, each in the frame of its body: outward planes n x <= d, corners, and a box around it."""
+
+    plane: wp.array(dtype=wp.vec4)
+    first_plane: wp.array(dtype=wp.int32)
+    corner: wp.array(dtype=wp.vec3)
+    first_corner: wp.array(dtype=wp.int32)
+    middle: wp.array(dtype=wp.vec3)
+    half: wp.array(dtype=wp.vec3)
+
+
+@wp.func
+def is_apart(solids: Solids, s: int, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Whether one of the solid's planes, or the triangle's own, parts the triangle from the solid. Where only a plane
+    through an edge of each would, the answer is no."""
+    apart = wp.bool(False)
+    i = solids.first_plane[s]
+    while i < solids.first_plane[s + 1] and not apart:
+        plane = solids.plane[i]
+        n = wp.vec3(plane[0], plane[1], plane[2])
+        apart = wp.min(wp.min(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, c)) > plane[3] + SLACK
+        i = i + 1
+    if not apart:
+        n = wp.normalize(wp.cross(b - a, c - a))
+        low = float(1.0e9)
+        high = float(-1.0e9)
+        for i in range(solids.first_corner[s], solids.first_corner[s + 1]):
+            height = wp.dot(n, solids.corner[i] - a)
+            low = wp.min(low, height)
+            high = wp.max(high, height)
+        apart = low > SLACK or high < -SLACK
+    return apart
+
+
+@wp.kernel
+def faces_in_solids(
+    # Model:
+    mesh_in: wp.uint64,
+    solids_in: Solids,
+    # In:
+    solid_in: wp.array(dtype=wp.int32),
+    pose_in: wp.array(dtype=wp.transform),
+    # Out:
+    crossed_out: wp.array(dtype=wp.int32),
+):
+    """1 where a face of the mesh may reach into the solid `solid_in`, whose body is at `pose_in`; 0 where none does."""
+    k = wp.tid()
+    s = solid_in[k]
+    pose = pose_in[k]
+    turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    half = solids_in.half[s]
+    reach = wp.vec3(SLACK)
+    for i in range(3):
+        for j in range(3):
+            reach[i] = reach[i] + wp.abs(turn[i, j]) * half[j]
+    middle = wp.transform_point(pose, solids_in.middle[s])
+    back = wp.transform_inverse(pose)
+    query = wp.mesh_query_aabb(mesh_in, middle - reach, middle + reach)
+    mesh = wp.mesh_get(mesh_in)
+    face = wp.int32(0)
+    crossed = wp.int32(0)
+    while wp.mesh_query_aabb_next(query, face):
+        if crossed == 0:
+            a = wp.transform_point(back, mesh.points[mesh.indices[3 * face]])
+            b = wp.transform_point(back, mesh.points[mesh.indices[3 * face + 1]])
+            c = wp.transform_point(back, mesh.points[mesh.indices[3 * face + 2]])
+            if not is_apart(solids_in, s, a, b, c):
+                crossed = 1
+    crossed_out[k] = crossed
