@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from worker.simulation.device import joint_units, to_wxyz, to_xyzw
-from worker.simulation.kernels import contact
+from worker.simulation.kernels import contact, packing
 from worker.simulation.model import MAX_DILATION, Model
 from worker.simulation.state import Floats, HandState, Schedule, still_schedule
 
@@ -31,8 +31,8 @@ class Tables:
 
 
 class Contacts:
-    """Candidate contacts (B, N), those of a hand packed at the front; `gradient` is dL/d distance, `near` (B, N) the
-    indices of those that the object may meet in its step."""
+    """Candidate contacts (B, N), those of a hand packed at the front in the order of its points; `gradient` is dL/d
+    distance, `near` (B, N) the indices of those that the object may meet in its step."""
 
     def __init__(self, capacity: int, points: int) -> None:
         shape = (capacity, points)
@@ -45,6 +45,18 @@ class Contacts:
         self.gradient = wp.zeros(shape, dtype=wp.float32)
         self.near_count = wp.zeros(capacity, dtype=wp.int32)
         self.near = wp.zeros(shape, dtype=wp.int32)
+        self.mark = wp.zeros((0, 0), dtype=wp.int32)
+
+
+class Marked(Contacts):
+    """Contacts (B, N) at the places of their points, marked, and how many there are in each chunk (B, N / chunk)."""
+
+    def __init__(self, capacity: int, points: int) -> None:
+        super().__init__(capacity, points)
+        self.mark = wp.zeros((capacity, points), dtype=wp.int32)
+        chunks = (capacity, -(-points // packing.CHUNK))
+        self.kept_in = wp.zeros(chunks, dtype=wp.int32)
+        self.near_in = wp.zeros(chunks, dtype=wp.int32)
 
 
 class Depths:
@@ -64,11 +76,15 @@ class Depths:
 class Data:
     """Up to `capacity` hands of a model; see `worker.simulation.record` for what is done with them."""
 
-    def __init__(self, model: Model, capacity: int) -> None:
+    def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
+        """`serial`: threads of a launch run in their order, as on a CPU; where they do not, contacts and residuals are
+        put in order before they are summed, which gives the same bits."""
         self.device, self.capacity = model.device, capacity
+        self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
             self.contacts = Contacts(capacity, model.count)
+            self.marked = None if self.serial else Marked(capacity, model.count)
             self.depths = Depths(capacity)
             self.schedule = Tables(still_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
@@ -85,8 +101,7 @@ class Data:
         self.body_p = wp.zeros((B, L), dtype=wp.vec3)
         self.body_q = wp.zeros((B, L), dtype=wp.quat)
         self.axis = wp.zeros((B, L), dtype=wp.vec3)
-        self.force = wp.zeros((B, L), dtype=wp.vec3)
-        self.torque = wp.zeros((B, L), dtype=wp.vec3)
+        self.wrench = wp.zeros((B, L, 6), dtype=wp.int64)
         self.loss = wp.zeros((B, M), dtype=wp.float32)
         self.end = wp.zeros((B, M), dtype=contact.vec6)
         self.adjoint = wp.zeros((B, M), dtype=contact.vec6)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.transforms import quat_from_axis_angle, quat_multiply
 from worker.simulation.data import Data
-from worker.simulation.kernels import obstacles, solids
+from worker.simulation.kernels import obstacles, packing, solids
 from worker.simulation.kernels import projection as kernels
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
@@ -62,6 +62,8 @@ def _residuals(capacity: int) -> Any:
         setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.vec3))
     for name in ("value", "weight"):
         setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.float32))
+    out.key = wp.zeros((capacity, CAPACITY), dtype=wp.int64)
+    out.order = wp.array(np.tile(np.arange(CAPACITY, dtype=np.int32), (capacity, 1)))
     return out
 
 
@@ -158,6 +160,11 @@ class Projection:
                 inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, *pose,
                         o.obstacle_near, o.obstacle_target],
                 outputs=[r], device=m.device,
+            )  # fmt: skip
+        if not d.serial:
+            wp.launch(
+                packing.order, (d.capacity, CAPACITY),
+                inputs=[d.active, r.count, r.key], outputs=[r.order], device=m.device,
             )  # fmt: skip
         wp.launch(
             kernels.normal_equations, d.capacity,

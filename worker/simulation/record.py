@@ -9,8 +9,18 @@ from __future__ import annotations
 from typing import Final
 
 from service.model.errors import InputError
-from worker.simulation.data import Data
-from worker.simulation.kernels import contact, kinematics, obstacles, optimizers, penalties, pieces, solids, surface
+from worker.simulation.data import Data, Marked
+from worker.simulation.kernels import (
+    contact,
+    kinematics,
+    obstacles,
+    optimizers,
+    packing,
+    penalties,
+    pieces,
+    solids,
+    surface,
+)
 from worker.simulation.launches import Launches
 from worker.simulation.model import NEAR_GAP, REFERENCE_SAMPLES, SOLVERS, Model
 
@@ -59,19 +69,35 @@ def add_poses(out: Launches, m: Model, d: Data) -> None:
     out.add(
         kinematics.forward, d.capacity,
         inputs=[m.hand.tree, d.active, d.pivot, d.rotation, d.q],
-        outputs=[d.body_p, d.body_q, d.axis, d.force, d.torque, d.contacts.count, d.contacts.near_count,
+        outputs=[d.body_p, d.body_q, d.axis, d.wrench, d.contacts.count, d.contacts.near_count,
                  d.depths.points, d.depths.object, d.depths.links],
     )  # fmt: skip
 
 
 def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = None) -> None:
     """Candidate contacts: hand points near the object, their distances and normals."""
-    c, o = d.contacts, m.options
+    found, o = d.marked or d.contacts, m.options
     nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     out.add(
         surface.gather, (d.capacity, m.lanes),
         inputs=[m.obj.surface, *nearness, NEAR_GAP, m.lane, m.point_body, m.point_position, m.point_weight,
                 d.active, d.iteration, d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q],
+        outputs=[found.count, found.body, found.point, found.normal, found.distance, found.weight, found.gradient,
+                 found.near_count, found.near, found.mark],
+    )  # fmt: skip
+    if d.marked is not None:
+        _add_packing(out, d, d.marked)
+
+
+def _add_packing(out: Launches, d: Data, marked: Marked) -> None:
+    """Marked contacts to their slots."""
+    c = d.contacts
+    counts = [marked.kept_in, marked.near_in]
+    out.add(packing.count_marks, marked.kept_in.shape, inputs=[d.active, marked.mark], outputs=counts)
+    out.add(
+        packing.pack, marked.mark.shape,
+        inputs=[d.active, marked.mark, *counts, marked.body, marked.point, marked.normal, marked.distance,
+                marked.weight],
         outputs=[c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient, c.near_count, c.near],
     )  # fmt: skip
 
@@ -116,12 +142,12 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
     """Penetrations, and the way of the gradient from points to bodies."""
     add_object_penalty(out, m, d)
     add_self_penalty(out, m, d, m.options.self_margin)
-    c, wrench = d.contacts, [d.force, d.torque]
+    c = d.contacts
     out.add(
         penalties.points_to_bodies, (d.capacity, m.lanes),
         inputs=[0.0, m.lane, d.active, d.iteration, d.schedule.penetration, c.count, c.body, c.point, c.normal,
                 c.distance, c.weight, c.gradient],
-        outputs=[*wrench, d.depths.points],
+        outputs=[d.wrench, d.depths.points],
     )  # fmt: skip
     if m.obstacles is not None:
         out.add(obstacles.clear, d.capacity, inputs=[d.active], outputs=[d.depths.obstacles])
@@ -129,14 +155,14 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
             obstacles.penalty, (d.capacity, m.pieces),
             inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, d.iteration, d.schedule.penetration,
                     d.body_p, d.body_q, room],
-            outputs=[*wrench, d.depths.obstacles],
+            outputs=[d.wrench, d.depths.obstacles],
         )  # fmt: skip
     if m.obstacles is not None and m.obstacles.any_solid:
         out.add(
             solids.penalty, (d.capacity, m.pieces),
             inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, d.iteration,
                     d.schedule.penetration, d.body_p, d.body_q, room],
-            outputs=[*wrench, d.depths.obstacles],
+            outputs=[d.wrench, d.depths.obstacles],
         )  # fmt: skip
 
 
@@ -146,7 +172,7 @@ def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
         pieces.object_in_pieces, (d.capacity, m.pieces),
         inputs=[m.hand.pieces, m.obj.sorted_samples, REFERENCE_SAMPLES / len(m.obj.samples),
                 d.active, d.iteration, d.schedule.object_penetration, d.body_p, d.body_q],
-        outputs=[d.force, d.torque, d.depths.object],
+        outputs=[d.wrench, d.depths.object],
     )  # fmt: skip
 
 
@@ -156,7 +182,7 @@ def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
         pieces.pieces_in_pieces, (d.capacity, m.pieces),
         inputs=[m.hand.pieces, m.body_points, m.self_scale, margin,
                 d.active, d.iteration, d.schedule.self_penetration, d.body_p, d.body_q],
-        outputs=[d.force, d.torque, d.depths.links],
+        outputs=[d.wrench, d.depths.links],
     )  # fmt: skip
 
 
@@ -164,7 +190,7 @@ def add_root_gradient(out: Launches, m: Model, d: Data) -> None:
     """The gradient with respect to root and joints, from what bodies accumulated."""
     out.add(
         kinematics.backward, d.capacity,
-        inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis], outputs=[d.force, d.torque, d.gradient],
+        inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis], outputs=[d.wrench, d.gradient],
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from tests.worker.simulation.rigs import ball, rig
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
-from worker.simulation.kernels import kinematics
+from worker.simulation.kernels import kinematics, wrenches
 from worker.simulation.record import record_placement
 from worker.simulation.state import HandState
 
@@ -132,12 +132,12 @@ def test_the_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> 
     record_placement(model, data).run()
     poses = body_poses(hand, root_poses(hand, state), joints)[0]
     points = apply(poses, local)
-    data.force.assign(force[None].astype(np.float32))
-    data.torque.assign(np.cross(points, force)[None].astype(np.float32))
+    wrench = np.concatenate([force, np.cross(points, force)], axis=1)
+    data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
     wp.launch(
         kinematics.backward, 1,
         inputs=[model.hand.tree, data.active, data.pivot, data.body_p, data.axis],
-        outputs=[data.force, data.torque, data.gradient],
+        outputs=[data.wrench, data.gradient],
         device="cpu",
     )  # fmt: skip
     # Sums of up to 23 float32 products of size 1.

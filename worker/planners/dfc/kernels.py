@@ -20,6 +20,7 @@ from worker.planners.dfc.schedule import (
 from worker.simulation.kernels.optimizers import turn
 from worker.simulation.kernels.pieces import Pieces, in_box, piece_centre, piece_distance, piece_rotation, world_extent
 from worker.simulation.kernels.surface import Surface, mesh_distance
+from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -120,8 +121,7 @@ def force_closure(
     body_q_in: wp.array2d(dtype=wp.quat),
     # Data out:
     energy_out: wp.array2d(dtype=wp.float32),
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
 ):
     """E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|; normals count as constant. Columns 0 and 1. Over B."""
     b = wp.tid()
@@ -141,8 +141,7 @@ def force_closure(
         sample = mesh_distance(surface_in, x, FAR)
         distance_sum += wp.abs(sample.distance)
         gradient = 2.0 * wp.cross(sample.normal, t) + (W_DISTANCE * wp.sign(sample.distance)) * sample.normal
-        wp.atomic_add(force_inout, b, body, gradient)
-        wp.atomic_add(torque_inout, b, body, wp.cross(x, gradient))
+        add_wrench(wrench_inout, b, body, gradient, wp.cross(x, gradient))
     energy_out[b, 0] = wp.dot(f, f) + wp.dot(t, t)
     energy_out[b, 1] = distance_sum
 
@@ -158,8 +157,7 @@ def penetration(
     body_q_in: wp.array2d(dtype=wp.quat),
     # Data out:
     energy_inout: wp.array2d(dtype=wp.float32),
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
 ):
     """E_pen = sum of depths of object samples in pieces of the hand, column 2. Launch over (B, P)."""
     b, piece = wp.tid()
@@ -186,8 +184,7 @@ def penetration(
                 torque += wp.cross(x, f)
     if total > 0.0:
         wp.atomic_add(energy_inout, b, 2, total)
-        wp.atomic_add(force_inout, b, body, force)
-        wp.atomic_add(torque_inout, b, body, torque)
+        add_wrench(wrench_inout, b, body, force, torque)
 
 
 @wp.kernel
@@ -202,8 +199,7 @@ def self_penetration(
     body_q_in: wp.array2d(dtype=wp.quat),
     # Data out:
     energy_inout: wp.array2d(dtype=wp.float32),
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
 ):
     """E_spen = sum of max(0, gap - distance) over pairs of key points, column 3. Launch over (B, pairs)."""
     b, pair = wp.tid()
@@ -215,10 +211,8 @@ def self_penetration(
     if apart < GAP and apart > 1.0e-9:
         wp.atomic_add(energy_inout, b, 3, GAP - apart)
         f = (-W_SELF / apart) * (x - y)
-        wp.atomic_add(force_inout, b, body_in[i], f)
-        wp.atomic_add(torque_inout, b, body_in[i], wp.cross(x, f))
-        wp.atomic_add(force_inout, b, body_in[j], -f)
-        wp.atomic_add(torque_inout, b, body_in[j], -wp.cross(y, f))
+        add_wrench(wrench_inout, b, body_in[i], f, wp.cross(x, f))
+        add_wrench(wrench_inout, b, body_in[j], -f, -wp.cross(y, f))
 
 
 @wp.kernel

@@ -103,7 +103,7 @@ class Descent:
 
     def _record(self) -> Launches:
         s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
-        pose, own = [s.body_p, s.body_q], [self.new_terms, s.force, s.torque]
+        pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
         out.add(
             kernels.propose, n,
             inputs=[len(self.candidates), s.iteration, self.gradient, *self.state, self.contact],

@@ -13,6 +13,7 @@ sum |f - F|^2. In that gradient points that do not touch leak a share of it, so 
 import warp as wp
 
 from worker.simulation.kernels.surface import Surface, field_distance
+from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -124,8 +125,7 @@ def relax(
     first_inout: wp.array3d(dtype=wp.vec3),
     largest_inout: wp.array3d(dtype=wp.vec3),
     total_inout: wp.array2d(dtype=vec6),
-    wrench_force_inout: wp.array2d(dtype=wp.vec3),
-    wrench_torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
 ):
     """A step of Adamax on every force, then the gradient of sum |f - F|^2 on the bodies. Launch over (B, N)."""
     b, i = wp.tid()
@@ -166,8 +166,7 @@ def relax(
     g_distance = -slope_sum
     if g_distance != 0.0 and sample.distance < 1.0e2:
         f = g_distance * n
-        wp.atomic_add(wrench_force_inout, b, body, f)
-        wp.atomic_add(wrench_torque_inout, b, body, wp.cross(x, f))
+        add_wrench(wrench_inout, b, body, f, wp.cross(x, f))
 
 
 @wp.kernel

@@ -139,7 +139,7 @@ class _Batch:
             kernels.relax, (n, POINTS),
             inputs=[self.physics, self.grid, self.velocity, m.point_body, m.point_position, d.active, d.iteration,
                     d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q, self.pull],
-            outputs=[self.force, self.first, self.largest, self.total, d.force, d.torque],
+            outputs=[self.force, self.first, self.largest, self.total, d.wrench],
         )  # fmt: skip
         add_self_penalty(out, m, d, 0.0)
         add_root_gradient(out, m, d)

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from worker.simulation.kernels.wrenches import Wrenches, clear_wrench, force_on, torque_on
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -33,8 +35,7 @@ def forward(
     body_p_out: wp.array2d(dtype=wp.vec3),
     body_q_out: wp.array2d(dtype=wp.quat),
     axis_out: wp.array2d(dtype=wp.vec3),
-    force_out: wp.array2d(dtype=wp.vec3),
-    torque_out: wp.array2d(dtype=wp.vec3),
+    wrench_out: Wrenches,
     count_out: wp.array(dtype=wp.int32),
     near_count_out: wp.array(dtype=wp.int32),
     point_depth_out: wp.array(dtype=wp.float32),
@@ -52,8 +53,7 @@ def forward(
     self_depth_out[b] = 0.0
     body_q_out[b, 0] = rotation_in[b]
     body_p_out[b, 0] = pivot_in[b] - wp.quat_rotate(rotation_in[b], tree_in.pivot)
-    force_out[b, 0] = wp.vec3(0.0)
-    torque_out[b, 0] = wp.vec3(0.0)
+    clear_wrench(wrench_out, b, 0)
     for body in range(1, tree_in.parent.shape[0]):
         parent = tree_in.parent[body]
         pq = body_q_out[b, parent]
@@ -68,8 +68,7 @@ def forward(
         body_p_out[b, body] = p
         body_q_out[b, body] = q
         axis_out[b, body] = axis
-        force_out[b, body] = wp.vec3(0.0)
-        torque_out[b, body] = wp.vec3(0.0)
+        clear_wrench(wrench_out, b, body)
 
 
 @wp.kernel
@@ -82,8 +81,7 @@ def backward(
     body_p_in: wp.array2d(dtype=wp.vec3),
     axis_in: wp.array2d(dtype=wp.vec3),
     # Data out:
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
     gradient_out: wp.array2d(dtype=wp.float32),
 ):
     """Gradient (B, 6 + D) of a loss whose gradient at body l is the wrench (force, torque about the object's origin).
@@ -98,8 +96,8 @@ def backward(
     count = tree_in.parent.shape[0]
     for k in range(1, count):
         body = count - k
-        f = force_inout[b, body]
-        t = torque_inout[b, body]
+        f = force_on(wrench_inout, b, body)
+        t = torque_on(wrench_inout, b, body)
         axis = axis_in[b, body]
         g = wp.dot(axis, f)
         if tree_in.joint_type[body] == 1:
@@ -107,10 +105,10 @@ def backward(
         column = 6 + tree_in.dof[body]
         gradient_out[b, column] = gradient_out[b, column] + tree_in.multiplier[body] * g
         parent = tree_in.parent[body]
-        force_inout[b, parent] = force_inout[b, parent] + f
-        torque_inout[b, parent] = torque_inout[b, parent] + t
-    f = force_inout[b, 0]
-    t = torque_inout[b, 0] - wp.cross(pivot_in[b], f)
+        for i in range(6):
+            wrench_inout[b, parent, i] = wrench_inout[b, parent, i] + wrench_inout[b, body, i]
+    f = force_on(wrench_inout, b, 0)
+    t = torque_on(wrench_inout, b, 0) - wp.cross(pivot_in[b], f)
     for i in range(3):
         gradient_out[b, i] = f[i]
         gradient_out[b, 3 + i] = t[i]

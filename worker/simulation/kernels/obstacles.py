@@ -6,7 +6,8 @@ Half-spaces need no more and are seen exactly; for solids see `solids`.
 
 import warp as wp
 
-from worker.simulation.kernels.projection import Residuals, emit
+from worker.simulation.kernels.projection import Residuals, emit, key_of
+from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -169,8 +170,7 @@ def penalty(
     # In:
     room_in: wp.float32,
     # Data out:
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Half-spaces: gradient of w sum w_i min(h_i - margin_i - room, 0)^2; deepest shortfall per grasp. Over (B, P)."""
@@ -189,8 +189,7 @@ def penalty(
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 if weight != 0.0:
                     force = (weight * short) * n
-                    wp.atomic_add(force_inout, b, f.body, force)
-                    wp.atomic_add(torque_inout, b, f.body, wp.cross(lowest_point(f, n), force))
+                    add_wrench(wrench_inout, b, f.body, force, wp.cross(lowest_point(f, n), force))
                 wp.atomic_max(depth_inout, b, -short)
 
 
@@ -223,4 +222,5 @@ def residuals(
             margin = kept(features_in, obstacles_in, i, k, 0.0)
             if nd[3] < margin + near_in:
                 n = wp.vec3(nd[0], nd[1], nd[2])
-                emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, nd[3] - margin - target_in, 1.0)
+                gap = nd[3] - margin - target_in
+                emit(residuals_out, b, key_of(3, i, k), f.body, -1, lowest_point(f, n), n, gap, 1.0)

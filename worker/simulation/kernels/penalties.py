@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from worker.simulation.kernels.wrenches import Wrenches, add_wrench
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -22,8 +24,7 @@ def points_to_bodies(
     weight_in: wp.array2d(dtype=wp.float32),
     gradient_in: wp.array2d(dtype=wp.float32),
     # Data out:
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Wrench gradient on bodies from dL/drho, with the penetration term w sum w_i min(rho - clearance, 0)^2 added.
@@ -44,8 +45,7 @@ def points_to_bodies(
         if g != 0.0:
             body = body_in[b, i]
             f = g * normal_in[b, i]
-            wp.atomic_add(force_inout, b, body, f)
-            wp.atomic_add(torque_inout, b, body, wp.cross(point_in[b, i], f))
+            add_wrench(wrench_inout, b, body, f, wp.cross(point_in[b, i], f))
 
 
 @wp.kernel

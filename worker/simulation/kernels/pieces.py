@@ -3,6 +3,8 @@ links. Thin parts of an object pass between hand points; they do not pass betwee
 
 import warp as wp
 
+from worker.simulation.kernels.wrenches import Wrenches, add_wrench
+
 wp.set_module_options({"enable_backward": False})
 
 BOX = wp.constant(0)
@@ -175,8 +177,7 @@ def object_in_pieces(
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
     # Data out:
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Gradient of w sum depth^2 over object surface samples inside a piece; deepest depth per grasp. Over (B, P).
@@ -230,8 +231,7 @@ def object_in_pieces(
                             torque += wp.cross(x, f)
                             deepest = wp.max(deepest, depth)
     if deepest > 0.0:
-        wp.atomic_add(force_inout, b, body, force)
-        wp.atomic_add(torque_inout, b, body, torque)
+        add_wrench(wrench_inout, b, body, force, torque)
         wp.atomic_max(depth_inout, b, deepest)
 
 
@@ -277,8 +277,7 @@ def pieces_in_pieces(
     body_p_in: wp.array2d(dtype=wp.vec3),
     body_q_in: wp.array2d(dtype=wp.quat),
     # Data out:
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Gradient of w sum (depth + margin)^2 over hand points inside pieces of bodies they must stay clear of.
@@ -318,8 +317,6 @@ def pieces_in_pieces(
                 f = wp.quat_rotate(q, force)
                 # About the object's origin: the sum was about the piece's.
                 t = wp.quat_rotate(q, torque) + wp.cross(p, f)
-                wp.atomic_add(force_inout, b, other, f)
-                wp.atomic_add(torque_inout, b, other, t)
-                wp.atomic_add(force_inout, b, own, -f)
-                wp.atomic_add(torque_inout, b, own, -t)
+                add_wrench(wrench_inout, b, other, f, t)
+                add_wrench(wrench_inout, b, own, -f, -t)
                 wp.atomic_max(depth_inout, b, deepest)

@@ -34,16 +34,25 @@ class Residuals:
     point: wp.array2d(dtype=wp.vec3)
     direction: wp.array2d(dtype=wp.vec3)  # moving the body by it increases d
     value: wp.array2d(dtype=wp.float32)  # d - target [m]
+    key: wp.array2d(dtype=wp.int64)  # order in which they are summed
+    order: wp.array2d(dtype=wp.int32)  # their slots in that order
     weight: wp.array2d(dtype=wp.float32)
 
 
 @wp.func
+def key_of(kind: wp.int32, thread: wp.int32, serial: wp.int32):
+    """Where the residual that a thread of a launch emits as its `serial`-th comes; launches have kinds 0, 1, ..."""
+    return (wp.int64(kind) << wp.int64(56)) + (wp.int64(thread) << wp.int64(28)) + wp.int64(serial)
+
+
+@wp.func
 def emit(
-    out: Residuals, b: wp.int32, body: wp.int32, other: wp.int32, point: wp.vec3, direction: wp.vec3,
+    out: Residuals, b: wp.int32, key: wp.int64, body: wp.int32, other: wp.int32, point: wp.vec3, direction: wp.vec3,
     value: wp.float32, weight: wp.float32,
 ):  # fmt: skip
     k = wp.atomic_add(out.count, b, 1)
     if k < out.body.shape[1]:
+        out.key[b, k] = key
         out.body[b, k] = body
         out.other[b, k] = other
         out.point[b, k] = point
@@ -82,10 +91,12 @@ def point_residuals(
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
         rho = distance_in[b, i]
         if rho < near_in:
-            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
+            key = key_of(0, i, 0)
+            emit(residuals_out, b, key, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
         elif rho < hold_in:
             gap = rho - hold_target_in
-            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], gap, hold_weight_in)
+            key = key_of(0, i, 0)
+            emit(residuals_out, b, key, body_in[b, i], -1, point_in[b, i], normal_in[b, i], gap, hold_weight_in)
 
 
 @wp.kernel
@@ -119,6 +130,7 @@ def sample_residuals(
     ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
     zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
     back = wp.transpose(wp.quat_to_matrix(q))
+    emitted = wp.int32(0)
     if xs[0] <= xs[1] and ys[0] <= ys[1] and zs[0] <= zs[1]:
         for i in range(xs[0], xs[1] + 1):
             for j in range(ys[0], ys[1] + 1):
@@ -131,7 +143,8 @@ def sample_residuals(
                         if nd[3] < near_in:
                             n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
                             # The link moving along its own outward normal comes nearer: d falls.
-                            emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
+                            emit(residuals_out, b, key_of(1, piece, emitted), body, -1, x, -n, nd[3] - target_in, 1.0)
+                            emitted += 1
 
 
 @wp.kernel
@@ -158,6 +171,7 @@ def self_residuals(
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
     reach = wp.length(pieces_in.half[piece]) + near_in
+    emitted = wp.int32(0)
     for own in range(body_p_in.shape[1]):
         if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
             # From the body's frame straight into the piece's.
@@ -170,7 +184,8 @@ def self_residuals(
                     if nd[3] < near_in:
                         x = p + wp.quat_rotate(q, local)
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                        emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
+                        emit(residuals_out, b, key_of(2, piece, emitted), own, other, x, n, nd[3] - target_in, 1.0)
+                        emitted += 1
 
 
 @wp.func
@@ -216,7 +231,8 @@ def normal_equations(
         for j in range(n):
             matrix_out[b, i, j] = 0.0
     count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
-    for k in range(count):
+    for place in range(count):
+        k = residuals_in.order[b, place]
         for i in range(n):
             row_out[b, i] = 0.0
         body = residuals_in.body[b, k]

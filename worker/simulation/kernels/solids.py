@@ -11,7 +11,8 @@ import warp as wp
 
 from worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
 from worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
-from worker.simulation.kernels.projection import Residuals, emit
+from worker.simulation.kernels.projection import Residuals, emit, key_of
+from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -235,8 +236,7 @@ def penalty(
     # In:
     room_in: wp.float32,
     # Data out:
-    force_inout: wp.array2d(dtype=wp.vec3),
-    torque_inout: wp.array2d(dtype=wp.vec3),
+    wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Gradient of w sum min(d - margin - room, 0)^2 over features, and the nearest edge of each pair. Over (B, P)."""
@@ -257,15 +257,13 @@ def penalty(
             if short < 0.0:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 force = (weight * short) * n
-                wp.atomic_add(force_inout, b, body, force)
-                wp.atomic_add(torque_inout, b, body, wp.cross(lowest_point(f, n), force))
+                add_wrench(wrench_inout, b, body, force, wp.cross(lowest_point(f, n), force))
                 wp.atomic_max(depth_inout, b, -short)
         near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
         short = near.distance - keep
         if short < 0.0:
             force = (weight * short) * near.direction
-            wp.atomic_add(force_inout, b, body, force)
-            wp.atomic_add(torque_inout, b, body, wp.cross(near.point, force))
+            add_wrench(wrench_inout, b, body, force, wp.cross(near.point, force))
             wp.atomic_max(depth_inout, b, -short)
 
 
@@ -292,6 +290,7 @@ def residuals(
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
+    emitted = wp.int32(0)
     for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
         margin = kept(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
@@ -303,10 +302,14 @@ def residuals(
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < keep:
                 n = wp.vec3(nd[0], nd[1], nd[2])
-                emit(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
+                key = key_of(4, piece, emitted)
+                emit(residuals_out, b, key, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
+                emitted += 1
         near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
         if near.distance < keep:
-            emit(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
+            key = key_of(4, piece, emitted)
+            emit(residuals_out, b, key, body, -1, near.point, near.direction, near.distance - target, 1.0)
+            emitted += 1
 
 
 @wp.kernel

@@ -266,26 +266,37 @@ def gather(
     gradient_out: wp.array2d(dtype=wp.float32),
     near_count_inout: wp.array(dtype=wp.int32),
     near_out: wp.array2d(dtype=wp.int32),
+    mark_out: wp.array2d(dtype=wp.int32),
 ):
     """Candidate contacts: hand points nearer than dilation + keep, packed per grasp; `near` lists those with a gap of
-    at most `near_gap`. Launch over (B, N / lane)."""
+    at most `near_gap`. Launch over (B, N / lane).
+
+    With room for `mark` each point writes to its own place, marked, for `packing.pack` to put them side by side.
+    """
     b, part = wp.tid()
     if active_in[b] == 0:
         return
     dilation = dilation_scale_in[b] * dilation_in[iteration_in[0]]
     reach = dilation + band_in
     keep = dilation + keep_in
+    apart = mark_out.shape[0] > 0
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, body_in.shape[0])):
         body = body_in[i]
         point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
         sample = distance(surface_in, point, reach, exact_in, keep)
-        if sample.distance < keep:
+        kept = sample.distance < keep
+        near = kept and sample.distance - dilation <= near_gap_in
+        k = i
+        if apart:
+            mark_out[b, i] = wp.int32(kept) + wp.int32(near)
+        elif kept:
             k = wp.atomic_add(count_inout, b, 1)
+            if near:
+                near_out[b, wp.atomic_add(near_count_inout, b, 1)] = k
+        if kept:
             contact_body_out[b, k] = body
             contact_point_out[b, k] = point
             contact_normal_out[b, k] = sample.normal
             contact_distance_out[b, k] = sample.distance
             contact_weight_out[b, k] = weight_in[i]
             gradient_out[b, k] = 0.0
-            if sample.distance - dilation <= near_gap_in:
-                near_out[b, wp.atomic_add(near_count_inout, b, 1)] = k

@@ -1,0 +1,51 @@
+"""Wrenches on bodies, summed by many threads at once: in whole numbers, so that no order of the threads changes a bit.
+
+A wrench is six counts of `UNIT`: force and torque about the object's origin. Float32 sums depend on their order, which
+on a GPU is another at each run.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: What one count stands for: 2^-36, below the rounding of any float32 above 1e-4. Sums may reach 1.3e8.
+UNIT = wp.constant(1.0 / 68719476736.0)
+PER_UNIT = wp.constant(68719476736.0)
+#: Largest component that one thread may add: hands far inside an object reach about 1e4.
+MOST = wp.constant(1.0e6)
+
+Wrenches = wp.array3d(dtype=wp.int64)
+"""(B, L, 6)."""
+
+
+@wp.func
+def counts(x: wp.float32):
+    """A component in units; what is no finite number counts nothing: its hand shows that itself."""
+    if not wp.isfinite(x):
+        return wp.int64(0)
+    return wp.int64(wp.clamp(x, -MOST, MOST) * PER_UNIT)
+
+
+@wp.func
+def add_wrench(wrench: Wrenches, b: wp.int32, body: wp.int32, force: wp.vec3, torque: wp.vec3):
+    """Add to the wrench on a body of hand b."""
+    for i in range(3):
+        wp.atomic_add(wrench, b, body, i, counts(force[i]))
+        wp.atomic_add(wrench, b, body, 3 + i, counts(torque[i]))
+
+
+@wp.func
+def clear_wrench(wrench: Wrenches, b: wp.int32, body: wp.int32):
+    for i in range(6):
+        wrench[b, body, i] = wp.int64(0)
+
+
+@wp.func
+def force_on(wrench: Wrenches, b: wp.int32, body: wp.int32):
+    return UNIT * wp.vec3(float(wrench[b, body, 0]), float(wrench[b, body, 1]), float(wrench[b, body, 2]))
+
+
+@wp.func
+def torque_on(wrench: Wrenches, b: wp.int32, body: wp.int32):
+    """About the object's origin."""
+    return UNIT * wp.vec3(float(wrench[b, body, 3]), float(wrench[b, body, 4]), float(wrench[b, body, 5]))
