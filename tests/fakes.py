@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import os
 import sys
@@ -137,7 +138,8 @@ def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
     FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
-    long each task holds the interpreter lock, and while there is a file FAKE_BROKEN nothing works.
+    long each task holds the interpreter lock, and while there is a file FAKE_BROKEN nothing works. Of the options of
+    `graspd worker` it takes `--burst` and `--idle`.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
@@ -164,7 +166,12 @@ def main() -> None:
         leaked.append(os.urandom(2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 
-    sys.exit(0 if run_worker(settings, table=table | {Stage.SYNTHESIZE: synthesize}, check=check) else 1)
+    options = argparse.ArgumentParser()
+    options.add_argument("--burst", action="store_true")
+    options.add_argument("--idle", type=int, default=0)
+    wanted, _ = options.parse_known_args()
+    table |= {Stage.SYNTHESIZE: synthesize}
+    sys.exit(0 if run_worker(settings, table=table, check=check, burst=wanted.burst, idle_s=wanted.idle) else 1)
 
 
 if __name__ == "__main__":

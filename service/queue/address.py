@@ -18,7 +18,21 @@ def redis_url(settings: Settings) -> str:
     """The Redis of these settings: GRASPD_REDIS_URL, or else the one that `graspd up` starts for the data folder."""
     if settings.redis_url is not None:
         return settings.redis_url.get_secret_value()
-    return f"unix://{socket_path(settings.data_dir)}"
+    secret = password(settings.data_dir)
+    return f"unix://{f':{secret}@' if secret else ''}{socket_path(settings.data_dir)}"
+
+
+def password(data_dir: Path) -> str:
+    """What the embedded Redis of a data folder asks for; "" if it listens on its private socket alone."""
+    try:
+        return password_file(data_dir).read_text().strip()
+    except OSError:
+        return ""
+
+
+def password_file(data_dir: Path) -> Path:
+    """Where the password of an embedded Redis is kept, readable by its user alone."""
+    return data_dir.resolve() / "redis" / "password"
 
 
 def socket_path(data_dir: Path) -> Path:

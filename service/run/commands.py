@@ -32,11 +32,21 @@ def up(
     host: Annotated[str | None, typer.Option(help="Address the API binds; GRASPD_HOST.")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port of the API, 0: any; GRASPD_PORT.")] = None,
     device: Annotated[str | None, typer.Option(help="Device of the workers: cpu, cuda:0, auto; GRASPD_DEVICE.")] = None,
+    join: Annotated[
+        Path | None, typer.Option(help="Let workers of other machines join: write to this file what they need.")
+    ] = None,
+    join_host: Annotated[
+        str | None, typer.Option(help="With --join: how they call this machine; default: its name.")
+    ] = None,
+    redis_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="With --join: port of Redis for them; 0: any free one.")
+    ] = 0,
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
     """The whole service on this machine, until Ctrl-C."""
     _check_rooms(workers)
+    from service.run.joining import joining
     from service.run.supervisor import Supervisor
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
@@ -44,7 +54,8 @@ def up(
     keep_private(settings)
     stop = stop_on_signals()
     console = Console(stderr=True)
-    supervisor = Supervisor(settings, workers=workers)
+    others = joining(settings, join, host=join_host, port=redis_port) if join is not None else None
+    supervisor = Supervisor(settings, workers=workers, joining=others)
     supervisor.start()
     try:
         supervisor.wait_ready(_READY_S)

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import IO, Final
 
 from service.model.errors import BusyError, QueueUnavailable
-from service.queue.address import socket_path
+from service.queue.address import password_file, socket_path
+from service.run.joining import Joining
 from service.settings import Settings
 
 
@@ -32,8 +33,12 @@ def find_server() -> tuple[Path, str]:
     )
 
 
-def server_command(settings: Settings) -> list[str]:
-    """The command that runs the embedded Redis in the foreground. Makes its folders; call `own_redis` first."""
+def server_command(settings: Settings, joining: Joining | None = None) -> list[str]:
+    """The command that runs the embedded Redis in the foreground. Makes its folders; call `own_redis` first.
+
+    Args:
+        joining: where it listens for other machines; None: on its private socket alone.
+    """
     server, _ = find_server()
     folder = settings.data_dir.resolve() / "redis"
     socket = socket_path(settings.data_dir)
@@ -52,7 +57,22 @@ def server_command(settings: Settings) -> list[str]:
         "maxmemory-policy": "noeviction",
         "daemonize": "no",
     }
-    return [str(server), *(part for name, value in options.items() for part in (f"--{name}", value))]
+    secret = password_file(settings.data_dir)
+    secret.unlink(missing_ok=True)
+    # A password among the arguments would be read by every user of the machine.
+    configuration = []
+    if joining is not None:
+        options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
+        _write_private(secret, joining.password)
+        _write_private(folder / "redis.conf", f"requirepass {joining.password}\n")
+        configuration = [str(folder / "redis.conf")]
+    return [str(server), *configuration, *(part for name, value in options.items() for part in (f"--{name}", value))]
+
+
+def _write_private(file: Path, text: str) -> None:
+    file.unlink(missing_ok=True)
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
+        opened.write(text)
 
 
 def own_redis(settings: Settings) -> IO[str]:

@@ -23,6 +23,7 @@ from service.queue.rq_queue import open_queue
 from service.run.address import forget_address, record_address
 from service.run.children import Child, end_leftovers
 from service.run.embedded import find_server, lock_file, own_redis, server_command
+from service.run.joining import Joining
 from service.settings import Settings
 from service.store.store import open_store
 
@@ -42,14 +43,16 @@ class Supervisor:
         workers: int = 1,
         api: bool = True,
         worker_command: Sequence[str] = (*_PROGRAM, "worker"),
+        joining: Joining | None = None,
     ) -> None:
-        """`settings.port` 0 picks a free port."""
+        """`settings.port` 0 picks a free port; `joining` lets workers of other machines in."""
         if workers < 0:
             raise InputError("the number of workers cannot be negative")
         self._wanted = settings
         self._workers = workers
         self._api = api
         self._worker_command = tuple(worker_command)
+        self._joining = joining
         self._locks: list[IO[str]] = []
         self._children: list[Child] = []
         self._thread: threading.Thread | None = None
@@ -156,7 +159,7 @@ class Supervisor:
     def _plan(self) -> list[Child]:
         environment = {
             "GRASPD_DATA_DIR": str(self.settings.data_dir),
-            "GRASPD_REDIS_URL": redis_url(self.settings),
+            "GRASPD_REDIS_URL": self._joining.redis_url if self._joining else redis_url(self.settings),
             "GRASPD_HOST": self.settings.host,
             "GRASPD_PORT": str(self.settings.port),
             "GRASPD_API_URL": self.api_url,
@@ -170,7 +173,7 @@ class Supervisor:
         if self._wanted.redis_url is None:
             self._locks.append(own_redis(self.settings))
             log.info("Redis: %s, from %s", *find_server())
-            children.append(child("redis", *server_command(self.settings)))
+            children.append(child("redis", *server_command(self.settings, self._joining)))
         children.append(child("keeper", *_PROGRAM, "keeper"))
         if self._api:
             children.append(child("api", *_PROGRAM, "api"))
@@ -205,6 +208,8 @@ class Supervisor:
         return [child for child in self._children if child.name.startswith(prefixes)]
 
     def _record(self, folder: Path) -> None:
+        if self._joining is not None:
+            self._joining.write(self.settings, self.api_url)
         if not self._api:
             return
         try:
@@ -213,6 +218,8 @@ class Supervisor:
             log.warning("where the API answers cannot be noted in %s: %s", folder, error.strerror)
 
     def _release(self) -> None:
+        if self._locks and self._joining is not None:
+            self._joining.forget()
         if self._locks and self._api:
             forget_address(self._wanted.data_dir.resolve())
         for lock in self._locks:

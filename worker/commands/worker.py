@@ -28,6 +28,7 @@ def worker(
     workers: Annotated[int, typer.Option(min=1, help="Processes; with device auto each takes the next GPU.")] = 1,
     threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
     burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
+    idle: Annotated[int, typer.Option(min=0, help="With --burst: end when none came for so long [s].")] = 0,
     once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
     max_tasks: Annotated[int | None, typer.Option(min=1, help="End after this many tasks.")] = None,
     check: Annotated[
@@ -51,7 +52,11 @@ def worker(
 
     tracing.set_up("worker")
     ended_well = run_worker(
-        settings, stages=_parse_stages(stages), burst=burst or once, max_tasks=1 if once else max_tasks
+        settings,
+        stages=_parse_stages(stages),
+        burst=burst or once,
+        idle_s=idle,
+        max_tasks=1 if once else max_tasks,
     )
     _end(0 if ended_well else 1)
 

@@ -269,12 +269,14 @@ def run_worker(
     table: Mapping[Stage, StageFunction] | None = None,
     check: Check | None = None,
     burst: bool = False,
+    idle_s: int = 0,
     max_tasks: int | None = None,
 ) -> bool:
     """Do tasks until told to stop; with `burst` until none waits, with `max_tasks` that many.
 
     Args:
         table: what each stage does; the real ones by default.
+        idle_s: with `burst`: how long it waits for a task before none waits [s].
         check: of what they run on, before the first task and in doubt; that of the real engine if the stages are.
 
     Returns:
@@ -304,7 +306,13 @@ def run_worker(
         device.find_out(lambda: heart.update(device=device.resolve(), device_name=device.name))
         if not _admitted(fitness, heart, stages, limit_s=settings.task_timeout_s, patient=does_all):
             return False
-        worker.work(burst=burst, max_jobs=max_tasks, logging_level="WARNING")
+        patient = burst and idle_s > 0
+        worker.work(
+            burst=burst and not patient,
+            max_jobs=max_tasks,
+            max_idle_time=idle_s if patient else None,
+            logging_level="WARNING",
+        )
     finally:
         heart.stop()
         queue.close()

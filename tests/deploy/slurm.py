@@ -1,0 +1,162 @@
+"""A cluster of one machine that runs batch scripts as Slurm does: arrays, preemption, lost nodes, time limits.
+
+It knows the options that our scripts use and refuses all others, so that a misspelt one is found.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+#: Options of sbatch that a script may use, and what each looks like.
+_OPTIONS: Final = {
+    "job-name": r"[\w-]+",
+    "nodes": r"1",
+    "ntasks": r"1",
+    "cpus-per-task": r"\d+",
+    "mem": r"\d+[MG]",
+    "time": r"(\d+-)?\d\d:\d\d:\d\d",
+    "requeue": r"",
+    "open-mode": r"append",
+    "signal": r"B:USR1@\d+",
+    "output": r"[\w%-]+\.log",
+    "array": r"\d+-\d+",
+    "gpus": r"\d+",
+}
+
+
+def directives(script: Path) -> dict[str, str]:
+    """Options in a batch script. Slurm reads them up to the first command; ValueError for one that is unknown."""
+    found = {}
+    for line in script.read_text().splitlines()[1:]:
+        if line.strip() and not line.startswith("#"):
+            break
+        if line.startswith("#SBATCH "):
+            name, _, value = line.removeprefix("#SBATCH --").partition("=")
+            if name not in _OPTIONS or not re.fullmatch(_OPTIONS[name], value):
+                raise ValueError(f"{script.name}: {line}")
+            found[name] = value
+    return found
+
+
+@dataclass
+class Element:
+    """One element of an array, or a job without one."""
+
+    id: int
+    script: Path
+    environment: Mapping[str, str]
+    log: Path
+    restarts: int = 0
+    process: subprocess.Popen[bytes] | None = None
+    ended: list[int] = field(default_factory=list)
+    """Exit codes of the runs that ended."""
+
+    def start(self) -> None:
+        """Run the script in a process group of its own, as a step's processes are."""
+        environment = {**self.environment, "SLURM_JOB_ID": str(self.id), "SLURM_RESTART_COUNT": str(self.restarts)}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                ["bash", str(self.script)], stdout=log, stderr=log, env=environment, start_new_session=True
+            )
+
+    def signal(self, number: int, *, everybody: bool) -> None:
+        """To all processes of the job, or to the batch shell alone (`B:`)."""
+        assert self.process is not None
+        (os.killpg if everybody else os.kill)(self.process.pid, number)
+
+    def wait(self, seconds: float) -> int:
+        """Exit code of the run."""
+        assert self.process is not None
+        code = self.process.wait(seconds)
+        self.ended.append(code)
+        return code
+
+
+class FakeSlurm:
+    """The cluster. `folder` holds its commands and logs."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.elements: list[Element] = []
+        (folder / "bin").mkdir(parents=True)
+        (folder / "requeued").mkdir()
+        scontrol = folder / "bin" / "scontrol"
+        scontrol.write_text(f'#!/bin/sh\n[ "$1" = requeue ] && touch "{folder}/requeued/$2"\n')
+        scontrol.chmod(0o755)
+
+    def sbatch(self, script: Path, environment: Mapping[str, str], *, array: int = 0) -> list[Element]:
+        """Start a script, `array` times over."""
+        options = directives(script)
+        first = 1000 + len(self.elements)
+        base = {
+            **environment,
+            "PATH": f"{self.folder / 'bin'}:{environment['PATH']}",
+            "SLURM_CPUS_PER_TASK": options["cpus-per-task"],
+        }
+        made = []
+        for number in range(array or 1):
+            of_array = {"SLURM_ARRAY_JOB_ID": str(first), "SLURM_ARRAY_TASK_ID": str(number)} if array else {}
+            log = self.folder / f"{first}_{number}.log"
+            made.append(Element(first + number, script, {**base, **of_array}, log))
+            made[-1].start()
+        self.elements += made
+        return made
+
+    def preempt(self, element: Element, *, grace_s: float) -> None:
+        """SIGTERM to all, SIGKILL after the grace time, and again from the start."""
+        element.signal(signal.SIGTERM, everybody=True)
+        try:
+            element.wait(grace_s)
+        finally:
+            self._again(element)
+
+    def lose_node(self, element: Element) -> None:
+        """SIGKILL to all without a word, and again from the start."""
+        element.signal(signal.SIGKILL, everybody=True)
+        element.wait(10)
+        self._again(element)
+
+    def reach_time_limit(self, element: Element, *, notice_s: float) -> bool:
+        """SIGUSR1 to the batch shell, SIGKILL after the notice; whether the script asked to be queued again."""
+        element.signal(signal.SIGUSR1, everybody=False)
+        element.wait(notice_s)
+        asked = self.folder / "requeued" / str(element.id)
+        if not asked.exists():
+            return False
+        asked.unlink()
+        self._again(element)
+        return True
+
+    def logs(self) -> str:
+        return "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in sorted(self.folder.glob("*.log")))
+
+    def close(self) -> None:
+        """Cancel what still runs."""
+        for element in self.elements:
+            if element.process is not None and element.process.poll() is None:
+                element.signal(signal.SIGKILL, everybody=True)
+                element.process.wait()
+
+    def _again(self, element: Element) -> None:
+        assert element.process is not None
+        if element.process.poll() is None:
+            element.signal(signal.SIGKILL, everybody=True)
+            element.process.wait()
+        # Whatever of the job outlived its shell goes with it.
+        deadline = time.monotonic() + 5
+        while time.monotonic() < deadline:
+            try:
+                os.killpg(element.process.pid, signal.SIGKILL)
+            except ProcessLookupError:
+                break
+            time.sleep(0.01)
+        element.restarts += 1
+        element.start()

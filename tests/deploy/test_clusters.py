@@ -1,0 +1,148 @@
+"""Files for clusters: in step with commands, settings, images and secrets.
+
+Their own tools read them in `make clusters`; the batch scripts run in tests/system/test_slurm.py.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import kubernetes_validate
+import pytest
+import yaml
+
+import graspd.cli
+from service.settings import Settings
+from tests.conftest import REPOSITORY
+from tests.deploy.slurm import directives
+from tests.deploy.test_dockerfile import DOCKERFILE
+
+CLUSTERS = REPOSITORY / "docker" / "clusters"
+SLURM = REPOSITORY / "docker" / "slurm"
+PAGE = (REPOSITORY / "docs" / "clusters.md").read_text()
+SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
+FILES = sorted([*CLUSTERS.iterdir(), *SLURM.iterdir()])
+
+
+def options_of(command: str) -> set[str]:
+    module = next(module for name, module, *_ in graspd.cli.COMMANDS if name == command)
+    loaded: Any = graspd.cli.load(module, command)
+    return {option for parameter in loaded.params for option in parameter.opts}
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if file.suffix != ".pyc"], ids=lambda file: file.name)
+def test_every_file_is_on_the_page_and_uses_settings_and_options_that_exist(file: Path) -> None:
+    if file.is_dir():
+        return
+    assert f"docker/{file.parent.name}/{file.name}" in PAGE
+    text = file.read_text()
+    # `GRASPD=` is the command itself.
+    assert set(re.findall(r"\bGRASPD_[A-Z_]+\b", text)) - {"GRASPD_"} <= SETTINGS
+    for command in ("worker", "up", "doctor"):
+        by_name, by_variable = rf"\bgraspd {command} ([^|;`)\n]*)", rf'"\${{graspd\[@\]}}" {command} (.*)'
+        for call in re.findall(f"{by_name}|{by_variable}", text.replace("\\\n", " ")):
+            assert set(re.findall(r"(?<![\w-])--[a-z-]+", " ".join(call))) <= options_of(command), call
+    for found in re.findall(r"\[(worker, --burst[^\]]*)\]", text):
+        words = [word.strip(" '\"") for word in found.split(",")]
+        assert {word for word in words if word.startswith("--")} <= options_of("worker")
+
+
+@pytest.mark.parametrize("script", ["service.sbatch", "worker.sbatch"])
+def test_a_batch_script_is_shell_and_asks_for_what_slurm_knows(script: str) -> None:
+    subprocess.run(["bash", "-n", SLURM / script], check=True)
+    wanted = directives(SLURM / script)
+    assert {"requeue", "signal", "time"} <= wanted.keys(), "it is queued again, and told before its time is up"
+    assert wanted["open-mode"] == "append", "the log of before stays"
+
+
+def test_the_fake_refuses_an_option_that_slurm_does_not_know(tmp_path: Path) -> None:
+    script = tmp_path / "x.sbatch"
+    script.write_text("#!/bin/bash\n#SBATCH --reqeue\n")
+    with pytest.raises(ValueError, match="reqeue"):
+        directives(script)
+
+
+def test_the_apptainer_image_stands_on_the_python_of_the_docker_images() -> None:
+    text = (SLURM / "graspd.def").read_text()
+    (base,) = re.findall(r"^From: (\S+)$", text, re.MULTILINE)
+    assert f"FROM {base} AS base" in DOCKERFILE.read_text()
+    copied = re.findall(r"^    (\S+) /opt/\S+$", text, re.MULTILINE)
+    assert copied == ["dist", "docker/constraints.txt"]
+    assert (REPOSITORY / "docker" / "constraints.txt").is_file()
+    extras = re.search(r'"graspd\[([\w,]+)\] @ file:', text)
+    assert extras is not None
+    known = re.findall(r"^([\w-]+) = \[", (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)
+    assert set(extras[1].split(",")) <= set(known)
+
+
+def test_the_kubernetes_job_is_valid_and_runs_as_the_workers_do() -> None:
+    document = yaml.safe_load((CLUSTERS / "kubernetes-burst.yaml").read_text())
+    kubernetes_validate.validate(document, "1.30", strict=True)
+    manifests = (REPOSITORY / "docker" / "kubernetes" / "fixed-cpu" / "workers.yaml").read_text()
+    fixed = next(yaml.safe_load_all(manifests))
+    ours, theirs = document["spec"]["template"]["spec"], fixed["spec"]["template"]["spec"]
+    for same in ("serviceAccountName", "securityContext", "volumes"):
+        assert ours[same] == theirs[same]
+    for same in ("envFrom", "env", "resources", "securityContext", "volumeMounts"):
+        assert ours["containers"][0][same] == theirs["containers"][0][same]
+    assert document["spec"]["template"]["metadata"]["labels"]["graspd/talks-to"] == "redis-store", "the network opens"
+    assert ours["restartPolicy"] == "Never", "a pod failure policy needs it"
+
+
+#: Fields of a task in OSMO's specification of workflows, and of a resource.
+OSMO_TASK = {"name", "image", "command", "args", "environment", "credentials", "resource", "files", "inputs", "outputs"}
+OSMO_RESOURCE = {"cpu", "gpu", "memory", "storage", "platform"}
+
+
+def test_the_osmo_workflow_has_a_task_for_each_worker() -> None:
+    text = (CLUSTERS / "osmo.yaml").read_text()
+    body, _, defaults = text.partition("default-values:")
+    values = yaml.safe_load(f"default-values:{defaults}")["default-values"]
+    rendered = jinja2.Environment(undefined=jinja2.StrictUndefined).from_string(body).render(**values | {"workers": 3})
+    workflow = yaml.safe_load(rendered)["workflow"]
+    assert [task["name"] for task in workflow["tasks"]] == ["worker-0", "worker-1", "worker-2"]
+    for task in workflow["tasks"]:
+        assert task.keys() <= OSMO_TASK
+        assert all(isinstance(word, str) for word in [*task["command"], *task["args"]])
+        assert all(isinstance(value, str) for value in task["environment"].values())
+        assert "GRASPD_REDIS_URL" not in task["environment"], "a secret comes from a credential"
+        assert "GRASPD_REDIS_URL" in task["credentials"]["graspd"]
+    assert workflow["resources"]["default"].keys() <= OSMO_RESOURCE
+
+
+def test_the_skypilot_task_keeps_its_secrets_out_of_the_file() -> None:
+    task = yaml.safe_load((CLUSTERS / "skypilot.yaml").read_text())
+    assert set(task["secrets"].values()) == {None}
+    assert "GRASPD_REDIS_URL" in task["secrets"]
+    assert task["resources"]["use_spot"] is True
+    assert "num_nodes" not in task, "a node that is taken away would restart all"
+    for line in task["run"].splitlines():
+        subprocess.run(["bash", "-n", "-c", line], check=True)
+
+
+def test_the_ray_launcher_is_python_and_ties_the_worker_to_its_process() -> None:
+    source = (CLUSTERS / "ray_workers.py").read_text()
+    ast.parse(source)
+    assert '"service.run.launch", str(os.getpid())' in source
+
+
+def test_commands_of_the_page_are_shell() -> None:
+    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    assert len(blocks) >= 5
+    for block in blocks:
+        subprocess.run(["bash", "-n", "-c", block], check=True)
+        for line in block.splitlines():
+            words = shlex.split(line.replace("\\", ""), comments=True)
+            if words[:1] == ["sbatch"]:
+                assert (REPOSITORY / words[-1]).is_file(), line
+
+
+def test_every_file_the_page_links_to_exists() -> None:
+    for target in re.findall(r"\]\(([\w./-]+)\)", PAGE):
+        assert (REPOSITORY / "docs" / target).is_file(), target
