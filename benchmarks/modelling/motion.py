@@ -45,10 +45,7 @@ def predictors(subjects: list[Subject], held: list[Bools], spent: float) -> list
         # The first step is the planner's and costs nothing more; the price of others is their number.
         rows[-1]["steps_ratio"] = float(count)
     with cpu() as clock:
-        balance = [
-            np.array([-h.residual for h in hold_forces(s.hand, s.obj, s.grasps.grasp, friction=FRICTION)])
-            for s in subjects
-        ]
+        balance = [-hold_forces(s.hand, s.obj, s.grasps.grasp, friction=FRICTION).residual for s in subjects]
     rows.append(_row("static hand, balance of contact forces (selects the start)", balance, held, clock.seconds, spent))
     both = [rankdata(b) + rankdata(-r[:, -1]) for b, r in zip(balance, rolled, strict=True)]
     rows.append(_row(f"balance and {STEPS[-1]} steps, sum of ranks", both, held, None, spent))

@@ -82,8 +82,8 @@ def grasp_set(
     grasp = posture_of(hand, obj, state)
     return GraspSet(
         grasp=grasp,
-        pregrasp=pregrasp(hand, obj, grasp),
-        squeeze=squeeze(hand, obj, grasp),
+        pregrasp=pregrasp(hand, obj, grasp, device=pair.hand.device),
+        squeeze=squeeze(hand, obj, grasp, device=pair.hand.device),
         stability_loss=np.full(len(grasp), np.nan) if loss is None else loss,
         seconds=seconds,
         info=info,

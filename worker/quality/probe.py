@@ -88,9 +88,9 @@ class Probe:
             # Loading here keeps threads from compiling the same module at once.
             wp.load_module(module=kernels, device=device)
             self._body = wp.array(self.points.body, dtype=wp.int32)
-            self._of_bodies = _by_body(self.points, hand.bodies)
+            self.body_points = _by_body(self.points, hand.bodies)
             self._origin = wp.vec3d(*obj.centre_of_mass)
-            self._frames = [
+            self.frames = [
                 wp.array(self._piece_frame[:, :3], dtype=wp.vec3d),
                 wp.array(to_xyzw(self._piece_frame[:, 3:]), dtype=wp.quatd),
             ]
@@ -157,25 +157,9 @@ class Probe:
         )
         with wp.ScopedDevice(self.device):
             gap = wp.full(shape, np.inf, dtype=wp.float32)
-            inputs = [self.skin, self._of_bodies, self._origin, reach, posed.position, posed.rotation]
+            inputs = [self.skin, self.body_points, self._origin, reach, posed.position, posed.rotation]
             wp.launch(kernels.body_gaps, shape, inputs=inputs, outputs=[gap])
         return gap.numpy().astype(float)
-
-    def body_depths(self, hand_pose: Floats, joint_positions: Floats) -> Floats:
-        """(P, L) as `self_depth`, for many postures."""
-        posed, shape = (
-            PosedBodies.of(self.hand, hand_pose, joint_positions, self.device),
-            (len(hand_pose), self.hand.bodies),
-        )
-        bodies, frames = [posed.position, posed.rotation], (len(hand_pose), len(self._piece_body))
-        with wp.ScopedDevice(self.device):
-            piece = [wp.empty(frames, dtype=wp.vec3), wp.empty(frames, dtype=wp.quat)]
-            inputs = [self.pieces, self._origin, *self._frames, *bodies]
-            wp.launch(kernels.place_pieces, frames, inputs=inputs, outputs=piece)
-            depth = wp.zeros(shape, dtype=wp.float32)
-            inputs = [self.pieces, self._of_bodies, self._origin, *bodies, *piece]
-            wp.launch(kernels.body_depths, shape, inputs=inputs, outputs=[depth])
-        return depth.numpy().astype(float)
 
     def posed_points(self, bodies: Floats) -> Floats:
         """(B, N, 3) hand points in the object frame for body poses (B, L, 7)."""

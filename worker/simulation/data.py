@@ -77,8 +77,8 @@ class Data:
     """Up to `capacity` hands of a model; see `worker.simulation.record` for what is done with them."""
 
     def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
-        """`serial`: threads of a launch run in their order, as on a CPU; where they do not, contacts and residuals are
-        put in order before they are summed, which gives the same bits."""
+        """`serial`: threads of a launch run in their order, as on a CPU; where they do not, contacts are put in order
+        before they are summed, which gives the same bits."""
         self.device, self.capacity = model.device, capacity
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)

@@ -25,31 +25,47 @@ class PosedBodies:
 
     chain: Any
     """The hand, `kernels.chain.Chain`."""
-    position: Any
-    """(P, L) origins [m]."""
-    rotation: Any
-    """(P, L) quaternions."""
+    bodies: Any
+    """Their poses (P, L), `kernels.chain.Bodies`."""
 
     @classmethod
     def of(cls, hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> PosedBodies:
         """Hands with roots (P, 7) and joint positions (P, J), as `body_poses` takes them."""
-        chain, count = _chain_of(hand, device), len(hand_pose)
+        chain, count = chain_of(hand, device), len(hand_pose)
         with wp.ScopedDevice(device):
             root, joints = (
                 wp.array(np.ascontiguousarray(given, float), dtype=wp.float64, ndim=2)
                 for given in (hand_pose, joint_positions)
             )
-            position: Any = wp.empty((count, hand.bodies), dtype=wp.vec3d)
-            rotation: Any = wp.empty((count, hand.bodies), dtype=wp.quatd)
-            wp.launch(kernels.pose, count, inputs=[chain, root, joints], outputs=[position, rotation])
-        return cls(chain, position, rotation)
+            bodies = room_for_bodies(hand, count)
+            wp.launch(kernels.pose, count, inputs=[chain, root, joints], outputs=[bodies])
+        return cls(chain, bodies)
+
+    @property
+    def position(self) -> Any:
+        """(P, L) origins [m]."""
+        return self.bodies.position
+
+    @property
+    def rotation(self) -> Any:
+        """(P, L) quaternions."""
+        return self.bodies.rotation
+
+
+def room_for_bodies(hand: HandModel, count: int) -> Any:
+    """Poses of so many hands, not filled in, on the present device."""
+    out = kernels.Bodies()
+    out.position = wp.empty((count, hand.bodies), dtype=wp.vec3d)
+    out.rotation = wp.empty((count, hand.bodies), dtype=wp.quatd)
+    return out
 
 
 _chains: LRUCache[tuple[str, str], Any] = LRUCache(8)
 _lock = threading.Lock()
 
 
-def _chain_of(hand: HandModel, device: str) -> Any:
+def chain_of(hand: HandModel, device: str) -> Any:
+    """The hand on a device as `kernels.chain.Chain`, from memory where it was used lately."""
     key = (hand.content, device)
     with _lock:
         if (found := _chains.get(key)) is None:
@@ -71,6 +87,9 @@ def _chain(hand: HandModel) -> Any:
     out.origin_p = wp.array(hand.origin[:, :3], dtype=wp.vec3d)
     out.origin_q = wp.array(to_xyzw(hand.origin[:, 3:]), dtype=wp.quatd)
     out.axis = wp.array(hand.axis, dtype=wp.vec3d)
+    out.dof = wp.array(hand.dof, dtype=wp.int32)
+    out.multiplier = wp.array(hand.multiplier, dtype=wp.float64)
+    out.offset = wp.array(hand.offset, dtype=wp.float64)
     out.tip = wp.array(np.isin(np.arange(hand.bodies), hand.fingertips), dtype=wp.int32)
     out.first = wp.array(np.searchsorted(features.body[order], np.arange(hand.bodies + 1)), dtype=wp.int32)
     out.centre = wp.array(features.centre[order], dtype=wp.vec3d)

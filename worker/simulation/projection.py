@@ -9,10 +9,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_from_axis_angle, quat_multiply
 from worker.simulation.data import Data
-from worker.simulation.kernels import obstacles, packing, solids
+from worker.simulation.device import to_wxyz, to_xyzw
+from worker.simulation.kernels import obstacles, solids
 from worker.simulation.kernels import projection as kernels
+from worker.simulation.launches import Launches
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
 from worker.simulation.state import HandState, still_schedule
@@ -21,6 +22,8 @@ Floats = NDArray[np.float64]
 
 #: Residuals kept per grasp and iteration.
 CAPACITY: Final = 1024
+#: Residuals that one thread of a GPU adds to the equations.
+CUDA_LANE: Final = 16
 #: A state is better than another if it is less deep by more than this [m].
 BETTER_M: Final = 1e-5
 
@@ -62,22 +65,28 @@ def _residuals(capacity: int) -> Any:
         setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.vec3))
     for name in ("value", "weight"):
         setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.float32))
-    out.key = wp.zeros((capacity, CAPACITY), dtype=wp.int64)
-    out.order = wp.array(np.tile(np.arange(CAPACITY, dtype=np.int32), (capacity, 1)))
     return out
 
 
 class Projection:
-    """Moves the hands of a model; keeps of each the least penetrating state it saw."""
+    """Moves the hands of a model; keeps of each the least penetrating state it saw. Nothing leaves the device between
+    two steps."""
 
     def __init__(self, model: Model, data: Data, options: ProjectionOptions) -> None:
         self.model, self.data, self.options = model, data, options
-        B, n = data.capacity, 6 + model.dofs
+        hand, B, n = model.hand.model, data.capacity, 6 + model.dofs
+        self._lane = CUDA_LANE if wp.get_device(model.device).is_cuda else CAPACITY
+        self._lanes = -(-CAPACITY // self._lane)
+        scale = np.repeat(options.scale, [3, 3, model.dofs])
+        scale[6:] *= data.unit
         with wp.ScopedDevice(model.device):
             self.residuals = _residuals(B)
-            self.row = wp.zeros((B, n), dtype=wp.float32)
-            self.matrix = wp.zeros((B, n, n), dtype=wp.float32)
-            self.vector = wp.zeros((B, n), dtype=wp.float32)
+            self._row = wp.empty((B * self._lanes, n), dtype=wp.float32)
+            self.matrix, self.vector = wp.zeros((B, n, n), dtype=wp.int64), wp.zeros((B, n), dtype=wp.int64)
+            self._factor, self._move = wp.empty((B, n, n), dtype=wp.float64), wp.empty((B, n), dtype=wp.float64)
+            self._limits = [wp.array(limit, dtype=wp.float64) for limit in (hand.lower, hand.upper)]
+            self._scale = wp.array(scale, dtype=wp.float64)
+            self._depth = wp.empty(B, dtype=wp.float64)
 
     def run(self, state: HandState, iterations: int) -> tuple[HandState, Floats]:
         """At most `iterations` steps from `state`.
@@ -85,102 +94,85 @@ class Projection:
         Returns:
             The best state of each hand, and its deepest penetration (n,) [m].
         """
-        data = self.data
-        n = len(state.pivot)
+        data, n = self.data, len(state.pivot)
         data.set_schedule(still_schedule())
-        placement = record_placement(self.model, data, within=max(self.options.near, self.options.hold))
-        best, depth = state, np.full(n, np.inf)
-        current = state
-        for step in range(iterations + 1):
-            # A hand without penetration cannot become better: it costs nothing more.
-            going = depth > BETTER_M
-            if not going.any():
-                break
-            data.set_state(current, active=going)
-            placement.run()
-            now = np.where(going, data.deepest(n), np.inf)
-            better = now < depth - BETTER_M
-            best = _where(better, current, best)
-            depth = np.where(better, now, depth)
-            if step == iterations:
-                break
-            current = self._moved(current, self._step(np.flatnonzero(going), n))
-        return best, depth.astype(float)
+        data.set_state(state)
+        now, best = self._states(state), self._states(state)
+        self._depth.fill_(np.inf)
+        step = self._judged(now, best)
+        self._add_equations(step)
+        self._add_step(step, now)
+        step.run(iterations)
+        self._judged(now, best).run()
+        return self._found(best, n), self._depth.numpy()[:n].copy()
 
-    def _step(self, rows: NDArray[np.intp], n: int) -> Floats:
-        """Damped Gauss-Newton step (n, 6 + D) of some hands for the placement just evaluated; 0 for the others."""
-        self._assemble()
-        o = self.options
-        lower = self.matrix.numpy()[rows].astype(float)
-        H = lower + np.tril(lower, -1).transpose(0, 2, 1)
-        g = self.vector.numpy()[rows].astype(float)
-        count = np.minimum(self.residuals.count.numpy()[rows], CAPACITY)
-        scale = np.repeat(o.scale, [3, 3, self.model.dofs])
-        scale[6:] *= self.data.unit
-        H = H * scale[:, None] * scale[None, :]
-        damping = o.damping * np.maximum(count, 1)
-        H[:, np.arange(len(scale)), np.arange(len(scale))] += damping[:, None]
-        step = -np.linalg.solve(H, (g * scale)[..., None])[..., 0]
-        length = np.linalg.norm(step, axis=1, keepdims=True)
-        step *= np.minimum(1.0, o.step / np.maximum(length, 1e-12))
-        out = np.zeros((n, len(scale)))
-        out[rows] = step * scale
+    def _judged(self, now: Any, best: Any) -> Launches:
+        """Places the hands and keeps what is better than ever."""
+        d, o = self.data, self.options
+        out = record_placement(self.model, d, within=max(o.near, o.hold))
+        out.add(
+            kernels.keep_best, d.capacity,
+            inputs=[d.depths.points, d.depths.object, d.depths.links, d.depths.obstacles, wp.float64(BETTER_M), now],
+            outputs=[d.active, self.residuals.count, best, self._depth],
+        )  # fmt: skip
         return out
 
-    def _assemble(self) -> None:
+    def _states(self, state: HandState) -> Any:
+        """Hands on the device, in double precision; where the capacity is larger they stand still."""
+        rest = self.data.capacity - len(state.pivot)
+        out = kernels.States()
+        with wp.ScopedDevice(self.model.device):
+            out.pivot = wp.array(np.pad(state.pivot, ((0, rest), (0, 0))), dtype=wp.vec3d)
+            out.rotation = wp.array(np.pad(to_xyzw(state.rotation), ((0, rest), (0, 0))), dtype=wp.quatd)
+            out.q = wp.array(np.pad(state.q, ((0, rest), (0, 0))), dtype=wp.float64)
+        return out
+
+    @staticmethod
+    def _found(states: Any, n: int) -> HandState:
+        pivot, rotation, q = (array.numpy()[:n].copy() for array in (states.pivot, states.rotation, states.q))
+        return HandState(pivot, to_wxyz(rotation), q)
+
+    def _add_equations(self, out: Launches) -> None:
         m, d, o, r = self.model, self.data, self.options, self.residuals
         c, pose = d.contacts, [d.body_p, d.body_q]
-        r.count.zero_()
-        wp.launch(
+        out.add(
             kernels.point_residuals, (d.capacity, m.lanes),
             inputs=[m.lane, d.active, c.count, c.body, c.point, c.normal, c.distance,
                     o.near, o.target, o.hold, o.hold_target, o.hold_weight],
-            outputs=[r], device=m.device,
+            outputs=[r],
         )  # fmt: skip
-        wp.launch(
+        out.add(
             kernels.sample_residuals, (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target],
-            outputs=[r], device=m.device,
+            inputs=[m.hand.pieces, m.obj.sorted_samples, d.active, *pose, o.sample_near, o.target], outputs=[r],
         )  # fmt: skip
-        wp.launch(
+        out.add(
             kernels.self_residuals, (d.capacity, m.pieces),
-            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target],
-            outputs=[r], device=m.device,
+            inputs=[m.hand.pieces, m.body_points, d.active, *pose, o.self_near, o.self_target], outputs=[r],
         )  # fmt: skip
         if m.obstacles is not None:
-            wp.launch(
+            out.add(
                 obstacles.residuals, (d.capacity, m.pieces),
                 inputs=[m.obstacles.features, m.obstacles.solids, d.active, d.scene, *pose, o.obstacle_near,
                         o.obstacle_target],
-                outputs=[r], device=m.device,
+                outputs=[r],
             )  # fmt: skip
         if m.obstacles is not None and m.obstacles.any_solid:
-            wp.launch(
+            out.add(
                 solids.residuals, (d.capacity, m.pieces),
                 inputs=[m.obstacles.features, m.hand.pieces, m.obstacles.solids, d.active, d.scene, *pose,
                         o.obstacle_near, o.obstacle_target],
-                outputs=[r], device=m.device,
+                outputs=[r],
             )  # fmt: skip
-        if not d.serial:
-            wp.launch(
-                packing.order, (d.capacity, CAPACITY),
-                inputs=[d.active, r.count, r.key], outputs=[r.order], device=m.device,
-            )  # fmt: skip
-        wp.launch(
-            kernels.normal_equations, d.capacity,
-            inputs=[m.hand.tree, d.active, d.pivot, d.body_p, d.axis, r],
-            outputs=[self.row, self.matrix, self.vector], device=m.device,
+        out.add(
+            kernels.normal_equations, (d.capacity, self._lanes),
+            inputs=[m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, r],
+            outputs=[self._row, self.matrix, self.vector],
         )  # fmt: skip
 
-    def _moved(self, state: HandState, step: Floats) -> HandState:
-        hand = self.model.hand.model
-        angle = np.linalg.norm(step[:, 3:6], axis=1)
-        axis = step[:, 3:6] / np.maximum(angle, 1e-12)[:, None]
-        rotation = quat_multiply(quat_from_axis_angle(axis, angle), state.rotation)
-        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-        return HandState(state.pivot + step[:, :3], rotation, np.clip(state.q + step[:, 6:], hand.lower, hand.upper))
-
-
-def _where(mask: NDArray[np.bool_], a: HandState, b: HandState) -> HandState:
-    m = mask[:, None]
-    return HandState(np.where(m, a.pivot, b.pivot), np.where(m, a.rotation, b.rotation), np.where(m, a.q, b.q))
+    def _add_step(self, out: Launches, now: Any) -> None:
+        d, o = self.data, self.options
+        out.add(
+            kernels.step, d.capacity,
+            inputs=[*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals],
+            outputs=[self._factor, self._move, self.matrix, self.vector, now, d.pivot, d.rotation, d.q],
+        )  # fmt: skip

@@ -29,7 +29,7 @@ QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)
 
 
-def plain(hand, obj, state: HandState, losses: np.ndarray, placed: Placed) -> GraspSet:
+def plain(hand, obj, state: HandState, losses: np.ndarray, placed: Placed, *, device: str) -> GraspSet:
     """Grasps that remember which hand they are by their loss, and their place in the batch by their scene."""
     rows = [((0.0, 0.0, 0.0), (0.0,) * hand.dofs) for _ in losses]
     return replace(grasp_set(posture(*rows)), stability_loss=losses)

@@ -247,7 +247,7 @@ def test_terms_do_not_depend_on_the_grasps_and_follow_everything_else(monkeypatc
 def test_a_constant_that_moves_no_verdict_moves_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
     terms = verdict_key(PADS, BOX, "letter", False, pieces=WHOLE)
     monkeypatch.setattr(protocol, "UNRELATED", 7, raising=False)
-    monkeypatch.setattr(postures, "_CHUNK", 5)
+    monkeypatch.setattr(postures, "ROOM_M", 5)
     assert verdict_key(PADS, BOX, "letter", False, pieces=WHOLE) == terms
 
 
@@ -265,7 +265,7 @@ def test_a_constant_of_one_level_moves_the_key_of_that_level_alone(monkeypatch: 
 def test_every_constant_of_the_protocol_is_said_to_move_verdicts_or_not_to() -> None:
     # A new constant belongs in key.py, or here if no verdict depends on it.
     # The last four move lifts: lifting.py has them.
-    still = {"postures._CHUNK", "postures._LOOK_STEPS", "postures.ROOM_M", "postures.WIDE", "model.DENSITY"}
+    still = {"postures.ROOM_M", "postures.WIDE", "model.DENSITY"}
     still |= {"model.TOUCH_ROUNDING_M"}
     named = {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in MOVES.items() for name in names}
     for modules in LEVEL_MOVES.values():

@@ -7,12 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 from service.model.domain import FIDELITIES
 from tests.worker.models import object_from_mesh, two_finger_hand
+from worker.grasps import Posture
 from worker.planners import Wanted
 from worker.planners.fast_graspd import planner
+from worker.quality.opening import OPENING_STEPS
+from worker.quality.postures import pregrasp
 from worker.run import Run
 from worker.simulation import launches
 from worker.simulation.launches import Launches
@@ -73,8 +77,6 @@ def forbid_the_host(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def planned() -> planner.Part:
-    import trimesh
-
     box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
     (part,) = planner.optimise_batch(two_finger_hand(), box, Wanted(2, FIDELITY, seed=3), Run("cpu", threads=1))
     return part
@@ -84,18 +86,37 @@ def test_replayed_graphs_give_the_very_hands_of_plain_launches(monkeypatch: pyte
     plain = planned()
     graphs = Graphs(monkeypatch)
     replayed = planned()
-    assert graphs.captured == 2  # the coarse and the fine phase
-    assert graphs.replayed == FIDELITY.coarse_iterations + FIDELITY.fine_iterations
+    assert graphs.captured == 3  # the coarse and the fine phase, and the projection
+    steps = FIDELITY.coarse_iterations + FIDELITY.fine_iterations + FIDELITY.polish_iterations
+    assert graphs.replayed == steps
     assert plain.state is not None
     assert replayed.state is not None
     for name in ("pivot", "rotation", "q"):
         np.testing.assert_array_equal(getattr(plain.state, name), getattr(replayed.state, name))
 
 
+def opened() -> Posture:
+    """Pregrasps of hands in touch: one that opens along its normals, one that has to open plainly."""
+    hand, box = two_finger_hand(), object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+    grasp = Posture(np.tile([0, 0, -0.095, 1.0, 0, 0, 0], (2, 1)), np.array([[0.4, 0.4], [0.1, 0.8]]))
+    return pregrasp(hand, box, grasp)
+
+
+def test_replayed_graphs_open_hands_as_plain_launches_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = opened()
+    graphs = Graphs(monkeypatch)
+    replayed = opened()
+    assert graphs.captured == 2  # along the normals, and plainly
+    assert graphs.replayed == 2 * (OPENING_STEPS + 1)
+    np.testing.assert_array_equal(plain.joint_positions, replayed.joint_positions)
+    np.testing.assert_array_equal(plain.hand_pose, replayed.hand_pose)
+
+
 def test_nothing_on_the_host_is_touched_between_two_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     Graphs(monkeypatch)
     broken = forbid_the_host(monkeypatch)
     planned()
+    opened()
     assert broken == []
 
 

@@ -58,17 +58,6 @@ def test_what_is_no_number_adds_nothing() -> None:
     assert (summed(np.array([[np.nan, np.inf, -np.inf]])) == 0).all()
 
 
-def test_keys_give_the_order_of_what_lies_in_any_order() -> None:
-    rng = np.random.default_rng(7)
-    key = np.stack([rng.permutation(60) * 7, rng.permutation(60) + 2**40]).astype(np.int64)
-    count, active = wp.array([60, 25], dtype=wp.int32), wp.ones(2, dtype=wp.int32)
-    found = wp.full((2, 60), -1, dtype=wp.int32)
-    wp.launch(packing.order, (2, 60), inputs=[active, count, wp.array(key)], outputs=[found], device="cpu")
-    assert (found.numpy()[0] == np.argsort(key[0])).all()
-    assert (found.numpy()[1, :25] == np.argsort(key[1, :25])).all()
-    assert (found.numpy()[1, 25:] == -1).all()
-
-
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 95])
 def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
     rng = np.random.default_rng(count)

@@ -27,11 +27,12 @@ HOPELESS: Final = 1e9
 
 
 def with_postures(
-    hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, placed: Placed | None
-) -> GraspSet:
-    """Hands (n) as grasps with the postures around them."""
+    hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, placed: Placed | None, *, device: str = "cpu"
+) -> GraspSet:  # fmt: skip
+    """Hands (n) as grasps with the postures around them, found on a device."""
     grasp = posture_of(hand, obj, state)
-    return GraspSet(grasp, pregrasp(hand, obj, grasp, placed), squeeze(hand, obj, grasp), losses)
+    before = pregrasp(hand, obj, grasp, placed, device=device)
+    return GraspSet(grasp, before, squeeze(hand, obj, grasp, device=device), losses)
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,9 @@ class Taken:
 
 
 def tried(
-    hand: HandModel, obj: ObjectModel, order: NDArray[np.intp], seat: Seat, placed: Placed, trial: Trial
-) -> Taken:
+    hand: HandModel, obj: ObjectModel, order: NDArray[np.intp], seat: Seat, placed: Placed, trial: Trial, *,
+    device: str = "cpu",
+) -> Taken:  # fmt: skip
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
 
     The first `FIRST` of each grasp are seated and tried in the order of their merit, then, of grasps that have none
@@ -83,6 +85,7 @@ def tried(
         seat: seats hands.
         placed: scenes of the n grasps.
         trial: gives the scores.
+        device: finds the postures that the trial needs.
     """
     taken, left = Taken.none(len(order), hand.dofs), np.arange(len(order))
     for wave in np.split(order, [FIRST], axis=1):
@@ -93,19 +96,22 @@ def tried(
             open_ = ~(taken.score[left] < 1.0)
             if not open_.any():
                 break
-            _try(hand, obj, seated, rows[open_], left[open_], placed, trial, taken)
+            which = left[open_]
+            found = with_postures(
+                hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], placed.take(which), device=device
+            )
+            _try(found, seated, rows[open_], which, placed, trial, taken)
         left = left[~(taken.score[left] < 1.0)]
     return taken
 
 
 def _try(
-    hand: HandModel, obj: ObjectModel, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp],
-    placed: Placed, trial: Trial, taken: Taken,
+    found: GraspSet, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp], placed: Placed, trial: Trial,
+    taken: Taken,
 ) -> None:  # fmt: skip
-    """One hand each (k,) of the grasps `which` (k,)."""
-    state, losses, scenes = seated.state[rows], seated.losses[rows], placed.take(which)
-    found = with_postures(hand, obj, state, losses, scenes)
-    score = np.nan_to_num(trial(found, scenes), nan=HOPELESS, posinf=HOPELESS)
+    """One hand each (k,) of the grasps `which` (k,), as grasps."""
+    state, losses = seated.state[rows], seated.losses[rows]
+    score = np.nan_to_num(trial(found, placed.take(which)), nan=HOPELESS, posinf=HOPELESS)
     for k in np.flatnonzero(score < taken.score[which]):
         grasp = int(which[k])
         taken.grasps[grasp] = found.take(slice(k, k + 1))

@@ -70,7 +70,7 @@ def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSe
     """See `worker.planners.Planner`."""
     began = time.perf_counter()
     parts = optimise_batch(hand, obj, wanted, run)
-    return grasps_of(hand, obj, parts, time.perf_counter() - began, wanted.placed)
+    return grasps_of(hand, obj, parts, time.perf_counter() - began, wanted.placed, device=run.device)
 
 
 def plan_joined(hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[Finish | Exception]:
@@ -92,7 +92,8 @@ def plan_joined(hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> li
             continue
         own = [part.take(np.flatnonzero(batches.owner[part.rows] == owner)) for part in parts]
         own = [part for part in own if len(part.rows)]
-        found.append(partial(grasps_of, hand, obj, own, each * one.wanted.count, one.wanted.placed))
+        seconds, placed = each * one.wanted.count, one.wanted.placed
+        found.append(partial(grasps_of, hand, obj, own, seconds, placed, device=run.device))
     return found
 
 
@@ -217,13 +218,13 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
     if last < fidelity.starts:
-        merit = merits(hand, obj, state, losses)
+        merit = merits(hand, obj, state, losses, device=pair.hand.device)
         if placed is not None:
             merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
     seats = _Seats(launch, rows, state, losses, curve)
     if last > 1 and placed is not None and batches.has_trial:
-        taken = tried(hand, obj, order, seats.seated, placed, batches.trial)
+        taken = tried(hand, obj, order, seats.seated, placed, batches.trial, device=pair.hand.device)
         return Part(rows, taken.state, taken.losses, curve, taken.joined())
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
     winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
@@ -259,7 +260,8 @@ class _Seats:
         if rows.shape[1] == 1:
             return Seated(state, losses, np.zeros(len(flat)))
         hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
-        return Seated(state, losses, merits(hand, obj, state, losses, depths))
+        merit = merits(hand, obj, state, losses, depths, device=launch.pair.hand.device)
+        return Seated(state, losses, merit)
 
 
 def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:
@@ -305,8 +307,9 @@ def _joined_states(states: Sequence[HandState]) -> HandState:
 
 
 def grasps_of(
-    hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float, placed: Placed | None = None
-) -> GraspSet:
+    hand: HandModel, obj: ObjectModel, parts: list[Part], seconds: float, placed: Placed | None = None, *,
+    device: str = "cpu",
+) -> GraspSet:  # fmt: skip
     """The parts of a batch as grasps with the postures around them."""
     curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]
@@ -314,5 +317,6 @@ def grasps_of(
         grasps = joined(known)
     else:
         loss = np.concatenate([part.loss for part in parts])
-        grasps = with_postures(hand, obj, _joined_states([part.state for part in parts]), loss, placed)
+        state = _joined_states([part.state for part in parts])
+        grasps = with_postures(hand, obj, state, loss, placed, device=device)
     return replace(grasps, seconds=seconds, info={"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK})

@@ -31,11 +31,14 @@ def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:
     return Posture(np.concatenate([root, state.rotation], axis=1), hand.expand(state.q))
 
 
-def merits(hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
+def merits(
+    hand: HandModel, obj: ObjectModel, state: HandState, losses: Floats, depths: Floats | None = None, *,
+    device: str = "cpu",
+) -> Floats:  # fmt: skip
     """(n,) the smaller the better: residual of balanced contact forces, a little of L_stable (n,), and what the
     penetration `depths` (n,) [m] have above the tolerated."""
-    holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=FRICTION)
-    merit = np.array([hold.residual for hold in holds]) + STABILITY * losses
+    holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=FRICTION, device=device)
+    merit = holds.residual + STABILITY * losses
     if depths is not None:
         merit += DEPTH * np.maximum(depths - TOLERATED_M, 0.0)
     return merit

@@ -14,7 +14,7 @@ from service.model.digests import digest_bytes, digest_json
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.quality import jaw_squeeze, postures, squeeze
+from worker.quality import jaw_squeeze, opening, postures, squeeze
 from worker.quality.referee import model, protocol
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 
@@ -34,11 +34,11 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "OBJECT_MASS", "FRICTION", "HARD", "DAMPING_TIME", "HAND_SOLIMP", "HAND_SOLREF", "COUPLING_SOLREF",
         "COUPLING_SOLIMP", "NOT_IN_3_3_2", "_BARE_RADIUS", "_MIN_MASS",
     ),
-    postures: (
+    opening: (
         "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M",
-        "OPENING_STEPS", "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M", "PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION",
-        "MAX_PRESSING", "_POINTS",
+        "OPENING_STEPS", "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M",
     ),
+    postures: ("PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS"),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
 }  # fmt: skip
@@ -94,11 +94,12 @@ def postures_key(terms: str, grasps: GraspSet) -> str:
 
 
 def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
-    """Values of the named constants, module by module; of a module's name the last word counts."""
-    return {
-        part.__name__.rpartition(".")[2]: {name: _plain(getattr(part, name)) for name in there}
-        for part, there in names.items()
-    }
+    """Values of the named constants by the last word of their module's name; those of `opening` are of postures."""
+    out: dict[str, Any] = {}
+    for part, there in names.items():
+        group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})
+        group |= {name: _plain(getattr(part, name)) for name in there}
+    return out
 
 
 def _plain(value: Any) -> Any:

@@ -15,11 +15,48 @@ class Chain:
     origin_p: wp.array(dtype=wp.vec3d)
     origin_q: wp.array(dtype=wp.quatd)
     axis: wp.array(dtype=wp.vec3d)
+    dof: wp.array(dtype=wp.int32)
+    multiplier: wp.array(dtype=wp.float64)  # the joint's value: this times that of the dof
+    offset: wp.array(dtype=wp.float64)  # and this
     tip: wp.array(dtype=wp.int32)  # 1: a fingertip
     first: wp.array(dtype=wp.int32)  # (L + 1,) features of a body
     centre: wp.array(dtype=wp.vec3d)  # (F,) body frame
     about: wp.array(dtype=wp.vec3d)  # (F,) axis of a rim; zero: a ball
     radius: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class Bodies:
+    """Poses of the L bodies of P hands, (P, L)."""
+
+    position: wp.array2d(dtype=wp.vec3d)
+    rotation: wp.array2d(dtype=wp.quatd)
+
+
+@wp.func
+def place_body(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32, value: wp.float64):
+    """Pose of a body whose parent stands already, and whose joint has this value [rad or m]."""
+    turned = bodies.rotation[p, chain.parent[body]]
+    place = bodies.position[p, chain.parent[body]] + wp.quat_rotate(turned, chain.origin_p[body])
+    turned = turned * chain.origin_q[body]
+    if chain.turns[body] == 1:
+        turned = turned * wp.quat_from_axis_angle(chain.axis[body], value)
+    else:
+        place = place + value * wp.quat_rotate(turned, chain.axis[body])
+    bodies.position[p, body] = place
+    bodies.rotation[p, body] = turned
+
+
+@wp.func
+def joint_value(chain: Chain, body: wp.int32, q: wp.float64):
+    """Value of a body's joint at a value of its dof."""
+    return chain.multiplier[body] * q + chain.offset[body]
+
+
+@wp.func
+def joint_axis(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32):
+    """Axis of a body's joint in the frame of the poses: turning about it does not move it."""
+    return wp.quat_rotate(bodies.rotation[p, body], chain.axis[body])
 
 
 @wp.kernel
@@ -30,24 +67,14 @@ def pose(
     root_in: wp.array2d(dtype=wp.float64),
     joints_in: wp.array2d(dtype=wp.float64),
     # Outputs:
-    body_p_out: wp.array2d(dtype=wp.vec3d),
-    body_q_out: wp.array2d(dtype=wp.quatd),
+    bodies_out: Bodies,
 ):
     """Poses of the bodies (P, L) of hands with roots (P, 7), quaternions w x y z, and joints (P, J). Launch over P."""
     p = wp.tid()
-    body_p_out[p, 0] = wp.vec3d(root_in[p, 0], root_in[p, 1], root_in[p, 2])
-    body_q_out[p, 0] = wp.quatd(root_in[p, 4], root_in[p, 5], root_in[p, 6], root_in[p, 3])
+    bodies_out.position[p, 0] = wp.vec3d(root_in[p, 0], root_in[p, 1], root_in[p, 2])
+    bodies_out.rotation[p, 0] = wp.quatd(root_in[p, 4], root_in[p, 5], root_in[p, 6], root_in[p, 3])
     for body in range(1, chain_in.parent.shape[0]):
-        turned = body_q_out[p, chain_in.parent[body]]
-        place = body_p_out[p, chain_in.parent[body]] + wp.quat_rotate(turned, chain_in.origin_p[body])
-        turned = turned * chain_in.origin_q[body]
-        value = joints_in[p, chain_in.joint[body]]
-        if chain_in.turns[body] == 1:
-            turned = turned * wp.quat_from_axis_angle(chain_in.axis[body], value)
-        else:
-            place = place + value * wp.quat_rotate(turned, chain_in.axis[body])
-        body_p_out[p, body] = place
-        body_q_out[p, body] = turned
+        place_body(chain_in, bodies_out, p, body, joints_in[p, chain_in.joint[body]])
 
 
 @wp.struct

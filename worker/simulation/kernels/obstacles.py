@@ -6,7 +6,7 @@ Half-spaces need no more and are seen exactly; for solids see `solids`.
 
 import warp as wp
 
-from worker.simulation.kernels.projection import Residuals, emit, key_of
+from worker.simulation.kernels.projection import Residuals, emit
 from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
@@ -223,4 +223,4 @@ def residuals(
             if nd[3] < margin + near_in:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 gap = nd[3] - margin - target_in
-                emit(residuals_out, b, key_of(3, i, k), f.body, -1, lowest_point(f, n), n, gap, 1.0)
+                emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, gap, 1.0)

@@ -101,25 +101,3 @@ def pack(
     if last:
         count_out[b] = k + wp.min(mark, 1)
         near_count_out[b] = near + mark // 2
-
-
-@wp.kernel
-def order(
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    count_in: wp.array(dtype=wp.int32),
-    key_in: wp.array2d(dtype=wp.int64),
-    # Data out:
-    order_out: wp.array2d(dtype=wp.int32),
-):
-    """Slots in the order of their keys, no two of which are equal: each finds its rank. Launch over (B, R)."""
-    b, k = wp.tid()
-    count = wp.min(count_in[b], key_in.shape[1])
-    if active_in[b] == 0 or k >= count:
-        return
-    key = key_in[b, k]
-    rank = wp.int32(0)
-    for other in range(count):
-        if key_in[b, other] < key:
-            rank += 1
-    order_out[b, rank] = k

@@ -21,7 +21,10 @@ from worker.simulation.kernels.pieces import (
     world_extent,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+#: Terms of the normal equations are summed as integers of this unit, 2^-44: rows are of order one and shorter.
+FIXED = wp.constant(2.0**44)
 
 
 @wp.struct
@@ -34,25 +37,16 @@ class Residuals:
     point: wp.array2d(dtype=wp.vec3)
     direction: wp.array2d(dtype=wp.vec3)  # moving the body by it increases d
     value: wp.array2d(dtype=wp.float32)  # d - target [m]
-    key: wp.array2d(dtype=wp.int64)  # order in which they are summed
-    order: wp.array2d(dtype=wp.int32)  # their slots in that order
     weight: wp.array2d(dtype=wp.float32)
 
 
 @wp.func
-def key_of(kind: wp.int32, thread: wp.int32, serial: wp.int32):
-    """Where the residual that a thread of a launch emits as its `serial`-th comes; launches have kinds 0, 1, ..."""
-    return (wp.int64(kind) << wp.int64(56)) + (wp.int64(thread) << wp.int64(28)) + wp.int64(serial)
-
-
-@wp.func
 def emit(
-    out: Residuals, b: wp.int32, key: wp.int64, body: wp.int32, other: wp.int32, point: wp.vec3, direction: wp.vec3,
+    out: Residuals, b: wp.int32, body: wp.int32, other: wp.int32, point: wp.vec3, direction: wp.vec3,
     value: wp.float32, weight: wp.float32,
 ):  # fmt: skip
     k = wp.atomic_add(out.count, b, 1)
     if k < out.body.shape[1]:
-        out.key[b, k] = key
         out.body[b, k] = body
         out.other[b, k] = other
         out.point[b, k] = point
@@ -91,12 +85,10 @@ def point_residuals(
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
         rho = distance_in[b, i]
         if rho < near_in:
-            key = key_of(0, i, 0)
-            emit(residuals_out, b, key, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
+            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
         elif rho < hold_in:
             gap = rho - hold_target_in
-            key = key_of(0, i, 0)
-            emit(residuals_out, b, key, body_in[b, i], -1, point_in[b, i], normal_in[b, i], gap, hold_weight_in)
+            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], gap, hold_weight_in)
 
 
 @wp.kernel
@@ -130,7 +122,6 @@ def sample_residuals(
     ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
     zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
     back = wp.transpose(wp.quat_to_matrix(q))
-    emitted = wp.int32(0)
     if xs[0] <= xs[1] and ys[0] <= ys[1] and zs[0] <= zs[1]:
         for i in range(xs[0], xs[1] + 1):
             for j in range(ys[0], ys[1] + 1):
@@ -143,8 +134,7 @@ def sample_residuals(
                         if nd[3] < near_in:
                             n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
                             # The link moving along its own outward normal comes nearer: d falls.
-                            emit(residuals_out, b, key_of(1, piece, emitted), body, -1, x, -n, nd[3] - target_in, 1.0)
-                            emitted += 1
+                            emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
 
 
 @wp.kernel
@@ -171,7 +161,6 @@ def self_residuals(
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
     reach = wp.length(pieces_in.half[piece]) + near_in
-    emitted = wp.int32(0)
     for own in range(body_p_in.shape[1]):
         if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
             # From the body's frame straight into the piece's.
@@ -184,13 +173,12 @@ def self_residuals(
                     if nd[3] < near_in:
                         x = p + wp.quat_rotate(q, local)
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                        emit(residuals_out, b, key_of(2, piece, emitted), own, other, x, n, nd[3] - target_in, 1.0)
-                        emitted += 1
+                        emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
 
 
 @wp.func
 def add_chain(
-    tree: Tree, b: wp.int32, body: wp.int32, point: wp.vec3, direction: wp.vec3, sign: wp.float32,
+    tree: Tree, b: wp.int32, own: wp.int32, body: wp.int32, point: wp.vec3, direction: wp.vec3, sign: wp.float32,
     body_p: wp.array2d(dtype=wp.vec3), axis: wp.array2d(dtype=wp.vec3), row: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
     """Add the joints' part of a row: motion along `direction` of a point of `body`."""
@@ -201,14 +189,21 @@ def add_chain(
         if tree.joint_type[k] == 1:
             g = wp.dot(wp.cross(a, point - body_p[b, k]), direction)
         column = 6 + tree.dof[k]
-        row[b, column] = row[b, column] + sign * tree.multiplier[k] * g
+        row[own, column] = row[own, column] + sign * tree.multiplier[k] * g
         k = tree.parent[k]
+
+
+@wp.func
+def fixed(x: wp.float32):
+    """x as an integer: sums of those are the same in any order."""
+    return wp.int64(x * FIXED)
 
 
 @wp.kernel
 def normal_equations(
     # Model:
     tree_in: Tree,
+    lane_in: wp.int32,
     # Data in:
     active_in: wp.array(dtype=wp.int32),
     pivot_in: wp.array(dtype=wp.vec3),
@@ -218,43 +213,155 @@ def normal_equations(
     residuals_in: Residuals,
     # Out:
     row_out: wp.array2d(dtype=wp.float32),
-    matrix_out: wp.array3d(dtype=wp.float32),
-    vector_out: wp.array2d(dtype=wp.float32),
+    matrix_inout: wp.array3d(dtype=wp.int64),
+    vector_inout: wp.array2d(dtype=wp.int64),
 ):
-    """J'WJ (B, n, n) and J'We (B, n), n = 6 + D; `row` (B, n) is scratch. Launch over B."""
-    b = wp.tid()
-    if active_in[b] == 0:
+    """Add to J'WJ (B, n, n), lower half, and J'We (B, n), n = 6 + D, both `fixed`. Launch over (B, R / lane); `row`
+    has a row of scratch for each thread."""
+    b, part = wp.tid()
+    count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
+    if active_in[b] == 0 or part * lane_in >= count:
         return
     n = row_out.shape[1]
-    for i in range(n):
-        vector_out[b, i] = 0.0
-        for j in range(n):
-            matrix_out[b, i, j] = 0.0
-    count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
-    for place in range(count):
-        k = residuals_in.order[b, place]
+    own = b * ((residuals_in.body.shape[1] + lane_in - 1) / lane_in) + part
+    for k in range(part * lane_in, wp.min((part + 1) * lane_in, count)):
         for i in range(n):
-            row_out[b, i] = 0.0
+            row_out[own, i] = 0.0
         body = residuals_in.body[b, k]
         other = residuals_in.other[b, k]
         point = residuals_in.point[b, k]
         direction = residuals_in.direction[b, k]
-        add_chain(tree_in, b, body, point, direction, 1.0, body_p_in, axis_in, row_out)
+        add_chain(tree_in, b, own, body, point, direction, 1.0, body_p_in, axis_in, row_out)
         if other >= 0:
             # Both links move with the root: only the joints between them tell.
-            add_chain(tree_in, b, other, point, direction, -1.0, body_p_in, axis_in, row_out)
+            add_chain(tree_in, b, own, other, point, direction, -1.0, body_p_in, axis_in, row_out)
         else:
             turn = wp.cross(point - pivot_in[b], direction)
             for i in range(3):
-                row_out[b, i] = direction[i]
-                row_out[b, 3 + i] = turn[i]
+                row_out[own, i] = direction[i]
+                row_out[own, 3 + i] = turn[i]
         w = residuals_in.weight[b, k]
         e = residuals_in.value[b, k]
         for i in range(n):
-            ri = row_out[b, i]
+            ri = row_out[own, i]
             if ri != 0.0:
-                vector_out[b, i] = vector_out[b, i] + w * ri * e
+                wp.atomic_add(vector_inout, b, i, fixed(w * ri * e))
                 for j in range(i + 1):
-                    rj = row_out[b, j]
+                    rj = row_out[own, j]
                     if rj != 0.0:
-                        matrix_out[b, i, j] = matrix_out[b, i, j] + w * ri * rj
+                        wp.atomic_add(matrix_inout, b, i, j, fixed(w * ri * rj))
+
+
+@wp.struct
+class States:
+    """Hands (B,) in double precision: palm centres, rotations, dofs (B, D)."""
+
+    pivot: wp.array(dtype=wp.vec3d)
+    rotation: wp.array(dtype=wp.quatd)
+    q: wp.array2d(dtype=wp.float64)
+
+
+@wp.kernel
+def keep_best(
+    # Data in:
+    point_depth_in: wp.array(dtype=wp.float32),
+    object_depth_in: wp.array(dtype=wp.float32),
+    self_depth_in: wp.array(dtype=wp.float32),
+    obstacle_depth_in: wp.array(dtype=wp.float32),
+    # In:
+    better_in: wp.float64,
+    now_in: States,
+    # Data out:
+    active_inout: wp.array(dtype=wp.int32),
+    # Out:
+    count_out: wp.array(dtype=wp.int32),
+    best_inout: States,
+    depth_inout: wp.array(dtype=wp.float64),
+):
+    """Keep hands that stand less deep than ever by more than `better` [m]; those without penetration are done. Their
+    residuals begin anew. Launch over B."""
+    b = wp.tid()
+    if active_inout[b] == 0:
+        return
+    count_out[b] = 0
+    now = wp.max(wp.max(point_depth_in[b], object_depth_in[b]), wp.max(self_depth_in[b], obstacle_depth_in[b]))
+    if wp.float64(now) < depth_inout[b] - better_in:
+        depth_inout[b] = wp.float64(now)
+        best_inout.pivot[b] = now_in.pivot[b]
+        best_inout.rotation[b] = now_in.rotation[b]
+        for d in range(now_in.q.shape[1]):
+            best_inout.q[b, d] = now_in.q[b, d]
+    if depth_inout[b] <= better_in:
+        active_inout[b] = 0
+
+
+@wp.kernel
+def step(
+    # Model:
+    lower_in: wp.array(dtype=wp.float64),
+    upper_in: wp.array(dtype=wp.float64),
+    scale_in: wp.array(dtype=wp.float64),
+    damping_in: wp.float64,
+    longest_in: wp.float64,
+    # Data in:
+    active_in: wp.array(dtype=wp.int32),
+    # In:
+    residuals_in: Residuals,
+    # Out:
+    factor_out: wp.array3d(dtype=wp.float64),
+    move_out: wp.array2d(dtype=wp.float64),
+    matrix_inout: wp.array3d(dtype=wp.int64),
+    vector_inout: wp.array2d(dtype=wp.int64),
+    state_inout: States,
+    # Data out:
+    pivot_out: wp.array(dtype=wp.vec3),
+    rotation_out: wp.array(dtype=wp.quat),
+    q_out: wp.array2d(dtype=wp.float32),
+):
+    """A damped Gauss-Newton step, at most `longest` in units of `scale` (n,): (S H S + d I) x = -S g by Cholesky, moved
+    by S x; d is `damping` times the number of residuals. The equations begin anew. Launch over B."""
+    b = wp.tid()
+    if active_in[b] == 0:
+        return
+    n = vector_inout.shape[1]
+    unit = wp.float64(1.0) / wp.float64(FIXED)
+    count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
+    for i in range(n):
+        for j in range(i + 1):
+            total = unit * scale_in[i] * scale_in[j] * wp.float64(matrix_inout[b, i, j])
+            matrix_inout[b, i, j] = wp.int64(0)
+            if i == j:
+                total += damping_in * wp.float64(wp.max(count, 1))
+            for k in range(j):
+                total -= factor_out[b, i, k] * factor_out[b, j, k]
+            if i == j:
+                factor_out[b, i, i] = wp.sqrt(total)
+            else:
+                factor_out[b, i, j] = total / factor_out[b, j, j]
+        right = -unit * scale_in[i] * wp.float64(vector_inout[b, i])
+        vector_inout[b, i] = wp.int64(0)
+        for k in range(i):
+            right -= factor_out[b, i, k] * move_out[b, k]
+        move_out[b, i] = right / factor_out[b, i, i]
+    square = wp.float64(0.0)
+    for back in range(n):
+        i = n - 1 - back
+        total = move_out[b, i]
+        for k in range(i + 1, n):
+            total -= factor_out[b, k, i] * move_out[b, k]
+        move_out[b, i] = total / factor_out[b, i, i]
+        square += move_out[b, i] * move_out[b, i]
+    share = wp.min(wp.float64(1.0), longest_in / wp.max(wp.sqrt(square), wp.float64(1.0e-12)))
+    for i in range(n):
+        move_out[b, i] = share * scale_in[i] * move_out[b, i]
+    state_inout.pivot[b] = state_inout.pivot[b] + wp.vec3d(move_out[b, 0], move_out[b, 1], move_out[b, 2])
+    turn = wp.vec3d(move_out[b, 3], move_out[b, 4], move_out[b, 5])
+    angle = wp.length(turn)
+    axis = turn / wp.max(angle, wp.float64(1.0e-12))
+    state_inout.rotation[b] = wp.normalize(wp.quat_from_axis_angle(axis, angle) * state_inout.rotation[b])
+    pivot_out[b] = wp.vec3(state_inout.pivot[b])
+    rotation_out[b] = wp.quat(state_inout.rotation[b])
+    for d in range(n - 6):
+        value = wp.clamp(state_inout.q[b, d] + move_out[b, 6 + d], lower_in[d], upper_in[d])
+        state_inout.q[b, d] = value
+        q_out[b, d] = wp.float32(value)

@@ -11,7 +11,7 @@ import warp as wp
 
 from worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
 from worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
-from worker.simulation.kernels.projection import Residuals, emit, key_of
+from worker.simulation.kernels.projection import Residuals, emit
 from worker.simulation.kernels.wrenches import Wrenches, add_wrench
 
 wp.set_module_options({"enable_backward": False})
@@ -290,7 +290,6 @@ def residuals(
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
-    emitted = wp.int32(0)
     for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
         margin = kept(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
@@ -302,14 +301,10 @@ def residuals(
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < keep:
                 n = wp.vec3(nd[0], nd[1], nd[2])
-                key = key_of(4, piece, emitted)
-                emit(residuals_out, b, key, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
-                emitted += 1
+                emit(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
         near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
         if near.distance < keep:
-            key = key_of(4, piece, emitted)
-            emit(residuals_out, b, key, body, -1, near.point, near.direction, near.distance - target, 1.0)
-            emitted += 1
+            emit(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
 
 
 @wp.kernel

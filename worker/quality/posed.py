@@ -1,0 +1,129 @@
+"""Hands posed on a device, in double precision, and what the kernels of postures know of a hand and an object."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from worker.grasps import Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.probe import Probe, probe_of
+from worker.simulation.device import to_xyzw
+from worker.simulation.kernels import balance, jamming, opening, optimizers, touching
+from worker.simulation.posed import PosedBodies, chain_of, room_for_bodies
+
+Floats = NDArray[np.float64]
+
+#: Points that one thread of the CPU works on, and hands that are worked on at a time: what they take fits the cache.
+CPU_LANE: Final = 64
+CPU_HANDS: Final = 128
+#: Hands at a time on a GPU.
+GPU_HANDS: Final = 4096
+
+
+@dataclass(frozen=True)
+class Posing:
+    """A hand and an object as the kernels of postures see them."""
+
+    probe: Probe
+    chain: Any
+    points: Any
+    effort: Any
+    """(D,)"""
+
+    @classmethod
+    def of(cls, probe: Probe) -> Posing:
+        with wp.ScopedDevice(probe.device):
+            for module in (touching, balance, opening, jamming, optimizers):
+                wp.load_module(module=module, device=probe.device)
+            return cls(
+                probe, chain_of(probe.hand, probe.device), _points(probe), wp.array(probe.hand.effort, dtype=wp.float64)
+            )
+
+    @property
+    def hand(self) -> HandModel:
+        return self.probe.hand
+
+    @property
+    def device(self) -> str:
+        return self.probe.device
+
+    @property
+    def is_cuda(self) -> bool:
+        return bool(wp.get_device(self.device).is_cuda)
+
+    @property
+    def lane(self) -> int:
+        """Points of a hand that one thread works on."""
+        return 1 if self.is_cuda else CPU_LANE
+
+    @property
+    def lanes(self) -> int:
+        """Threads that the points of a hand take."""
+        return -(-len(self.probe.points) // self.lane)
+
+    @property
+    def at_once(self) -> int:
+        """Hands that are worked on at a time."""
+        return GPU_HANDS if self.is_cuda else CPU_HANDS
+
+    def parts(self, count: int) -> list[slice]:
+        """Slices of so many hands that are worked on one after the other."""
+        return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]
+
+    def bodies(self, count: int) -> Any:
+        """Room for the bodies of so many hands."""
+        with wp.ScopedDevice(self.device):
+            return room_for_bodies(self.hand, count)
+
+    def roots(self, hand_pose: Floats) -> tuple[Any, Any]:
+        """Positions about the object's centre of mass, and rotations, of hands' roots (n, 7)."""
+        with wp.ScopedDevice(self.device):
+            position = wp.array(hand_pose[:, :3] - self.probe.obj.centre_of_mass, dtype=wp.vec3d)
+            return position, wp.array(to_xyzw(hand_pose[:, 3:]), dtype=wp.quatd)
+
+    def touch(self, posture: Posture, reach: float) -> tuple[Any, Any]:
+        """Bodies of posed hands, and what is near their points, within `reach` [m]."""
+        count = len(posture)
+        root = np.array(posture.hand_pose, float)
+        root[:, :3] -= self.probe.obj.centre_of_mass
+        bodies = PosedBodies.of(self.hand, root, posture.joint_positions, self.device).bodies
+        near, shape = touching.Touching(), (count, len(self.probe.points))
+        with wp.ScopedDevice(self.device):
+            near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
+            near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
+            wp.launch(
+                touching.touch, (count, self.lanes), inputs=[self.probe.skin, self.points, self.lane, bodies, reach],
+                outputs=[near],
+            )  # fmt: skip
+        return bodies, near
+
+
+def _points(probe: Probe) -> Any:
+    points, out = probe.points, touching.Points()
+    order = np.argsort(points.body, kind="stable")
+    out.first = wp.array(np.searchsorted(points.body[order], np.arange(probe.hand.bodies + 1)), dtype=wp.int32)
+    out.body = wp.array(points.body[order], dtype=wp.int32)
+    out.position = wp.array(points.position[order], dtype=wp.vec3d)
+    out.normal = wp.array(points.normal[order], dtype=wp.vec3d)
+    return out
+
+
+_posings: LRUCache[tuple[str, str, int, str], Posing] = LRUCache(8)
+_lock = threading.Lock()
+
+
+def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str = "cpu") -> Posing:
+    """The pair on a device, with so many hand points; from memory where it was used lately."""
+    key = (hand.content, obj.content, points, device)
+    with _lock:
+        if key not in _posings:
+            _posings[key] = Posing.of(probe_of(hand, obj, hand_points=points, object_points=64, device=device))
+        return _posings[key]

@@ -1,0 +1,206 @@
+"""Where fingers that open would jam, and how far an open hand goes back: fingers are held back where they run into
+others, hands that stay in touch retreat."""
+
+import warp as wp
+
+from worker.simulation.kernels.chain import Bodies, Chain, joint_value, place_body
+from worker.simulation.kernels.distance import BodyPoints, Skin, nearest, placed_at
+from worker.simulation.kernels.opening import Fingers, Hands
+from worker.simulation.kernels.pieces import Pieces, piece_distance
+from worker.simulation.kernels.touching import Points, point_of
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+
+@wp.struct
+class Jams:
+    """Fingers held back where they would jam: B hands, F fingers."""
+
+    going: wp.array(dtype=wp.int32)  # (B,)
+    share: wp.array2d(dtype=wp.float64)  # (B, F) of its way that each finger goes
+    limit: wp.array2d(dtype=wp.float32)  # (B, F) depth that it may have
+    depth: wp.array2d(dtype=wp.float32)  # (B, F) deepest on its way
+    blocked: wp.array2d(dtype=wp.int32)  # (B, F) 1: something else is in its way
+
+
+@wp.func
+def on_way(fingers: Fingers, hands: Hands, jams: Jams, open: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32):
+    """How far a dof goes, as a difference to the grasp."""
+    move = open[b, d] - hands.q[b, d]
+    finger = fingers.of_dof[d]
+    if finger >= 0:
+        move = move * jams.share[b, finger]
+    return move
+
+
+@wp.kernel
+def place_on_way(
+    # Model:
+    chain_in: Chain,
+    fingers_in: Fingers,
+    hands_in: Hands,
+    # In:
+    jams_in: Jams,
+    open_in: wp.array2d(dtype=wp.float64),
+    way_in: wp.float64,
+    # Out:
+    bodies_out: Bodies,
+):
+    """Bodies of hands that have come this share of their way. Launch over B."""
+    b = wp.tid()
+    if jams_in.going[b] == 0:
+        return
+    bodies_out.position[b, 0] = hands_in.position[b]
+    bodies_out.rotation[b, 0] = hands_in.rotation[b]
+    for body in range(1, chain_in.parent.shape[0]):
+        d = chain_in.dof[body]
+        q = hands_in.q[b, d] + way_in * on_way(fingers_in, hands_in, jams_in, open_in, b, d)
+        place_body(chain_in, bodies_out, b, body, joint_value(chain_in, body, q))
+
+
+@wp.func
+def deepen(fingers: Fingers, depth: wp.array2d(dtype=wp.float32), b: wp.int32, body: wp.int32, deep: wp.float32):
+    """Note a depth of a body with its finger."""
+    if fingers.of_body[body] >= 0:
+        wp.atomic_max(depth, b, fingers.of_body[body], deep)
+
+
+@wp.kernel
+def finger_depth(
+    # Model:
+    pieces_in: Pieces,
+    points_in: BodyPoints,
+    fingers_in: Fingers,
+    # In:
+    bodies_in: Bodies,
+    piece_p_in: wp.array2d(dtype=wp.vec3),
+    piece_q_in: wp.array2d(dtype=wp.quat),
+    # Out:
+    jams_inout: Jams,
+):
+    """Deepest that each finger is in the rest of the hand, or that in the finger. Launch over (B, L)."""
+    b, body = wp.tid()
+    if jams_inout.going[b] == 0 or points_in.first[body] == points_in.first[body + 1]:
+        return
+    place, turned = bodies_in.position[b, body], bodies_in.rotation[b, body]
+    middle = placed_at(wp.vec3d(), place, turned, points_in.middle[body])
+    for piece in range(pieces_in.body.shape[0]):
+        other = pieces_in.body[piece]
+        if pieces_in.apart[body, other] == 1:
+            centre = piece_p_in[b, piece]
+            bound = wp.length(pieces_in.half[piece])
+            about = bound + points_in.extent[body]
+            if wp.length_sq(middle - centre) < about * about:
+                deepest = float(0.0)
+                for i in range(points_in.first[body], points_in.first[body + 1]):
+                    offset = placed_at(wp.vec3d(), place, turned, points_in.position[i]) - centre
+                    if wp.dot(offset, offset) < bound * bound:
+                        nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(piece_q_in[b, piece], offset))
+                        deepest = wp.max(deepest, -nd[3])
+                if deepest > 0.0:
+                    deepen(fingers_in, jams_inout.depth, b, body, deepest)
+                    deepen(fingers_in, jams_inout.depth, b, other, deepest)
+
+
+@wp.kernel
+def limit_depth(
+    # In:
+    more_in: wp.float32,
+    # Out:
+    jams_inout: Jams,
+):
+    """What a finger has in the grasp and so much more is its limit; depths begin anew. Launch over B."""
+    b = wp.tid()
+    for f in range(jams_inout.share.shape[1]):
+        jams_inout.limit[b, f] = jams_inout.depth[b, f] + more_in
+        jams_inout.depth[b, f] = 0.0
+
+
+@wp.kernel
+def hold_back(
+    # In:
+    less_in: wp.float64,
+    # Out:
+    jams_inout: Jams,
+):
+    """Fingers that jam go a share `less` as far; hands of which none does are done. Depths begin anew. Over B."""
+    b = wp.tid()
+    if jams_inout.going[b] == 0:
+        return
+    going = wp.int32(0)
+    for f in range(jams_inout.share.shape[1]):
+        if jams_inout.depth[b, f] > jams_inout.limit[b, f] or jams_inout.blocked[b, f] == 1:
+            jams_inout.share[b, f] = less_in * jams_inout.share[b, f]
+            going = 1
+        jams_inout.depth[b, f] = 0.0
+    jams_inout.going[b] = going
+
+
+@wp.kernel
+def take_way(
+    # Model:
+    fingers_in: Fingers,
+    hands_in: Hands,
+    # In:
+    jams_in: Jams,
+    # Out:
+    open_inout: wp.array2d(dtype=wp.float64),
+):
+    """The dofs where fingers that jam have been held back. Launch over (B, D)."""
+    b, d = wp.tid()
+    open_inout[b, d] = hands_in.q[b, d] + on_way(fingers_in, hands_in, jams_in, open_inout, b, d)
+
+
+@wp.struct
+class Retreat:
+    """How far B open hands go back along their palm's approach."""
+
+    going: wp.array(dtype=wp.int32)  # (B,)
+    clear: wp.array(dtype=wp.float32)
+    best: wp.array(dtype=wp.float32)
+    chosen: wp.array(dtype=wp.int32)
+
+
+@wp.kernel
+def hand_clearance(
+    # Model:
+    skin_in: Skin,
+    points_in: Points,
+    lane_in: wp.int32,
+    approach_in: wp.vec3d,
+    wanted_in: wp.float32,
+    # In:
+    back_in: wp.float64,
+    bodies_in: Bodies,
+    # Out:
+    retreat_inout: Retreat,
+):
+    """Least distance of whole hands that went `back` against their palm's approach. Launch over (B, N / lane)."""
+    b, part = wp.tid()
+    if retreat_inout.going[b] == 0:
+        return
+    shift = back_in * wp.quat_rotate(bodies_in.rotation[b, 0], approach_in)
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, points_in.body.shape[0])):
+        found = nearest(skin_in, wp.vec3(point_of(points_in, bodies_in, b, i) - shift), wanted_in)
+        if found.distance < wanted_in:
+            wp.atomic_min(retreat_inout.clear, b, found.distance)
+
+
+@wp.kernel
+def judge_retreat(
+    # In:
+    wanted_in: wp.float32,
+    step_in: wp.int32,
+    # Out:
+    retreat_inout: Retreat,
+):
+    """Keep the first retreat that is enough, or the one that gets a hand farthest. Launch over B."""
+    b = wp.tid()
+    if retreat_inout.going[b] == 0:
+        return
+    if retreat_inout.clear[b] > retreat_inout.best[b]:
+        retreat_inout.best[b] = retreat_inout.clear[b]
+        retreat_inout.chosen[b] = step_in
+    if retreat_inout.best[b] >= wanted_in:
+        retreat_inout.going[b] = 0
+    retreat_inout.clear[b] = wanted_in

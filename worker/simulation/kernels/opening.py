@@ -1,0 +1,261 @@
+"""How fingers open around a grasp: the way each leaves the object, how far it goes, and where it would jam.
+
+Fingers are judged each by itself, hands all at once; a hand or a finger that is done costs nothing more.
+"""
+
+import warp as wp
+
+from worker.simulation.kernels.chain import Bodies, Chain, joint_axis, joint_value, place_body
+from worker.simulation.kernels.distance import Skin, nearest
+from worker.simulation.kernels.touching import Points, Touching, point_of
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+
+@wp.struct
+class Fingers:
+    """What opens as one: F fingers of a hand with L bodies and D dofs."""
+
+    of_body: wp.array(dtype=wp.int32)  # (L,) -1: none
+    of_dof: wp.array(dtype=wp.int32)  # (D,) -1: stays
+    closing: wp.array(dtype=wp.float64)  # (D,)
+    step: wp.array(dtype=wp.float64)  # (D,) [rad or m]
+    lower: wp.array(dtype=wp.float64)
+    upper: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class Hands:
+    """B hands in their grasps."""
+
+    position: wp.array(dtype=wp.vec3d)  # of the root, about the object's centre of mass
+    rotation: wp.array(dtype=wp.quatd)
+    q: wp.array2d(dtype=wp.float64)  # (B, D)
+
+
+@wp.struct
+class Sweep:
+    """How B hands open along `direction`, step by step."""
+
+    going: wp.array(dtype=wp.int32)  # (B,)
+    direction: wp.array2d(dtype=wp.float64)  # (B, D)
+    clear: wp.array2d(dtype=wp.float32)  # (B, F) distance at the present step, at most the one that is wanted
+    best: wp.array2d(dtype=wp.float32)  # (B, F) greatest so far
+    chosen: wp.array2d(dtype=wp.int32)  # (B, F) the first step with that
+
+
+@wp.func
+def opened(fingers: Fingers, hands: Hands, direction: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32,
+           steps: wp.int32):  # fmt: skip
+    """A dof so many steps along its way. A grasp may stand a hair outside its limits: that is no reason to jump."""
+    q = hands.q[b, d]
+    value = q + wp.float64(steps) * fingers.step[d] * direction[b, d]
+    return wp.clamp(value, wp.min(fingers.lower[d], q), wp.max(fingers.upper[d], q))
+
+
+@wp.kernel
+def body_wrenches(
+    # Model:
+    points_in: Points,
+    # In:
+    bodies_in: Bodies,
+    touching_in: Touching,
+    reach_in: wp.float32,
+    # Out:
+    force_out: wp.array2d(dtype=wp.vec3d),
+    torque_out: wp.array2d(dtype=wp.vec3d),
+):
+    """Forces on bodies (B, L), and their torques about the origin, along the object's normals: of each point as much as
+    it is nearer than `reach`. Launch over (B, L)."""
+    b, body = wp.tid()
+    force = wp.vec3d(wp.float64(0.0))
+    torque = wp.vec3d(wp.float64(0.0))
+    for i in range(points_in.first[body], points_in.first[body + 1]):
+        weight = wp.float64(reach_in) - wp.float64(touching_in.distance[b, i])
+        if weight > wp.float64(0.0):
+            f = weight * wp.vec3d(touching_in.normal[b, i])
+            force += f
+            torque += wp.cross(point_of(points_in, bodies_in, b, i), f)
+    force_out[b, body] = force
+    torque_out[b, body] = torque
+
+
+@wp.kernel
+def leave(
+    # Model:
+    chain_in: Chain,
+    fingers_in: Fingers,
+    plain_in: wp.float64,
+    # In:
+    bodies_in: Bodies,
+    # Out:
+    force_inout: wp.array2d(dtype=wp.vec3d),
+    torque_inout: wp.array2d(dtype=wp.vec3d),
+    away_out: wp.array2d(dtype=wp.float64),
+    sweep_out: Sweep,
+):
+    """Directions (B, D) in which fingers leave: a share `plain` against `closing`, the rest along the forces on them,
+    by 1 for the fastest dof of a finger. All hands set out. Launch over B."""
+    b = wp.tid()
+    dofs = away_out.shape[1]
+    for d in range(dofs):
+        away_out[b, d] = wp.float64(0.0)
+    count = chain_in.parent.shape[0]
+    for back in range(1, count):
+        body = count - back
+        force = force_inout[b, body]
+        torque = torque_inout[b, body]
+        axis = joint_axis(chain_in, bodies_in, b, body)
+        work = wp.dot(axis, force)
+        if chain_in.turns[body] == 1:
+            work = wp.dot(axis, torque - wp.cross(bodies_in.position[b, body], force))
+        d = chain_in.dof[body]
+        away_out[b, d] = away_out[b, d] + chain_in.multiplier[body] * work
+        parent = chain_in.parent[body]
+        force_inout[b, parent] = force_inout[b, parent] + force
+        torque_inout[b, parent] = torque_inout[b, parent] + torque
+    for d in range(dofs):
+        # A finger that hooks around an edge would leave by closing further: it must open all the same.
+        if away_out[b, d] * fingers_in.closing[d] > wp.float64(0.0):
+            away_out[b, d] = wp.float64(0.0)
+        sweep_out.direction[b, d] = -fingers_in.closing[d]
+    for d in range(dofs):
+        finger = fingers_in.of_dof[d]
+        fastest = wp.float64(0.0)
+        if finger >= 0:
+            for other in range(dofs):
+                if fingers_in.of_dof[other] == finger:
+                    fastest = wp.max(fastest, wp.abs(away_out[b, other]))
+        if fastest > wp.float64(0.0):
+            sweep_out.direction[b, d] = (
+                plain_in * sweep_out.direction[b, d] + (wp.float64(1.0) - plain_in) * away_out[b, d] / fastest
+            )
+    sweep_out.going[b] = 1
+    for f in range(sweep_out.best.shape[1]):
+        sweep_out.best[b, f] = -1.0e9
+        sweep_out.chosen[b, f] = 0
+
+
+@wp.kernel
+def open_plainly(
+    # Model:
+    fingers_in: Fingers,
+    stuck_in: wp.float32,
+    # In:
+    first_in: Sweep,
+    # Out:
+    sweep_out: Sweep,
+    step_out: wp.array(dtype=wp.int32),
+):
+    """Hands of which a finger got less than `stuck` away set out again, against `closing`. Launch over B."""
+    b = wp.tid()
+    step_out[0] = 0
+    sweep_out.going[b] = 0
+    for f in range(sweep_out.best.shape[1]):
+        sweep_out.best[b, f] = -1.0e9
+        sweep_out.chosen[b, f] = 0
+        if first_in.best[b, f] < stuck_in:
+            sweep_out.going[b] = 1
+    for d in range(sweep_out.direction.shape[1]):
+        sweep_out.direction[b, d] = -fingers_in.closing[d]
+
+
+@wp.kernel
+def place_opening(
+    # Model:
+    chain_in: Chain,
+    fingers_in: Fingers,
+    hands_in: Hands,
+    wanted_in: wp.float32,
+    # In:
+    step_in: wp.array(dtype=wp.int32),
+    # Out:
+    sweep_inout: Sweep,
+    bodies_out: Bodies,
+):
+    """Bodies of hands that open, at the present step. Launch over B."""
+    b = wp.tid()
+    if sweep_inout.going[b] == 0:
+        return
+    for f in range(sweep_inout.clear.shape[1]):
+        sweep_inout.clear[b, f] = wanted_in
+    bodies_out.position[b, 0] = hands_in.position[b]
+    bodies_out.rotation[b, 0] = hands_in.rotation[b]
+    for body in range(1, chain_in.parent.shape[0]):
+        q = opened(fingers_in, hands_in, sweep_inout.direction, b, chain_in.dof[body], step_in[0])
+        place_body(chain_in, bodies_out, b, body, joint_value(chain_in, body, q))
+
+
+@wp.kernel
+def finger_clearance(
+    # Model:
+    skin_in: Skin,
+    points_in: Points,
+    fingers_in: Fingers,
+    lane_in: wp.int32,
+    wanted_in: wp.float32,
+    # In:
+    bodies_in: Bodies,
+    # Out:
+    sweep_inout: Sweep,
+):
+    """Least distance of each finger that is not clear yet. Launch over (B, N / lane)."""
+    b, part = wp.tid()
+    if sweep_inout.going[b] == 0:
+        return
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, points_in.body.shape[0])):
+        finger = fingers_in.of_body[points_in.body[i]]
+        if finger >= 0:
+            if sweep_inout.best[b, finger] < wanted_in:
+                found = nearest(skin_in, wp.vec3(point_of(points_in, bodies_in, b, i)), wanted_in)
+                if found.distance < wanted_in:
+                    wp.atomic_min(sweep_inout.clear, b, finger, found.distance)
+
+
+@wp.kernel
+def judge_opening(
+    # In:
+    wanted_in: wp.float32,
+    step_in: wp.array(dtype=wp.int32),
+    # Out:
+    sweep_inout: Sweep,
+):
+    """Keep the first step at which each finger is clear, or farthest; hands with all fingers clear stop. Over B."""
+    b = wp.tid()
+    if sweep_inout.going[b] == 0:
+        return
+    going = wp.int32(0)
+    for f in range(sweep_inout.clear.shape[1]):
+        if sweep_inout.best[b, f] < wanted_in:
+            if sweep_inout.clear[b, f] > sweep_inout.best[b, f]:
+                sweep_inout.best[b, f] = sweep_inout.clear[b, f]
+                sweep_inout.chosen[b, f] = step_in[0]
+            if sweep_inout.best[b, f] < wanted_in:
+                going = 1
+    sweep_inout.going[b] = going
+
+
+@wp.kernel
+def take_opening(
+    # Model:
+    fingers_in: Fingers,
+    hands_in: Hands,
+    stuck_in: wp.float32,
+    # In:
+    first_in: Sweep,
+    plain_in: Sweep,
+    # Out:
+    open_out: wp.array2d(dtype=wp.float64),
+):
+    """Dofs (B, D) where each finger got: plainly opened where that got it farther than the other way, or than `stuck`.
+    Launch over (B, D)."""
+    b, d = wp.tid()
+    open_out[b, d] = hands_in.q[b, d]
+    finger = fingers_in.of_dof[d]
+    if finger < 0:
+        return
+    # A hand that did not set out again got nowhere.
+    if plain_in.best[b, finger] > wp.min(first_in.best[b, finger], stuck_in):
+        open_out[b, d] = opened(fingers_in, hands_in, plain_in.direction, b, d, plain_in.chosen[b, finger])
+    else:
+        open_out[b, d] = opened(fingers_in, hands_in, first_in.direction, b, d, first_in.chosen[b, finger])

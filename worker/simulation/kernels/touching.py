@@ -1,0 +1,268 @@
+"""What of an object is near the points of posed hands, and which forces there hold it: points, contacts, columns of the
+balance. Poses are in double precision, distances to the mesh in single."""
+
+import math
+
+import warp as wp
+
+from worker.simulation.kernels.chain import Bodies, Chain, joint_axis
+from worker.simulation.kernels.distance import Skin, nearest
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+#: Edges of a friction pyramid.
+EDGES = wp.constant(8)
+#: Angle from one to the next.
+TURN = wp.constant(wp.float64(math.tau / 8))
+#: Rows of a balance before those of the torques: the wrench and the sum of normal forces.
+FIRST_TORQUE = wp.constant(7)
+
+
+@wp.struct
+class Points:
+    """N points of a hand's surface, sorted by body."""
+
+    first: wp.array(dtype=wp.int32)  # (L + 1,)
+    body: wp.array(dtype=wp.int32)
+    position: wp.array(dtype=wp.vec3d)  # body frame
+    normal: wp.array(dtype=wp.vec3d)  # outward
+
+
+@wp.struct
+class Touching:
+    """What is near the points (B, N) of B hands, within a reach."""
+
+    distance: wp.array2d(dtype=wp.float32)  # at most the reach
+    closest: wp.array2d(dtype=wp.vec3)
+    normal: wp.array2d(dtype=wp.vec3)  # of the object; 0 beyond reach
+    cosine: wp.array2d(dtype=wp.float64)  # of the hand's normal and the object's
+
+
+@wp.func
+def point_of(points: Points, bodies: Bodies, b: wp.int32, i: wp.int32):
+    """Where a point of a hand is."""
+    body = points.body[i]
+    return bodies.position[b, body] + wp.quat_rotate(bodies.rotation[b, body], points.position[i])
+
+
+@wp.kernel
+def touch(
+    # Model:
+    skin_in: Skin,
+    points_in: Points,
+    lane_in: wp.int32,
+    # In:
+    bodies_in: Bodies,
+    reach_in: wp.float32,
+    # Out:
+    touching_out: Touching,
+):
+    """What is near all points of hands. Launch over (B, N / lane)."""
+    b, part = wp.tid()
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, points_in.body.shape[0])):
+        found = nearest(skin_in, wp.vec3(point_of(points_in, bodies_in, b, i)), reach_in)
+        touching_out.distance[b, i] = wp.min(found.distance, reach_in)
+        touching_out.closest[b, i] = found.closest
+        touching_out.normal[b, i] = found.normal
+        outward = wp.quat_rotate(bodies_in.rotation[b, points_in.body[i]], points_in.normal[i])
+        touching_out.cosine[b, i] = wp.dot(outward, wp.vec3d(found.normal))
+
+
+@wp.func
+def apart(touching: Touching, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
+    """Square of how far apart two contacts are: by place over `radius`, and by direction."""
+    place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
+    turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
+    return wp.dot(place, place) + wp.dot(turn, turn)
+
+
+@wp.kernel
+def choose(
+    # In:
+    touching_in: Touching,
+    near_in: wp.float32,
+    facing_in: wp.float64,
+    radius_in: wp.float64,
+    # Out:
+    list_out: wp.array2d(dtype=wp.int32),
+    least_out: wp.array2d(dtype=wp.float64),
+    chosen_out: wp.array2d(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """At most C points (B, C) of each hand that press: nearer than `near` and faced with a cosine below `facing`; of
+    more than C those that spread most widely, each farthest from those before it (Gonzalez 1985). Launch over B.
+
+    `list`, `least` (B, N) are scratch; `count` (B,) is how many there are.
+    """
+    b = wp.tid()
+    limit = chosen_out.shape[1]
+    n = wp.int32(0)
+    place = wp.vec3d(wp.float64(0.0))
+    turn = wp.vec3d(wp.float64(0.0))
+    for i in range(touching_in.distance.shape[1]):
+        if touching_in.distance[b, i] < near_in and touching_in.cosine[b, i] < facing_in:
+            list_out[b, n] = i
+            place += wp.vec3d(touching_in.closest[b, i]) / radius_in
+            turn += wp.vec3d(touching_in.normal[b, i])
+            n += 1
+    count_out[b] = wp.min(n, limit)
+    if n <= limit:
+        for k in range(n):
+            chosen_out[b, k] = list_out[b, k]
+        return
+    place = place / wp.float64(n)
+    turn = turn / wp.float64(n)
+    best = wp.int32(0)
+    farthest = wp.float64(-1.0)
+    for k in range(n):
+        i = list_out[b, k]
+        x = wp.vec3d(touching_in.closest[b, i]) / radius_in - place
+        y = wp.vec3d(touching_in.normal[b, i]) - turn
+        square = wp.dot(x, x) + wp.dot(y, y)
+        least_out[b, k] = wp.float64(1.0e30)
+        if square > farthest:
+            farthest = square
+            best = k
+    chosen_out[b, 0] = list_out[b, best]
+    for c in range(1, limit):
+        last = list_out[b, best]
+        least_out[b, best] = wp.float64(-1.0)
+        farthest = wp.float64(-2.0)
+        for k in range(n):
+            if least_out[b, k] >= wp.float64(0.0):
+                least_out[b, k] = wp.min(least_out[b, k], apart(touching_in, radius_in, b, list_out[b, k], last))
+            if least_out[b, k] > farthest:
+                farthest = least_out[b, k]
+                best = k
+        chosen_out[b, c] = list_out[b, best]
+
+
+@wp.func
+def first_tangent(n: wp.vec3d):
+    """A unit vector across n, along a coordinate axis where n is along another."""
+    axis = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+    if wp.abs(n[1]) < wp.abs(n[0]) and wp.abs(n[1]) <= wp.abs(n[2]):
+        axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+    elif wp.abs(n[2]) < wp.abs(n[0]):
+        axis = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+    return wp.normalize(wp.cross(n, axis))
+
+
+@wp.kernel
+def columns(
+    # Model:
+    chain_in: Chain,
+    effort_in: wp.array(dtype=wp.float64),
+    points_in: Points,
+    # In:
+    bodies_in: Bodies,
+    touching_in: Touching,
+    chosen_in: wp.array2d(dtype=wp.int32),
+    count_in: wp.array(dtype=wp.int32),
+    friction_in: wp.float64,
+    radius_in: wp.float64,
+    sum_in: wp.float64,
+    # Out:
+    matrix_out: wp.array3d(dtype=wp.float64),
+):
+    """Columns (B, C * E, 7 + D) of the balance: the wrench of each edge of a contact's pyramid with unit normal force,
+    torque over `radius`; `sum`; the torques of the dofs that exert it over their limits. Launch over (B, C)."""
+    b, c = wp.tid()
+    if c >= count_in[b]:
+        return
+    i = chosen_in[b, c]
+    place = wp.vec3d(touching_in.closest[b, i])
+    n = -wp.vec3d(touching_in.normal[b, i])
+    t1 = first_tangent(n)
+    t2 = wp.cross(n, t1)
+    for e in range(EDGES):
+        angle = wp.float64(e) * TURN
+        force = n + friction_in * (wp.cos(angle) * t1 + wp.sin(angle) * t2)
+        torque = wp.cross(place / radius_in, force)
+        k = c * EDGES + e
+        for axis in range(3):
+            matrix_out[b, k, axis] = force[axis]
+            matrix_out[b, k, 3 + axis] = torque[axis]
+        matrix_out[b, k, 6] = sum_in
+        for d in range(effort_in.shape[0]):
+            matrix_out[b, k, FIRST_TORQUE + d] = wp.float64(0.0)
+    # By virtual work: what an edge asks of a joint is the force along the way that the joint moves the contact.
+    body = points_in.body[i]
+    while body > 0:
+        way = joint_axis(chain_in, bodies_in, b, body)
+        if chain_in.turns[body] == 1:
+            way = wp.cross(way, place - bodies_in.position[b, body])
+        d = chain_in.dof[body]
+        way = (chain_in.multiplier[body] / effort_in[d]) * way
+        for e in range(EDGES):
+            k = c * EDGES + e
+            force = wp.vec3d(matrix_out[b, k, 0], matrix_out[b, k, 1], matrix_out[b, k, 2])
+            matrix_out[b, k, FIRST_TORQUE + d] = matrix_out[b, k, FIRST_TORQUE + d] + wp.dot(force, way)
+        body = chain_in.parent[body]
+
+
+@wp.kernel
+def scale_torques(
+    # In:
+    weight_in: wp.float64,
+    # Out:
+    count_inout: wp.array(dtype=wp.int32),
+    matrix_inout: wp.array3d(dtype=wp.float64),
+    unit_out: wp.array(dtype=wp.float64),
+):
+    """Torques of a balance over `unit` (B,), which gives the largest of them `weight`; `count` (B,) of contacts becomes
+    that of columns. Launch over B."""
+    b = wp.tid()
+    count = EDGES * count_inout[b]
+    count_inout[b] = count
+    largest = wp.float64(1.0e-12)
+    for k in range(count):
+        for row in range(FIRST_TORQUE, matrix_inout.shape[2]):
+            largest = wp.max(largest, wp.abs(matrix_inout[b, k, row]))
+    unit = largest / weight_in
+    unit_out[b] = unit
+    for k in range(count):
+        for row in range(FIRST_TORQUE, matrix_inout.shape[2]):
+            matrix_inout[b, k, row] = matrix_inout[b, k, row] / unit
+
+
+@wp.kernel
+def hold(
+    # Model:
+    effort_in: wp.array(dtype=wp.float64),
+    # In:
+    matrix_in: wp.array3d(dtype=wp.float64),
+    share_in: wp.array2d(dtype=wp.float64),
+    count_in: wp.array(dtype=wp.int32),
+    unit_in: wp.array(dtype=wp.float64),
+    total_in: wp.float64,
+    # Out:
+    residual_out: wp.array(dtype=wp.float64),
+    torque_out: wp.array2d(dtype=wp.float64),
+):
+    """Net wrench of forces in these shares (B, C * E) over the sum of their normal components, and the torques (B, D)
+    that exert them when that sum is `total`, or less where a limit asks for it. Launch over B."""
+    b = wp.tid()
+    whole = wp.float64(0.0)
+    for k in range(count_in[b]):
+        whole += share_in[b, k]
+    whole = wp.max(whole, wp.float64(1.0e-12))
+    square = wp.float64(0.0)
+    for axis in range(6):
+        net = wp.float64(0.0)
+        for k in range(count_in[b]):
+            net += share_in[b, k] / whole * matrix_in[b, k, axis]
+        square += net * net
+    residual_out[b] = wp.sqrt(square)
+    if count_in[b] == 0:
+        residual_out[b] = wp.float64(1.0)
+    asked = wp.float64(1.0e-12)
+    for d in range(effort_in.shape[0]):
+        torque = wp.float64(0.0)
+        for k in range(count_in[b]):
+            torque += share_in[b, k] / whole * matrix_in[b, k, FIRST_TORQUE + d]
+        torque_out[b, d] = total_in * unit_in[b] * effort_in[d] * torque
+        asked = wp.max(asked, wp.abs(torque_out[b, d]) / effort_in[d])
+    scale = wp.min(wp.float64(1.0), wp.float64(1.0) / asked)
+    for d in range(effort_in.shape[0]):
+        torque_out[b, d] = scale * torque_out[b, d]
