@@ -46,6 +46,11 @@ class Settings(BaseSettings):
         None, ge=0, description="of a worker among those of its machine: with device auto, number k takes the k-th GPU"
     )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
+    join: str = Field(
+        "auto",
+        pattern=r"^(auto|[1-9][0-9]{0,3})$",
+        description="batches of one pair that a worker plans in one launch; auto: what fills its GPU, on a CPU 1",
+    )
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
     keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")

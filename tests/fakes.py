@@ -87,6 +87,11 @@ def fake_stages() -> dict[Stage, Any]:
     return {Stage.SYNTHESIZE: fake_synthesize, Stage.SCENE: fake_scene}
 
 
+def alike_batches(message: TaskMessage) -> str | None:
+    """What `worker.stages.alike` says, without an engine."""
+    return message.object_digest if message.stage is Stage.SYNTHESIZE and message.attempt == 1 else None
+
+
 def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> ShardManifest:
     """Do a task on the spot: its shard and manifest are in the store afterwards."""
     context = TaskContext(store)
@@ -171,7 +176,10 @@ def main() -> None:
     options.add_argument("--idle", type=int, default=0)
     wanted, _ = options.parse_known_args()
     table |= {Stage.SYNTHESIZE: synthesize}
-    sys.exit(0 if run_worker(settings, table=table, check=check, burst=wanted.burst, idle_s=wanted.idle) else 1)
+    ended_well = run_worker(
+        settings, table=table, check=check, alike=alike_batches, burst=wanted.burst, idle_s=wanted.idle
+    )
+    sys.exit(0 if ended_well else 1)
 
 
 if __name__ == "__main__":

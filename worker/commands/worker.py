@@ -27,6 +27,9 @@ def worker(
     stages: Annotated[str | None, typer.Option(help="Stages to serve, with commas between; default: all.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; with device auto each takes the next GPU.")] = 1,
     threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0: one per core; GRASPD_THREADS.")] = None,
+    join: Annotated[
+        str | None, typer.Option(help="Batches of one pair that are planned in one launch, or auto; GRASPD_JOIN.")
+    ] = None,
     burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
     idle: Annotated[int, typer.Option(min=0, help="With --burst: end when none came for so long [s].")] = 0,
     once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
@@ -37,7 +40,7 @@ def worker(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
 ) -> None:
     """A worker on one device, or several: takes tasks from the queue until it is told to stop."""
-    settings = load_settings(device=device, threads=threads, data_dir=data_dir)
+    settings = load_settings(device=device, threads=threads, join=join, data_dir=data_dir)
     log_to_stderr(settings, "worker")
     keep_private(settings)
     if check:
@@ -67,6 +70,7 @@ def _run_several(count: int, settings: Settings, stages: str | None) -> None:
 
     _parse_stages(stages)
     arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
+    arguments += ["--join", settings.join]
     arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
     run_workers(count, arguments, settings, stop_on_signals())
 

@@ -58,9 +58,10 @@ def synthesize(
     key = (hand.content, obj.content, method, repr(options), wanted.fidelity.model_dump_json(), run.device, *around)
 
     def work(asked: Sequence[Asked]) -> list[Finish | Exception]:
-        found = together(hand, obj, asked)
-        check_device(run.device)  # here, where nobody else has work on it
-        return found
+        try:
+            return together(hand, obj, asked)
+        finally:
+            check_device(run.device)  # here, where nobody else has work on it
 
     finish: Finish = run.meeting.ask(key, Asked(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
     return finish()

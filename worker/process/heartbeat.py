@@ -39,28 +39,29 @@ class Hold:
         """The hold on an execution of RQ."""
         return cls(task_id, context, execution.composite_key, registry.key, timeout_s)
 
-    def keys(self) -> dict[str, str]:
-        """What the pulse needs to keep the lease."""
+    def told(self) -> dict[str, Any]:
+        """What the pulse needs to keep the lease, and to see to it that the task ends."""
         return {
             "entry": self.entry,
             "registry": self.registry,
-            "execution": f"rq:execution:{self.entry}",
-            "executions": f"rq:executions:{self.entry.partition(':')[0]}",
             "cancel": cancel_key(self.task_id),
+            "seconds": self.timeout_s,
         }
 
 
 class Heartbeat:
-    """Keeps a worker's registration and the lease of its task alive, and listens for cancellation."""
+    """Keeps a worker's registration and the leases of its tasks alive, and listens for cancellation."""
 
     def __init__(self, url: str, beat: WorkerBeat, *, lease_s: float, alive: Path | None = None) -> None:
         """`url` is that of Redis; `alive` a file that is touched with each beat."""
         self._beat = asdict(beat)
         self._place = place_of(beat.name, lease_s) | {"url": url, "alive": str(alive or "")}
-        self._hold: Hold | None = None
+        self._holds: dict[str, Hold] = {}
         self._limit: dict[str, Any] | None = None
         self._lock = threading.RLock()
         self._pending = False
+        self._unsent = b""
+        """Rest of a line that the pulse did not take whole."""
         self._stopping = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
@@ -91,12 +92,11 @@ class Heartbeat:
         """Of the pulse."""
         return self._process.pid if self._process is not None else None
 
-    def hold(self, hold: Hold | None, *, state: str | None = None) -> None:
-        """The task in hand from now on, or None."""
+    def hold(self, *holds: Hold, state: str | None = None) -> None:
+        """The tasks in hand from now on; the registration names the first of them."""
         with self._lock:
-            self._hold = hold
-            self._limit = {"id": hold.entry, "seconds": hold.timeout_s} if hold else None
-            self.update(task_id=hold.task_id if hold else "", state=state or ("busy" if hold else "idle"))
+            self._holds = {hold.entry: hold for hold in holds}
+            self.update(task_id=holds[0].task_id if holds else "", state=state or ("busy" if holds else "idle"))
 
     def limit(self, what: str, seconds: float) -> None:
         """Something besides a task that must end within a time, or else the worker is ended."""
@@ -115,22 +115,32 @@ class Heartbeat:
             self._tell()
 
     def _tell(self) -> None:
-        now_at = {"beat": self._beat, "limit": self._limit, "hold": self._hold.keys() if self._hold else None}
+        holds = [hold.told() for hold in self._holds.values()]
+        now_at = {"beat": self._beat, "limit": self._limit, "holds": holds}
         # A pulse that is not there yet, or busy, gets the news after its next beat.
         self._pending = not self._write(now_at)
 
     def _write(self, line: dict[str, Any]) -> bool:
-        """Whether the pulse has the line; it never waits, and a line (under 4 KiB) is written whole or not at all."""
+        """Whether the pulse has the whole line; it never waits. What it lacks is sent before anything else."""
         with self._lock:
             if self._process is None or self._process.stdin is None:
                 return True
-            try:
-                os.write(self._process.stdin.fileno(), json.dumps(line).encode() + b"\n")
-            except BlockingIOError:
+            if not self._flush():
                 return False
-            except (OSError, ValueError):  # it ended; the next one is told
-                pass
-            return True
+            self._unsent = json.dumps(line).encode() + b"\n"
+            return self._flush()
+
+    def _flush(self) -> bool:
+        """Whether nothing is left unsent."""
+        assert self._process is not None and self._process.stdin is not None
+        try:
+            while self._unsent:
+                self._unsent = self._unsent[os.write(self._process.stdin.fileno(), self._unsent) :]
+        except BlockingIOError:
+            return False
+        except (OSError, ValueError):  # it ended; the next one is told
+            self._unsent = b""
+        return True
 
     def _spawn(self) -> None:
         with self._lock:
@@ -142,6 +152,7 @@ class Heartbeat:
             )
             assert self._process.stdin is not None
             os.set_blocking(self._process.stdin.fileno(), False)
+            self._unsent = b""
             self._write(self._place)
             self._tell()
 
@@ -169,10 +180,10 @@ class Heartbeat:
     def _hear(self, line: str) -> None:
         word, _, about = line.partition("\t")
         with self._lock:
-            if word == "." and self._pending:
+            if word == "." and (self._pending or self._unsent):
                 self._tell()
-            elif word in set(StopReason) and self._hold is not None and about == self._hold.entry:
-                self._hold.context.stop(StopReason(word))
+            elif word in set(StopReason) and (hold := self._holds.get(about)) is not None:
+                hold.context.stop(StopReason(word))
 
 
 def place_of(name: str, lease_s: float) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 from redis.exceptions import ResponseError
@@ -22,24 +22,26 @@ from rq.serializers import JSONSerializer
 from rq.timeouts import BaseDeathPenalty
 
 from service.model.clock import timestamp
-from service.model.domain import Stage
+from service.model.domain import BATCH_SIZE, Stage
 from service.model.errors import QueueUnavailable
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob, AllowedQueue
-from service.queue.port import Event, Events, Report
+from service.queue.port import Event
 from service.queue.rq_queue import RqQueue, open_queue, queue_names, worker_key
 from service.settings import Settings
-from service.store.store import Store, open_store
+from service.store.store import open_store
 from worker.engines.devices import Device
+from worker.meeting import Meeting
+from worker.process.company import Alike, Company, Held, run_together
 from worker.process.fitness import Check, Fitness
 from worker.process.heartbeat import Heartbeat, Hold
-from worker.process.memory import limit_mb, resident_mb
 from worker.process.pulse import LEASE_KEPT_S
 from worker.process.runner import Runner
 from worker.process.selfcheck import check_engine
-from worker.stages import stage_table
+from worker.process.surroundings import Surroundings
+from worker.stages import alike_tasks, stage_table
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.output import StageFunction
 
@@ -77,10 +79,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         heart: Heartbeat,
         surroundings: Surroundings,
         fitness: Fitness,
+        company: Company | None = None,
         *,
         stages: Collection[Stage],
         name: str,
     ) -> None:
+        """Without `company` it takes one task at a time."""
         super().__init__(
             queues=queue_names(stages),
             name=name,
@@ -94,14 +98,17 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._heart = heart
         self._surroundings = surroundings
         self._fitness = fitness
+        self._company = company
         self._stages, self._taken = stages, 0
         self.gave_up = False
         """Whether it ended because it is unfit for tasks."""
         self._stop_requested: bool = False
         self.makes_room = False
         """Whether it ended so that its supervisor starts a fresh one."""
-        self._context: TaskContext | None = None
+        self._contexts: list[TaskContext] = []
         self._outcome: Event | None = None
+        self._closing: Held | None = None
+        """The task that was done beside others and whose books are being closed."""
         self._was_late = False
         AllowedJob.function = self._run_task
 
@@ -109,26 +116,70 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         return LEASE_KEPT_S
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        """One task under a lease; its outcome is told after RQ has closed its books on it."""
+        """One task under a lease, or several of one pair. An outcome is told after RQ has closed its books on it."""
         self._outcome = None
-        self.prepare_execution(job)
-        self._context = self._surroundings.context(_raw(job), self._queue)
-        self._heart.hold(
-            Hold.of(
-                job.id.rpartition("-")[0],
-                self._context,
-                self.execution,
-                job.started_job_registry,
-                self._surroundings.settings.task_timeout_s,
-            )
-        )
+        first = self._begun(job, queue)
         try:
-            self.perform_job(job, queue)
+            self._hold([first])
+            others = self._company.take(job, queue.name) if self._company is not None else []
+            if self._company is not None and others:
+                self._do_together(first, others, self._company.join)
+            else:
+                self.perform_job(job, queue)
         finally:
-            self._heart.hold(None, state="stopping" if self._stop_requested else "idle")
-            self._context = None
-        self._tell_outcome()
-        self._surroundings.tasks_done += 1
+            self._hold([])
+            self._contexts = []
+        if not others:
+            self._tell_outcome()
+        self._look_after_itself()
+        self.set_state("idle")
+
+    def _do_together(self, first: Held, others: Sequence[Any], join: int) -> None:
+        """All leases begin before the first task, and each ends with its own."""
+        with Meeting(1 + len(others), join * BATCH_SIZE) as meeting:
+            left: list[Held] = []
+            for one in (first, *(self._begun(job, first.queue) for job in others)):
+                super().prepare_job_execution(one.job)
+                one.context.meeting = meeting
+                left.append(one)
+            self._hold(left)
+
+            def close(one: Held) -> None:
+                self._outcome, self._closing, self.execution = None, one, one.execution
+                try:
+                    self.perform_job(one.job, one.queue)
+                finally:
+                    self._closing = None
+                left.remove(one)
+                self._hold(left)
+                self._tell_outcome()
+
+            run_together(list(left), meeting, self._runner, close)
+
+    def _hold(self, held: Sequence[Held]) -> None:
+        state = "stopping" if self._stop_requested else "busy" if held else "idle"
+        self._heart.hold(*(one.hold for one in held), state=state)
+
+    def _begun(self, job: Any, queue: Any) -> Held:
+        """The task under its lease."""
+        self.prepare_execution(job)
+        raw = _raw(job)
+        context = self._surroundings.context(raw, self._queue)
+        self._contexts.append(context)
+        if self._stop_requested:
+            context.stop(StopReason.SHUTDOWN)
+        limit_s = self._surroundings.settings.task_timeout_s
+        task_id = job.id.rpartition("-")[0]
+        hold = Hold.of(task_id, context, self.execution, job.started_job_registry, limit_s)
+        return Held(job, queue, self.execution, raw, context, hold)
+
+    def prepare_job_execution(self, job: Any, remove_from_intermediate_queue: bool = False) -> None:
+        """RQ's note that a job begins; one that was done beside others has it already."""
+        if self._closing is None:
+            super().prepare_job_execution(job, remove_from_intermediate_queue)
+
+    def _look_after_itself(self) -> None:
+        """What a worker sees to between two tasks: is it fit, and is it time to end?"""
         if self._runner.device_lost:
             log.error("this worker ends: %s", self._runner.device_lost)
             self._heart.stopping()
@@ -142,7 +193,6 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._heart.stopping()
             self.makes_room = True
             self._stop_requested = True
-        self.set_state("idle")
 
     def handle_exception(self, job: Any, *exc_info: Any) -> None:
         """An error that the runner did not sort. Where RQ finds no books to close, the keeper has closed them."""
@@ -160,6 +210,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             super().handle_job_failure(job, *args, **options)
 
     def _tell_outcome(self) -> None:
+        """Of a task whose books are closed."""
+        self._surroundings.tasks_done += 1
         if self._outcome is not None:
             try:
                 self._queue.publish(self._outcome)
@@ -167,8 +219,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 log.warning("the end of task %s is for the keeper to find: %s", self._outcome.task_id, error)
 
     def _run_task(self, message: dict[str, Any]) -> None:
-        assert self._context is not None
-        self._outcome = self._runner.run(message, self._context)
+        if self._closing is None:
+            self._outcome = self._runner.run(message, self._contexts[0])
+        elif self._closing.error is not None:
+            raise self._closing.error
+        else:
+            self._outcome = self._closing.outcome
         self._wait_for_writes()
 
     def _wait_for_writes(self) -> None:
@@ -192,14 +248,14 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
 
     def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
         """RQ's way to stop a task: there is no child to kill, so the task is asked."""
-        if self._context is not None:
-            self._context.stop(StopReason.CANCELLED)
+        for context in self._contexts:
+            context.stop(StopReason.CANCELLED)
 
     def handle_warm_shutdown_request(self) -> None:
-        """SIGTERM: the task at hand stops at its next launch and goes back to the queue."""
+        """SIGTERM: the tasks in hand stop at their next launch and go back to the queue."""
         self._heart.stopping()
-        if self._context is not None:
-            self._context.stop(StopReason.SHUTDOWN)
+        for context in self._contexts:
+            context.stop(StopReason.SHUTDOWN)
 
     @property
     def should_run_maintenance_tasks(self) -> bool:
@@ -228,46 +284,13 @@ def _raw(job: Any) -> Mapping[str, Any]:
         return {}
 
 
-class Surroundings:
-    """What a task gets besides its message."""
-
-    def __init__(self, settings: Settings, store: Store, device: Device) -> None:
-        self.settings = settings
-        self.store = store
-        self._device = device
-        self._memory_mb = limit_mb(settings.worker_max_memory_mb)
-        self.tasks_done = 0
-
-    def outgrown(self) -> str:
-        """Why this process should make room for a fresh one, "" if it need not."""
-        most = self.settings.worker_max_tasks
-        if most and self.tasks_done >= most:
-            return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
-        if (held := resident_mb()) > self._memory_mb:
-            return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
-        return ""
-
-    def context(self, raw: Mapping[str, Any], events: Events) -> TaskContext:
-        """The context of a task, which reports how far it is."""
-
-        def tell(done: float, total: float, message: str) -> float | None:
-            try:
-                report = Report(attempt=raw["attempt"], done=done, total=total, message=message[:200])
-                return events.report(raw["task_id"], report)
-            except QueueUnavailable:
-                log.debug("nobody could be told about the progress of %s", raw["task_id"])
-                return None
-
-        device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
-        return TaskContext(self.store, device=device, threads=self.settings.threads, tell=tell)
-
-
 def run_worker(
     settings: Settings,
     *,
     stages: Collection[Stage] = tuple(Stage),
     table: Mapping[Stage, StageFunction] | None = None,
     check: Check | None = None,
+    alike: Alike | None = None,
     burst: bool = False,
     idle_s: int = 0,
     max_tasks: int | None = None,
@@ -278,6 +301,8 @@ def run_worker(
         table: what each stage does; the real ones by default.
         idle_s: with `burst`: how long it waits for a task before none waits [s].
         check: of what they run on, before the first task and in doubt; that of the real engine if the stages are.
+        alike: which tasks may be done together, if the settings join any; that of the real stages if these are.
+        max_tasks: these are taken one at a time.
 
     Returns:
         False if the worker ended because something broke.
@@ -296,10 +321,13 @@ def run_worker(
     )
     if table is None:
         table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
+        alike = alike_tasks
     fitness = Fitness(store, check)
     runner = Runner(table, worker=name, publish=queue.publish, fitness=fitness)
     surroundings = Surroundings(settings, store, device)
-    worker = GraspWorker(queue, runner, heart, surroundings, fitness, stages=stages, name=name)
+    joins = alike is not None and max_tasks is None and settings.join != "1"
+    company = Company(queue.connection, surroundings.join, alike) if alike is not None and joins else None
+    worker = GraspWorker(queue, runner, heart, surroundings, fitness, company, stages=stages, name=name)
     does_all = not burst and max_tasks is None
     heart.start()
     try:

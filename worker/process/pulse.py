@@ -5,7 +5,7 @@ process shares no lock with it, imports no engine, and ends with the worker. It 
 and ends a worker that does not stop when it must.
 
 Lines of JSON come in on stdin: where Redis is, then each time what the worker is at; the last line counts. Words go
-out on stdout: why the task in hand must stop, and after every beat a dot.
+out on stdout: why a task in hand must stop, and after every beat a dot.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Pulse:
 
     `place` names the keys (`worker`, `workers`, `events`), `events_kept`, `lease_s`, and the file `alive`, if there is
     one. What the worker is at: `beat` is what its registration says; `limit` names a piece of work that must end (`id`,
-    `seconds`); `hold` is the lease of a task (`entry`, and the keys `registry`, `execution`, `executions`, `cancel`).
+    `seconds`); `holds` are the leases of tasks (`entry`, the keys `registry` and `cancel`, and `seconds`, in which the
+    task must end).
     """
 
     def __init__(
@@ -63,39 +64,41 @@ class Pulse:
         self._end_worker = end_worker
         self._clock = clock
         self._now_at: dict[str, Any] = {}
-        self._since = clock()
+        self._since: dict[str, float] = {}
+        """When each piece of work that must end began."""
         self.interval_s = beat_every_s(1, place["lease_s"])
 
     def take(self, now_at: dict[str, Any]) -> None:
         """What the worker is at from now on."""
-        if _limit(now_at) != _limit(self._now_at):
-            self._since = self._clock()
+        self._since = {name: self._since.get(name, self._clock()) for name in _limits(now_at)}
         self._now_at = now_at
 
     def tick(self) -> None:
-        """One beat; says if the task in hand must stop. Raises RedisError when Redis is away."""
+        """One beat; says which tasks in hand must stop. Raises RedisError when Redis is away."""
         if not self._now_at:
             return
         self._watch_time()
-        hold = self._now_at.get("hold")
+        holds = self._now_at.get("holds", ())
         beat = self._now_at["beat"] | {"seen": timestamp()}
         with self._connection.pipeline() as pipe:
             pipe.set(self._place["worker"], json.dumps(beat), ex=max(2, round(self._place["lease_s"])))
             pipe.sadd(self._place["workers"], beat["name"])
             pipe.scard(self._place["workers"])
-            if hold:
+            for hold in holds:
                 # Nothing is made that is not there: the task may be done, or taken away, by now.
                 pipe.zadd(hold["registry"], {hold["entry"]: time.time() + LEASE_KEPT_S}, xx=True)
-                pipe.expire(hold["execution"], LEASE_KEPT_S)
-                pipe.expire(hold["executions"], LEASE_KEPT_S)
+                pipe.expire(f"rq:execution:{hold['entry']}", LEASE_KEPT_S)
+                pipe.expire(f"rq:executions:{hold['entry'].partition(':')[0]}", LEASE_KEPT_S)
                 pipe.zscore(hold["registry"], hold["entry"])
                 pipe.exists(hold["cancel"])
             results = pipe.execute()
         self.interval_s = beat_every_s(results[2], self._place["lease_s"])
-        if hold and results[-1]:
-            self._tell("cancelled", hold["entry"])
-        elif hold and results[-2] is None:
-            self._tell("lease lost", hold["entry"])
+        for number, hold in enumerate(holds):
+            score, cancelled = results[6 + 5 * number : 8 + 5 * number]
+            if cancelled:
+                self._tell("cancelled", hold["entry"])
+            elif score is None:
+                self._tell("lease lost", hold["entry"])
 
     def leave(self) -> None:
         """End the registration, and say that this worker is not lost."""
@@ -118,15 +121,19 @@ class Pulse:
         return bool(self._now_at) and self._now_at["beat"]["state"] in _WITHOUT_TASKS
 
     def _watch_time(self) -> None:
-        limit, running = self._now_at.get("limit"), self._clock() - self._since
-        if limit and running > limit["seconds"]:
-            self._tell("timeout", limit["id"])
-            if running > limit["seconds"] + STUCK_AFTER_S:
-                self._end_worker(f"{limit['id']} does not stop; its worker is ended, and the task is taken from it")
+        for name, seconds in _limits(self._now_at).items():
+            running = self._clock() - self._since[name]
+            if running > seconds:
+                self._tell("timeout", name)
+            if running > seconds + STUCK_AFTER_S:
+                self._end_worker(f"{name} does not stop; its worker is ended, and its tasks are taken from it")
 
 
-def _limit(now_at: dict[str, Any]) -> str:
-    return str((now_at.get("limit") or {}).get("id", ""))
+def _limits(now_at: dict[str, Any]) -> dict[str, float]:
+    """What must end, and how long it may take [s]."""
+    limit = now_at.get("limit")
+    found = {limit["id"]: limit["seconds"]} if limit else {}
+    return found | {hold["entry"]: hold["seconds"] for hold in now_at.get("holds", ())}
 
 
 def is_stopped(pid: int) -> bool:

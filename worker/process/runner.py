@@ -103,7 +103,7 @@ class Runner:
             if (why := self._loss(error, context)) and first_loss(message.task_id):
                 log.error("the task is handed back: %s", why, exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
-            if not why and self._fitness is not None and (why := self._fitness.doubt(message, error)):
+            if not why and (why := self._doubt(message, error, context)):
                 log.warning("the task is handed back; it failed because of this worker", exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             return self._failed(message, error, context, started)
@@ -121,7 +121,8 @@ class Runner:
         clock = time.perf_counter()
         lost = self._lost(message, context)
         made = self._stages[message.stage](message, context)
-        self._check_device(context.device)
+        if context.meeting is None:  # in a meeting each launch ends with it
+            self._check_device(context.device)
         seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, TaskMessage):
             context.check()
@@ -141,12 +142,18 @@ class Runner:
     def _loss(self, error: Exception, context: TaskContext) -> str:
         """What became of the device, if that is what the error comes from; "" if it works."""
         try:
-            self._check_device(context.device)
+            _on_device(context, lambda: self._check_device(context.device))
         except DeviceLost as lost:
             error = lost
         if isinstance(error, DeviceLost):
             self.device_lost = str(error)
         return self.device_lost
+
+    def _doubt(self, message: Message, error: Exception, context: TaskContext) -> str:
+        """Why this worker is to blame for a failure; "" if it is not known to be."""
+        if (fitness := self._fitness) is None:
+            return ""
+        return str(_on_device(context, lambda: fitness.doubt(message, error)))
 
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):
@@ -210,6 +217,11 @@ class Runner:
             worker=self._worker,
             **facts | more,
         )
+
+
+def _on_device(context: TaskContext, work: Callable[[], Any]) -> Any:
+    """Work that must not meet another's launches."""
+    return work() if context.meeting is None else context.meeting.alone(work)
 
 
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:

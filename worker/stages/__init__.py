@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.domain import Stage
+from service.model.domain import Stage, TaskMessage
 
 if TYPE_CHECKING:
     from worker.stages.context import TaskContext
@@ -23,6 +23,12 @@ _MODULES: Final = {
 def stage_table() -> Mapping[Stage, StageFunction]:
     """The real stages. Their modules are imported on the first task, so that a worker is there at once."""
     return {stage: _Lazy(module) for stage, module in _MODULES.items()}
+
+
+def alike_tasks(message: TaskMessage) -> Hashable | None:
+    """See `worker.stages.alike`."""
+    found: Hashable | None = import_module("worker.stages.alike").alike(message)
+    return found
 
 
 class _Lazy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import TypeVar, cast
@@ -25,6 +26,7 @@ from worker.stages.prepared import prepared_object
 T = TypeVar("T")
 #: Loaded assets kept: a worker in a hands x objects dataset alternates between a few.
 _cache: LRUCache[Hashable, object] = LRUCache(16)
+_lock = threading.RLock()
 
 
 def hand_of(store: Store, message: TaskMessage) -> HandModel:
@@ -85,6 +87,8 @@ def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
 
 
 def _cached(key: Hashable, load: Callable[[], T]) -> T:
-    if key not in _cache:
-        _cache[key] = load()
-    return cast("T", _cache[key])
+    # Tasks of one pair start at once: one of them loads.
+    with _lock:
+        if key not in _cache:
+            _cache[key] = load()
+        return cast("T", _cache[key])

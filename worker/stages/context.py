@@ -10,6 +10,7 @@ from typing import Final
 
 from service.model.errors import TaskCancelled
 from service.store.store import Store
+from worker.meeting import Meeting
 from worker.run import Run
 
 #: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
@@ -40,6 +41,8 @@ class TaskContext:
         self.store = store
         self.device = device
         self.threads = threads
+        self.meeting: Meeting | None = None
+        """Where the task is done beside others; None: by itself."""
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
@@ -50,12 +53,14 @@ class TaskContext:
         now = time.monotonic()
         if self._tell is not None and now >= self._tell_again:
             self._tell_again = now + _REPORT_EVERY_S
-            self._tell_again = now + (self._tell(done, total, message) or _REPORT_EVERY_S)
+            # A worker tells no more for having more tasks in hand.
+            share = max(1, self.meeting.members) if self.meeting is not None else 1
+            self._tell_again = now + share * (self._tell(done, total, message) or _REPORT_EVERY_S)
 
     @property
     def run(self) -> Run:
         """What the engine room needs to know of the task."""
-        return Run(self.device, self.threads, self.progress, self.cancelled)
+        return Run(self.device, self.threads, self.progress, self.cancelled, self.meeting)
 
     def cancelled(self) -> bool:
         """Whether to stop at the next launch."""

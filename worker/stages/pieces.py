@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from service.store.store import Store
 from service.user_cache import write_whole
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose, piece_file
+
+_lock = threading.Lock()
 
 
 def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
@@ -22,12 +25,13 @@ def pieces_of(store: Store, obj: ObjectModel, *, cache: Path | None = None) -> C
     """
     file = piece_file(obj, cache)
     key = names.object_pieces(obj.digest, file.stem)
-    if not file.is_file():
-        _fetch(store, key, file)
-    pieces = decompose(obj, cache=cache)
-    if file.is_file() and not store.exists(key):
-        store.put(key, file.read_bytes())
-    return pieces
+    with _lock:  # tasks of one object start at once: one of them makes the pieces
+        if not file.is_file():
+            _fetch(store, key, file)
+        pieces = decompose(obj, cache=cache)
+        if file.is_file() and not store.exists(key):
+            store.put(key, file.read_bytes())
+        return pieces
 
 
 def _fetch(store: Store, key: str, file: Path) -> None:

@@ -80,6 +80,21 @@ def test_a_cancelled_task_hears_of_it(heart: Heartbeat, rq_queue: RqQueue, conte
     assert context.stop_reason is StopReason.CANCELLED
 
 
+def test_of_many_tasks_in_hand_each_keeps_its_lease_and_hears_what_is_for_it(
+    heart: Heartbeat, rq_queue: RqQueue
+) -> None:
+    contexts = [TaskContext(open_store("memory://")) for _ in range(200)]
+    entries = [f"task{number}-1:execution{number}" for number in range(len(contexts))]
+    rq_queue.connection.zadd("registry", dict.fromkeys(entries[1:], 1.0))
+    # Longer than what a pipe takes at once.
+    heart.hold(*(Hold(f"task{n}", contexts[n], entries[n], "registry", 60.0) for n in range(len(contexts))))
+    rq_queue.discard(["task150"])
+    until(lambda: contexts[150].stop_reason and contexts[0].stop_reason, "both hear of it")
+    assert (contexts[0].stop_reason, contexts[150].stop_reason) == (StopReason.LEASE_LOST, StopReason.CANCELLED)
+    assert sum(context.stop_reason is not None for context in contexts) == 2
+    assert min(score for _, score in rq_queue.connection.zrange("registry", 0, -1, withscores=True)) > 1.0
+
+
 def test_a_task_whose_lease_was_taken_hears_of_it(heart: Heartbeat, context: TaskContext) -> None:
     heart.hold(hold_of(context))
     until(lambda: context.stop_reason, "the task hears of it")
@@ -172,7 +187,7 @@ class Silence:
         return None
 
     def execute(self) -> list[Any]:
-        return [True, 1, 1, 1.0, 0]
+        return [True, 1, 1, *(1, 1, 1, 1.0, 0) * 4]
 
     def __getattr__(self, name: str) -> Any:
         return lambda *args, **kwargs: None
@@ -199,6 +214,27 @@ def test_a_task_is_stopped_when_its_time_is_over_and_then_its_worker() -> None:
     now[0] = 11.0 + STUCK_AFTER_S
     pulse.tick()
     assert ended and "does not stop" in ended[0]
+
+
+def test_each_task_in_hand_has_a_time_of_its_own() -> None:
+    now, said = [0.0], []
+    pulse = Pulse(
+        Silence(),
+        place_of("w", LEASE_S),
+        tell=lambda word, about: said.append((word, about)),
+        end_worker=lambda why: None,
+        clock=lambda: now[0],
+    )
+
+    def hold(entry: str) -> dict[str, Any]:
+        return {"entry": entry, "registry": "r", "cancel": "c", "seconds": 10.0}
+
+    pulse.take({"beat": asdict(beat_of("busy")), "holds": [hold("a-1:x")]})
+    now[0] = 6.0
+    pulse.take({"beat": asdict(beat_of("busy")), "holds": [hold("a-1:x"), hold("b-1:y")]})
+    now[0] = 11.0
+    pulse.tick()
+    assert said == [("timeout", "a-1:x")]
 
 
 def test_the_first_reason_to_stop_stands(context: TaskContext) -> None:

@@ -1,0 +1,43 @@
+"""A worker that holds several tasks at once is killed: every one of them comes back, and none takes others down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from service.model.domain import State
+from tests.fakes import request as wanted
+from tests.system.conftest import System
+
+pytestmark = pytest.mark.chaos
+Start = Callable[..., System]
+
+
+def test_every_task_of_a_killed_worker_runs_again_and_its_result_appears_once(start: Start) -> None:
+    system = start(environment={"FAKE_SECONDS": "1.5"}, join="4", lease_s=2.0)
+    job = system.submit(wanted(grasps=96))
+    running = system.parts.index.jobs.tasks
+    system.until(lambda: len(running(job=job, state=State.RUNNING).items) == 3, 20, "one worker holds three tasks")
+    killed = system.kill("worker-0")
+    (done,) = system.finish(job, seconds=120)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 96)
+    attempts = system.parts.index.jobs.attempts(job=job)
+    assert sorted(attempt.kind for attempt in attempts) == ["WorkerLost"] * 3
+    assert len({attempt.task_id for attempt in attempts}) == 3
+    assert all(f"-{killed}-" in attempt.worker for attempt in attempts)
+
+
+def test_a_task_that_kills_its_worker_takes_no_other_one_down(start: Start) -> None:
+    system = start(environment={"FAKE_POISON": "1", "FAKE_SECONDS": "0.2"}, join="4", lease_s=2.0, retry_backoff_s=0.1)
+    job = system.submit(wanted(grasps=96))
+    (done,) = system.finish(job, seconds=120)
+    assert done.state is State.FAILED
+    tasks = system.parts.index.jobs.tasks(job=job).items
+    assert [task.state for task in sorted(tasks, key=lambda task: task.batch)] == [
+        State.SUCCEEDED, State.FAILED, State.SUCCEEDED,
+    ]  # fmt: skip
+    lost = [attempt.task_id for attempt in system.parts.index.jobs.attempts(job=job)]
+    poison = next(task.id for task in tasks if task.state is State.FAILED)
+    assert lost.count(poison) == 3
+    assert all(lost.count(task.id) <= 1 for task in tasks if task.id != poison), "tried again, each is by itself"

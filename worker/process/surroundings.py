@@ -1,0 +1,60 @@
+"""What a task gets besides its message, and what its worker counts."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from service.model.domain import Stage
+from service.model.errors import QueueUnavailable
+from service.queue.port import Events, Report
+from service.settings import Settings
+from service.store.store import Store
+from worker.engines.devices import Device
+from worker.engines.joins import batches_at_once, parse_join
+from worker.process.memory import limit_mb, resident_mb
+from worker.stages.context import TaskContext
+
+log = logging.getLogger(__name__)
+
+
+class Surroundings:
+    """What a task gets besides its message."""
+
+    def __init__(self, settings: Settings, store: Store, device: Device) -> None:
+        self.settings = settings
+        self.store = store
+        self._device = device
+        self._memory_mb = limit_mb(settings.worker_max_memory_mb)
+        self.tasks_done = 0
+        self._joined = 0
+
+    def outgrown(self) -> str:
+        """Why this process should make room for a fresh one, "" if it need not."""
+        most = self.settings.worker_max_tasks
+        if most and self.tasks_done >= most:
+            return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
+        if (held := resident_mb()) > self._memory_mb:
+            return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
+        return ""
+
+    def join(self) -> int:
+        """Batches of one pair that one launch plans on the device; waits until that is known."""
+        if not self._joined:
+            self._joined = batches_at_once(self._device.resolve(), parse_join(self.settings.join))
+        return self._joined
+
+    def context(self, raw: Mapping[str, Any], events: Events) -> TaskContext:
+        """The context of a task, which reports how far it is."""
+
+        def tell(done: float, total: float, message: str) -> float | None:
+            try:
+                report = Report(attempt=raw["attempt"], done=done, total=total, message=message[:200])
+                return events.report(raw["task_id"], report)
+            except QueueUnavailable:
+                log.debug("nobody could be told about the progress of %s", raw["task_id"])
+                return None
+
+        device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
+        return TaskContext(self.store, device=device, threads=self.settings.threads, tell=tell)
