@@ -342,6 +342,7 @@ def run_worker(
             logging_level="WARNING",
         )
     finally:
+        AllowedJob.function = None
         heart.stop()
         queue.close()
     return not worker.gave_up and (not does_all or worker.was_told_to_stop or worker.makes_room)
