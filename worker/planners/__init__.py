@@ -10,7 +10,7 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fitting import fitting_pairs
-from worker.planners.port import Asked, Finish, Joined, Method, Options, Planner, Trial, Wanted
+from worker.planners.port import Asked, Joined, Method, Options, Planner, Trial, Wanted
 from worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
 from worker.run import ALONE, Run
 
@@ -18,7 +18,6 @@ __all__ = [
     "GROUP",
     "PLANNERS",
     "Asked",
-    "Finish",
     "Joined",
     "Method",
     "Options",
@@ -57,11 +56,11 @@ def synthesize(
     around = (wanted.placed.fixed, wanted.trial is not None) if wanted.placed is not None else ()
     key = (hand.content, obj.content, method, repr(options), wanted.fidelity.model_dump_json(), run.device, *around)
 
-    def work(asked: Sequence[Asked]) -> list[Finish | Exception]:
+    def work(asked: Sequence[Asked]) -> list[GraspSet | Exception]:
         try:
             return together(hand, obj, asked)
         finally:
             check_device(run.device)  # here, where nobody else has work on it
 
-    finish: Finish = run.meeting.ask(key, Asked(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
-    return finish()
+    found: GraspSet = run.meeting.ask(key, Asked(wanted, run), work, size=wanted.count, cancelled=run.cancelled)
+    return found

@@ -61,10 +61,6 @@ class Asked:
     run: Run
 
 
-#: Gives the grasps of a batch once its launch is over: what is left to do for it, for whoever asked.
-Finish = Callable[[], GraspSet]
-
-
 class Joined(Protocol):
     """Makes several batches of a hand on an object in one launch: of one fidelity, on one device, all around a free
     object or all in scenes with the same supports and neighbours (`Placed.fixed`).
@@ -73,7 +69,7 @@ class Joined(Protocol):
     place, a TaskCancelled where its own `run.cancelled()` answers True; the others go on.
     """
 
-    def __call__(self, hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[Finish | Exception]: ...
+    def __call__(self, hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[GraspSet | Exception]: ...
 
 
 class Options(BaseModel):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -26,7 +25,7 @@ from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine
 from worker.planners.fast_graspd.selection import best_of_each, merits, ranked
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.planners.port import Asked, Finish, Wanted
+from worker.planners.port import Asked, Wanted
 from worker.planners.threads import cut, run_parts
 from worker.run import Run
 from worker.simulation.data import Data
@@ -58,7 +57,7 @@ class Part:
     curve: list[Floats] = field(default_factory=list)
     """(n,) L_stable of each grasp's hands in the mean, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
-    """With the postures around them, where a trial needed these."""
+    """With the postures around them, where they were wanted or a trial needed these."""
 
     def take(self, which: NDArray[np.intp]) -> Part:
         """Some of the grasps."""
@@ -68,32 +67,32 @@ class Part:
 
 def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
     """See `worker.planners.Planner`."""
-    began = time.perf_counter()
-    parts = optimise_batch(hand, obj, wanted, run)
-    return grasps_of(hand, obj, parts, time.perf_counter() - began, wanted.placed, device=run.device)
+    (found,) = plan_joined(hand, obj, [Asked(wanted, run)])
+    if isinstance(found, Exception):
+        raise found
+    return found
 
 
-def plan_joined(hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[Finish | Exception]:
+def plan_joined(hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[GraspSet | Exception]:
     """See `worker.planners.Joined`."""
     began = time.perf_counter()
     batches = Batches(asked, obj)
     run = asked[0].run.apart()
     try:
-        parts = optimise(pair_of(hand, obj, asked[0].wanted.fidelity, run.device), batches, run)
+        parts = optimise(pair_of(hand, obj, asked[0].wanted.fidelity, run.device), batches, run, postures=True)
     except Exception:
         if len(batches.errors) < len(asked):
             raise
         parts = []
     each = (time.perf_counter() - began) / len(batches.owner)
-    found: list[Finish | Exception] = []
+    found: list[GraspSet | Exception] = []
     for owner, one in enumerate(asked):
         if owner in batches.errors:
             found.append(batches.errors[owner])
             continue
         own = [part.take(np.flatnonzero(batches.owner[part.rows] == owner)) for part in parts]
         own = [part for part in own if len(part.rows)]
-        seconds, placed = each * one.wanted.count, one.wanted.placed
-        found.append(partial(grasps_of, hand, obj, own, seconds, placed, device=run.device))
+        found.append(grasps_of(hand, obj, own, each * one.wanted.count, one.wanted.placed))
     return found
 
 
@@ -110,8 +109,9 @@ def optimise_pair(pair: Pair, wanted: Wanted, run: Run) -> list[Part]:
     return parts
 
 
-def optimise(pair: Pair, batches: Batches, run: Run) -> list[Part]:
-    """The same for several batches: the parts of those that are not out in the end, and perhaps of others.
+def optimise(pair: Pair, batches: Batches, run: Run, *, postures: bool = False) -> list[Part]:
+    """The same for several batches: the parts of those that are not out in the end, and perhaps of others; with the
+    `postures` around grasps, if they are wanted.
 
     Raises:
         Exception: what became of the first batch, if all of them are out.
@@ -122,7 +122,8 @@ def optimise(pair: Pair, batches: Batches, run: Run) -> list[Part]:
     begun = begun.take(np.flatnonzero(np.isin(begun.rows, rows)), batches.fidelity.starts)
 
     def work(which: range) -> Part:
-        return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
+        part = _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
+        return _posed(launch, part) if postures and part.grasps is None else part
 
     return run_parts(cut(len(rows), run, least=PART), work)
 
@@ -229,6 +230,13 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
     winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
     return Part(rows, seated.state[winners], seated.losses[winners], curve)
+
+
+def _posed(launch: _Launch, part: Part) -> Part:
+    """The part with the postures around its grasps."""
+    hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
+    placed, device = launch.placed(part.rows), launch.pair.hand.device
+    return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
 
 
 @dataclass
