@@ -20,7 +20,7 @@ from api.formatting import count, percent, size
 from api.models import Job
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
-from service.model.domain import AssetKind, State
+from service.model.domain import AUDITS, AssetKind, State
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
 from service.store.asset_summary import self_test_line
@@ -39,7 +39,9 @@ def submit(
     want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
     budget: Annotated[float, typer.Option(help="Tries for each valid grasp, at most.")] = 4.0,
     referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
-    audits: Annotated[int, typer.Option(help="Valid grasps judged again by the letter.")] = 8,
+    audits: Annotated[
+        int, typer.Option(help="Valid grasps judged again by the letter; 8 are spread over the job, one of 64.")
+    ] = AUDITS,
     robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
     method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
     option: Annotated[

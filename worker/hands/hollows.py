@@ -12,7 +12,6 @@ from typing import Final
 
 import fast_simplification
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from service.model.digests import digest_json
@@ -181,6 +180,8 @@ def _planes(points: Floats) -> tuple[Floats, Floats]:
 
 
 def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    import trimesh  # slow to load, seldom needed
+
     merged = trimesh.Trimesh(vertices, faces, process=True)
     points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
     if len(triangles) > _FACES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from typing import Final
 
@@ -10,11 +11,13 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from service.model import transforms
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, apply, invert, quat_rotate
-from worker.hands import primitives
+from worker.hands import kinematics, primitives
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints
+from worker.objects.kept_arrays import arrays_kept_or_made
 
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5
@@ -39,7 +42,9 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     key = (hand.content, count, seed)
     with _lock:
         if key not in _samples:
-            _samples[key] = _sample(hand, count, seed)
+            code = (sys.modules[__name__], primitives, kinematics, transforms)
+            made = arrays_kept_or_made("hand_samples", key, code, lambda: vars(_sample(hand, count, seed)))
+            _samples[key] = SurfacePoints(**made)
         return _samples[key]
 
 

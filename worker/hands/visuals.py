@@ -13,7 +13,6 @@ from typing import Final
 
 import fast_simplification
 import numpy as np
-import trimesh
 
 from service.model.errors import InputError
 from service.model.transforms import Floats, apply
@@ -91,6 +90,9 @@ NO_VISUALS: Final = Visuals()
 
 def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
     """The mesh with so many times fewer triangles."""
+    # Slow to load, and the meshes that come here are few.
+    import trimesh
+
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
     points, triangles = fast_simplification.simplify(
         np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1 - 1 / times

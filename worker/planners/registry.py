@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from service.cli import validation_line
 from service.model.errors import InputError
 from worker.planners.port import Joined, Method, Options, Planner
 
@@ -77,6 +76,8 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
     try:
         return known.options(**(options or {}))
     except ValidationError as error:
+        from service.cli import validation_line  # loads what commands need
+
         there_are = ", ".join(known.options.model_fields) or "none"
         raise InputError(f"option of {name}: {validation_line(error)}; its options: {there_are}") from None
 

@@ -7,13 +7,16 @@ whose polygon contains the projection of the centre of mass (Goldberg et al., "P
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from service.model.errors import MeshError
 from service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from worker.objects.model import Floats, Ints, ObjectModel
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: Hull triangles within this angle of each other are one flat face [rad].
 COPLANAR_ANGLE = np.radians(0.05)
@@ -46,6 +49,8 @@ def resting_faces(obj: ObjectModel) -> RestingFaces:
     Raises:
         MeshError: the hull is flat.
     """
+    import trimesh  # slow to load, seldom needed
+
     mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)
     label = _merge_coplanar(mesh)
     count = int(label.max()) + 1
@@ -66,8 +71,10 @@ def _support(normals: Floats, points: Floats) -> Floats:
 
 def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
     """(F,) index of the flat face that each hull triangle belongs to."""
+    from trimesh.graph import connected_component_labels
+
     pairs = mesh.face_adjacency[mesh.face_adjacency_angles < COPLANAR_ANGLE]
-    label = trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.faces))
+    label = connected_component_labels(pairs, node_count=len(mesh.faces))
     return np.asarray(label, np.int32)
 
 

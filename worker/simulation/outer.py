@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
@@ -87,6 +86,8 @@ def _outward(corners: Floats, triangles: NDArray[Any], normals: Floats) -> NDArr
 
 def _stands_out(points: Floats, corners: Floats, hull: Any) -> float:
     """Farthest of `points` from the hull of `corners` [m]; on a convex solid no point is farther than a corner."""
+    import trimesh  # slow to load, seldom needed
+
     mesh = trimesh.Trimesh(corners, hull.simplices, process=False)
     _, distance, _ = trimesh.proximity.closest_point_naive(mesh, points)
     outside = (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > 0

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 from numpy.typing import NDArray
 
+from worker.hands import surface
 from worker.hands.surface import farthest_points
+from worker.objects.kept_arrays import arrays_kept_or_made
 from worker.objects.model import ObjectModel
 
 Floats = NDArray[np.float64]
@@ -15,7 +19,15 @@ SHARP_EDGE_COS = np.cos(np.radians(35.0))
 
 
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
-    """(count, 3) evenly spread points of the surface, its sharp edges included [m]."""
+    """(count, 3) evenly spread points of the surface, its sharp edges included [m], the same for the same."""
+    code = (sys.modules[__name__], surface)
+    kept = arrays_kept_or_made(
+        "object_samples", (obj.content, count, seed), code, lambda: {"points": _sampled(obj, count, seed)}
+    )
+    return kept["points"]
+
+
+def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
     rng = np.random.default_rng(seed)
     corners = obj.vertices[obj.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,0 +1,170 @@
+"""How long the first grasps take: of a process that begins, and of a service that begins; prints Markdown.
+
+usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object mug] [--runs 3] [--no-service]
+
+Kernels and what else the user's cache holds are there: one run before the timed ones fills it. Clock time says what a
+user waits for and depends on what else runs; processor time, of all processes together, does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+from benchmarks.chain import environment_of
+
+#: Laps of a process that makes one valid grasp; processor seconds of each on stderr.
+FIRST: Final = """
+import json, sys, time
+laps, last = {}, time.process_time()
+laps["interpreter"] = last
+def lap(name):
+    global last
+    now = time.process_time()
+    laps[name], last = now - last, now
+import worker.certified
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from service.model.domain import FIDELITIES, JobRequest
+lap("imports")
+hand = hand_from_path(sys.argv[1])
+obj = object_from_path(sys.argv[2], face_error_m=FIDELITIES["standard"].face_error_m)
+lap("hand and object")
+request = JobRequest(hand="h", object="o", grasps=1, fidelity="standard", seed=3)
+found = worker.certified.certified_grasps(hand, obj, request, count=1)
+lap("first valid grasp")
+worker.certified.certified_grasps(hand, obj, request, count=1, batch=1)
+lap("one more")
+print(json.dumps({"valid": len(found.grasps), "laps": laps}))
+"""
+_PATIENCE_S: Final = 300.0
+
+
+def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
+    """Seconds of one process: `clock`, `processor`, and processor time of its laps."""
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST, hand, obj], cwd=root, env=environment_of(root), capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        sys.exit(f"{root}: {done.stderr[-2000:]}")
+    laps = json.loads(done.stdout.splitlines()[-1])["laps"]
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"clock": clock, "processor": spent, **laps}
+
+
+def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
+    """Seconds of a service in an empty folder: until a worker waits, and from there until 32 valid grasps are there."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = environment_of(root)
+        up = [sys.executable, "-m", "graspd", "up", "--port", "0", "--data-dir", folder, "--json"]
+        log = (Path(folder) / "up.log").open("w")
+        service = subprocess.Popen(
+            up, cwd=root, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+        )
+        try:
+            began = time.perf_counter()
+            url = _address(service)
+            _wait(root, environment, url, hand)
+            ready = time.perf_counter() - began
+            spent = _processor(service.pid)
+            began = time.perf_counter()
+            job = [sys.executable, "-m", "graspd", "submit", "--hand", hand, "--object", obj, "--url", url, "--wait"]
+            subprocess.run(job, cwd=root, env=environment, check=True, capture_output=True)
+            clock = time.perf_counter() - began
+            return {"until a worker waits": ready, "job": clock, "processor": _processor(service.pid) - spent}
+        finally:
+            os.killpg(service.pid, signal.SIGTERM)
+            service.wait(60)
+            log.close()
+
+
+def _address(service: subprocess.Popen[str]) -> str:
+    """Where the API of a service answers, from what it prints."""
+    assert service.stdout is not None
+    for line in service.stdout:
+        for word in line.split():
+            if "http://" in word:
+                return "http://" + word.partition("http://")[2].strip('",/;')
+    sys.exit("the service has not said where it answers")
+
+
+def _wait(root: Path, environment: Mapping[str, str], url: str, hand: str) -> None:
+    """Until a worker waits for tasks and the hand is there."""
+    ask = (
+        "import sys, json, urllib.request as u\n"
+        "get = lambda path: json.load(u.urlopen(sys.argv[1] + path))\n"
+        "w = get('/v1/workers'); w = w.get('items', w.get('workers', [])) if isinstance(w, dict) else w\n"
+        "sys.exit(not any(x['state'] == 'idle' for x in w))"
+    )
+    until = time.monotonic() + _PATIENCE_S
+    while subprocess.run(
+        [sys.executable, "-c", ask, url], capture_output=True, check=False, env=environment
+    ).returncode:
+        if time.monotonic() > until:
+            sys.exit("no worker is ready")
+        time.sleep(0.1)
+
+
+def _processor(leader: int) -> float:
+    """Processor seconds of a process and all below it that live, and of their children that have ended."""
+    parent, ticks = dict[int, int](), dict[int, int]()
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            fields = stat.read_text().rpartition(")")[2].split()
+            parent[int(stat.parent.name)], ticks[int(stat.parent.name)] = int(fields[1]), sum(map(int, fields[11:15]))
+    family = {leader}
+    while more := {pid for pid, above in parent.items() if above in family} - family:
+        family |= more
+    return sum(ticks.get(pid, 0) for pid in family) / os.sysconf("SC_CLK_TCK")
+
+
+def table(title: str, found: Mapping[str, list[dict[str, float]]]) -> list[str]:
+    """Medians, one column a checkout; the last column is the first checkout's over the last one's."""
+    names = list(found)
+    lines = [f"| {title} | " + " | ".join(names) + " | times |", "| --- |" + " --: |" * (len(names) + 1)]
+    for part in next(iter(found.values()))[0]:
+        middle = [median(run[part] for run in runs) for runs in found.values()]
+        times = f"{middle[0] / middle[-1]:.2f}" if middle[-1] > 0 else ""
+        lines.append(f"| {part} | " + " | ".join(f"{value:.2f}" for value in middle) + f" | {times} |")
+    return [*lines, ""]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkouts", nargs="+", type=Path)
+    parser.add_argument("--hand", default="allegro")
+    parser.add_argument("--object", default="mug")
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--no-service", action="store_true", help="the process alone")
+    given = parser.parse_args()
+    stages: list[tuple[str, Any]] = [("first valid grasp of a process, s", first_grasp)]
+    if not given.no_service:
+        stages.append(("32 valid grasps, the first job of a service, s", first_job))
+    for title, measure in stages:
+        found: dict[str, list[dict[str, float]]] = {str(root): [] for root in given.checkouts}
+        for turn in range(given.runs + 1):
+            for root in given.checkouts:
+                one = measure(root.resolve(), given.hand, given.object)
+                if turn:  # the first one fills the caches
+                    found[str(root)].append(one)
+        sys.stdout.write("\n".join(table(title, found)) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

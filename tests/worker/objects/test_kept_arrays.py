@@ -1,0 +1,61 @@
+"""Arrays that are kept on the machine: read bit for bit, made anew when anything they follow from changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service import user_cache
+from tests.worker.models import two_finger_hand
+from tests.worker.objects.shapes import sphere, stl
+from worker.hands import surface
+from worker.objects import kept_arrays
+from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.prepare import load_object
+from worker.simulation import sampling
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "graspd"
+
+
+def made(number: float) -> dict[str, np.ndarray]:
+    return {"a": np.full((2, 3), number), "b": np.arange(4)}
+
+
+def never() -> dict[str, np.ndarray]:
+    raise AssertionError("it is there already")
+
+
+def test_what_was_made_is_read_bit_for_bit(own_cache: Path) -> None:
+    first = arrays_kept_or_made("things", ("x", 1), (kept_arrays,), lambda: made(1 / 3))
+    again = arrays_kept_or_made("things", ("x", 1), (kept_arrays,), never)
+    assert all(np.array_equal(first[name], again[name]) and first[name].dtype == again[name].dtype for name in first)
+    assert [file.suffix for file in (own_cache / "things").iterdir()] == [".npz"]
+
+
+def test_other_terms_or_other_code_are_another_entry() -> None:
+    arrays_kept_or_made("things", ("x", 1), (kept_arrays,), lambda: made(1))
+    assert arrays_kept_or_made("things", ("x", 2), (kept_arrays,), lambda: made(2))["a"][0, 0] == 2
+    assert arrays_kept_or_made("things", ("x", 1), (surface,), lambda: made(3))["a"][0, 0] == 3
+
+
+def test_a_damaged_entry_is_made_again(own_cache: Path) -> None:
+    arrays_kept_or_made("things", ("x",), (kept_arrays,), lambda: made(1))
+    (file,) = (own_cache / "things").iterdir()
+    user_cache.keep(file, b"no arrays")
+    assert arrays_kept_or_made("things", ("x",), (kept_arrays,), lambda: made(2))["a"][0, 0] == 2
+
+
+def test_samples_of_hand_and_object_are_those_of_a_process_without_a_cache() -> None:
+    hand = two_finger_hand()
+    ball = load_object(stl(sphere(segments=24)), name="ball", digest="", face_error_m=0.0)
+    for _ in range(2):
+        surface._samples.clear()
+        found, fresh = surface.sample_surface(hand, 120, seed=2), surface._sample(hand, 120, 2)
+        assert all(np.array_equal(getattr(found, name), array) for name, array in vars(fresh).items())
+        assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
