@@ -79,8 +79,8 @@ def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[s
     moved = max(
         float(np.abs(one.state.pivot - other.state.pivot).max()) for one, other in zip(parts, again, strict=True)
     )
-    planner.grasps_of(hand, obj, parts, 0.0)
-    grasps, around = timed(lambda: planner.grasps_of(hand, obj, again, 0.0))
+    planner.grasps_of(hand, obj, parts, 0.0, device=device)
+    grasps, around = timed(lambda: planner.grasps_of(hand, obj, again, 0.0, device=device))
     few, pieces = grasps.take(np.arange(min(batch, JUDGED))), decompose(obj)
     verdicts, judged = timed(lambda: judge(hand, obj, few, pieces=pieces))
     _, measured = timed(lambda: measure(hand, obj, few))
