@@ -53,6 +53,11 @@ class Settings(BaseSettings):
     )
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
     keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
+    keeper_name: str | None = Field(
+        None,
+        max_length=200,
+        description="of a keeper: started again under the same name, it leads without a wait; unset: a fresh one",
+    )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_tasks: int = Field(

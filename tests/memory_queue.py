@@ -35,6 +35,7 @@ class MemoryQueue:
     _events: list[Event] = field(default_factory=list)
     _workers: dict[str, WorkerBeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
+    _leads: dict[str, tuple[str, float]] = field(default_factory=dict)
     _reports: dict[str, Report] = field(default_factory=dict)
     _sums: dict[str, float] = field(default_factory=dict)
     _taken: Counter[str] = field(default_factory=Counter)
@@ -125,6 +126,17 @@ class MemoryQueue:
 
     def announced(self, part: str) -> bool:
         return self._announced.get(part, 0.0) > time.monotonic()
+
+    def lead(self, part: str, holder: str, seconds: float) -> bool:
+        held_by, until = self._leads.get(part, ("", 0.0))
+        if held_by != holder and until > time.monotonic():
+            return False
+        self._leads[part] = (holder, time.monotonic() + seconds)
+        return True
+
+    def resign(self, part: str, holder: str) -> None:
+        if self._leads.get(part, ("", 0.0))[0] == holder:
+            del self._leads[part]
 
     def now(self, *, lease_s: float) -> QueueNow:
         running = Counter((Lane.BULK, held.message.stage) for held in self._held.values())

@@ -181,6 +181,12 @@ class Presence(Protocol):
     def announced(self, part: str) -> bool:
         """Whether a part said so."""
 
+    def lead(self, part: str, holder: str, seconds: float) -> bool:
+        """Take or keep the lease of a part of the service for that long; False if another holder has it."""
+
+    def resign(self, part: str, holder: str) -> None:
+        """Give the lease of a part back, if this holder has it."""
+
     def now(self, *, lease_s: float) -> QueueNow:
         """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.
 

@@ -39,6 +39,14 @@ _GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
 _JOB: Final = b"rq:job:"
 _WORKER: Final = b"graspd:worker:"
+#: In one step, so that two that ask at once do not both get it.
+_LEAD: Final = """
+local holder = redis.call('GET', KEYS[1])
+if holder and holder ~= ARGV[1] then return 0 end
+redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
+return 1
+"""
+_RESIGN: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"
 #: Later stages first: a batch that was begun is finished before the next begins.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 
@@ -189,6 +197,14 @@ class RqQueue:
     def announced(self, part: str) -> bool:
         with _mapped():
             return bool(self.connection.exists(f"graspd:part:{part}"))
+
+    def lead(self, part: str, holder: str, seconds: float) -> bool:
+        with _mapped():
+            return bool(self.connection.eval(_LEAD, 1, f"graspd:lead:{part}", holder, int(seconds * 1000)))
+
+    def resign(self, part: str, holder: str) -> None:
+        with _mapped():
+            self.connection.eval(_RESIGN, 1, f"graspd:lead:{part}", holder)
 
     def now(self, *, lease_s: float) -> QueueNow:
         with _mapped():

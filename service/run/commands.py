@@ -75,22 +75,39 @@ def keeper(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Reaper, delayed retries and indexer. One runs in a service; `graspd up` starts it."""
+    """Reaper, delayed retries and indexer. Of several one works, and another takes over; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "keeper")
     keep_private(settings)
     if check:
         check_keeper(settings)
         return
-    from service.pipeline.backends import Parts
-    from service.pipeline.keeper import Keeper
+    _run_keeper(settings, stop_on_signals())
 
-    stop = stop_on_signals()
-    parts = Parts.open(settings)
+
+def _run_keeper(settings: Settings, stop: threading.Event) -> None:
+    """Wait until this keeper leads, then keep; again from the start where another has taken over."""
+    from service.heartbeat_file import HeartbeatFile
+    from service.pipeline.backends import Parts
+    from service.pipeline.keeper import PART, Keeper
+    from service.pipeline.leadership import Leadership
+    from service.queue.rq_queue import open_queue
+
+    queue = open_queue(settings, patience=0)
+    leadership = Leadership(
+        queue, PART, lease_s=settings.lease_s, alive=HeartbeatFile(settings.heartbeat_file), name=settings.keeper_name
+    )
     try:
-        Keeper(parts).run(stop)
+        while leadership.wait(stop):
+            with leadership.held(stop) as over:
+                # What an earlier leader took in and did not finish comes again to a fresh one.
+                parts = Parts.open(settings)
+                try:
+                    Keeper(parts).run(over)
+                finally:
+                    parts.close()
     finally:
-        parts.close()
+        queue.close()
 
 
 @index_app.command(epilog="graspd index rebuild --check")

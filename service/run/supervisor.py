@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import secrets
 import socket
 import sys
 import threading
@@ -174,7 +175,9 @@ class Supervisor:
             self._locks.append(own_redis(self.settings))
             log.info("Redis: %s, from %s", *find_server())
             children.append(child("redis", *server_command(self.settings, self._joining)))
-        children.append(child("keeper", *_PROGRAM, "keeper"))
+        # One that is started again need not wait until its predecessor's lease has run out.
+        name = self._wanted.keeper_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
+        children.append(child("keeper", *_PROGRAM, "keeper", GRASPD_KEEPER_NAME=name))
         if self._api:
             children.append(child("api", *_PROGRAM, "api"))
         children += [

@@ -85,7 +85,7 @@ def test_the_pods_that_keda_starts_are_what_kubernetes_takes() -> None:
 
 
 def test_a_wrong_field_would_be_found() -> None:
-    broken = yaml.safe_load((FOLDER / "base" / "keeper.yaml").read_text())
+    broken = next(yaml.safe_load_all((FOLDER / "base" / "keeper.yaml").read_text()))
     broken["spec"]["replica"] = 2
     with pytest.raises(kubernetes_validate.ValidationError):
         kubernetes_validate.validate(broken, "1.34.0", strict=True)
@@ -150,10 +150,15 @@ def test_kubernetes_waits_longer_than_a_process_may_take_to_stop() -> None:
         assert pod["terminationGracePeriodSeconds"] > float(settings["data"]["GRASPD_STOP_GRACE_S"]), name
 
 
-def test_there_is_one_keeper_and_the_old_one_ends_first() -> None:
+def test_a_second_keeper_takes_over_where_the_first_is_lost() -> None:
     (keeper,) = [found for found in documents("Deployment") if found["metadata"]["name"] == "keeper"]
-    assert keeper["spec"]["replicas"] == 1
-    assert keeper["spec"]["strategy"] == {"type": "Recreate"}
+    assert keeper["spec"]["replicas"] == 2
+    assert keeper["spec"]["strategy"]["rollingUpdate"]["maxUnavailable"] == 1, "one leads while the other is exchanged"
+    environment = {one["name"]: one for one in keeper["spec"]["template"]["spec"]["containers"][0]["env"]}
+    named = environment["GRASPD_KEEPER_NAME"]["valueFrom"]["fieldRef"]["fieldPath"]
+    assert named == "metadata.name", "two under one name would both lead"
+    budgets = [found["spec"]["selector"] for found in documents("PodDisruptionBudget")]
+    assert keeper["spec"]["selector"] in budgets, "a drain of two nodes takes one after the other"
 
 
 def test_the_environment_is_made_of_settings() -> None:

@@ -299,6 +299,23 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) 
     assert queue.announced("keeper")
 
 
+def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides: tuple[TaskQueue, Worker]) -> None:
+    queue, _ = sides
+    assert queue.lead("keeper", "a", 600)
+    assert not queue.lead("keeper", "b", 600)
+    assert queue.lead("keeper", "a", 600), "who leads may go on"
+    assert queue.lead("another part", "b", 600)
+    queue.resign("keeper", "b")
+    assert not queue.lead("keeper", "b", 600), "only its holder gives it back"
+    queue.resign("keeper", "a")
+    assert queue.lead("keeper", "b", 0.05)
+    deadline = time.monotonic() + 60
+    while not queue.lead("keeper", "a", 600):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert not queue.lead("keeper", "b", 600)
+
+
 def test_sums_add_up_and_each_name_has_its_own(sides: tuple[TaskQueue, Worker]) -> None:
     counters: Counters = sides[0]
     counters.count({"a": 1.5, "b": 2.0})
