@@ -41,6 +41,7 @@ _MAKE: Final = {
     "fidelity": "standard",
     "scene": "free",
     "faces": "drawn",
+    "touch": "0",
     "neighbours": "",
 }
 

@@ -110,6 +110,16 @@ def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, parts: Pa
     assert 'value="block, bottle"' in wrong.text
 
 
+def test_a_dataset_says_how_near_fingertips_come_to_supports(http: TestClient, parts: Parts) -> None:
+    form = {"name": "flat", "hands": ["barrett"], "objects": ["block"], "scene": "table", "touch": "-0.5"}
+    assert http.post("/datasets", data=form).status_code == 200
+    assert parts.index.datasets.get("flat").options.touch == -0.5
+    wrong = http.post("/datasets", data=form | {"name": "too-deep", "touch": "-3"})
+    assert (
+        wrong.status_code == 422 and 'name="touch" type="number" min="-1" max="2" step="any" value="-3"' in wrong.text
+    )
+
+
 def test_cells_of_one_state_are_a_list(http: TestClient, parts: Parts) -> None:
     wanted = DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug", "block"]})
     actions.create(parts, wanted)
