@@ -32,6 +32,8 @@ ROOM: Final = 0.006
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 #: Draws per start before the least penetrating one is taken.
 DRAWS: Final = 96
+#: Draws whose random numbers are drawn together.
+DRAWN: Final = 8
 #: Half the width of a palm [m], directions along which a hand may come, and how near one of the free ones is (cosine).
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
@@ -69,7 +71,7 @@ def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
         InputError: there is none.
     """
     ways = _sphere(DIRECTIONS)
-    out = ((obj.vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
+    out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
     points = obj.centre_of_mass + path[..., None] * ways[:, None]
     free = np.ones(DIRECTIONS, bool)
@@ -113,13 +115,16 @@ def clear_scene_starts(
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
     count, around = len(scene), _Around(hand, obj, _Surface.of(obj), ways, openings)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
-    normal = np.array([g.standard_normal((DRAWS, 2 + hand.dofs)) for g in generators])
+    normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     depth = np.full(count, np.inf)
     for number in range(DRAWS):
         rows = np.flatnonzero(depth > CLEAR)
         if not len(rows):
             break
+        if number == normal.shape[1]:
+            # Most starts need a few draws: the numbers of later ones are drawn when they are needed.
+            normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         states, low = around.draws(uniform[rows, number], normal[rows, number], scene[rows], reach)
         _raise(states, np.flatnonzero(low), placed, scene[rows], probe)
@@ -137,6 +142,14 @@ def clear_scene_starts(
             taken.q,
         )
     return best, depth
+
+
+def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs: int) -> Floats:
+    """(n, DRAWN, 2 + D) numbers of the next draws of starts `rows`; 0 of the others."""
+    out = np.zeros((len(generators), DRAWN, 2 + dofs))
+    for row in rows.tolist():
+        out[row] = generators[row].standard_normal((DRAWN, 2 + dofs))
+    return out
 
 
 def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp]) -> Floats:
