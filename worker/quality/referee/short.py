@@ -1,8 +1,8 @@
 """A short lift in coarse physics: what a planner asks of its candidates before it chooses.
 
-The hand closes and squeezes around the object on its support in half the time of the lift test; then the support is
-gone, and for a moment gravity, doubled for the jerk of a lift, pulls. Not a verdict: it ranks candidates for a quarter
-of a verdict's cost, and what it chooses the lift test judges all the same.
+The hand closes and squeezes around the object on its support in two fifths of the time of the lift test; then the
+support is gone, and for a moment gravity, doubled for the jerk of a lift, pulls. Not a verdict: it ranks candidates for
+a fifth of a verdict's cost, and what it chooses the lift test judges all the same.
 """
 
 from __future__ import annotations
