@@ -82,6 +82,10 @@ def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[s
     planner.grasps_of(hand, obj, parts, 0.0, device=device)
     grasps, around = timed(lambda: planner.grasps_of(hand, obj, again, 0.0, device=device))
     few, pieces = grasps.take(np.arange(min(batch, JUDGED))), decompose(obj)
+    # Compiled models of the referee and kernels of the table are kept: a first call makes them.
+    warm = grasps.take(np.arange(min(batch, 16)))
+    judge(hand, obj, warm, pieces=pieces)
+    measure(hand, obj, warm)
     verdicts, judged = timed(lambda: judge(hand, obj, few, pieces=pieces))
     _, measured = timed(lambda: measure(hand, obj, few))
     return {
