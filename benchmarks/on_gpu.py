@@ -1,6 +1,7 @@
 """A GPU against the CPU of the same machine: the grasps must be as good, and how fast they are made; prints Markdown.
 
-usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 1024] [--grasps 64] [--json OUT]
+usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 1024] [--grasps 64]
+           [--json OUT] [--page OUT]
 
 DATA_DIR holds hands/ and objects/. Accuracy: grasps of both devices from the same seeds, judged by the same referee and
 measured by the same table, on the CPU. Speed: wall time of each stage of a launch, after one that is not timed.
@@ -17,11 +18,14 @@ from datetime import date
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import mujoco
 import numpy as np
 import warp as wp
 
 from benchmarks.success import HANDS
+from service.model.cores import available_cores
 from service.model.domain import FIDELITIES
+from service.model.version import PACKAGE_VERSION
 from worker.engines.devices import Device
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -43,8 +47,9 @@ SEED: Final = 808
 FIDELITY: Final = FIDELITIES["standard"]
 #: Grasps of a launch that are judged and measured.
 JUDGED: Final = 128
-#: What both devices are compared by, a mean over the grasps each.
-COLUMNS: Final = ("epsilon", "penetration_depth_mm", "contact_area_cm2")
+#: What both devices are compared by, a mean over the grasps each, and its digits in the report.
+COLUMNS: Final = {"epsilon": 3, "penetration_depth_mm": 2, "contact_area_cm2": 1}
+SHOWN: Final = {"gsr": 2, **COLUMNS}
 
 
 def say(line: str) -> None:
@@ -103,36 +108,96 @@ def speed(hand: HandModel, obj: ObjectModel, device: str, batches: Sequence[int]
     return [{"batch": batch, **stages(hand, obj, device, batch)} for batch in batches]
 
 
+def page(result: dict[str, Any]) -> str:
+    """The report, as Markdown."""
+    lines = [
+        "# A GPU against the CPU of the same machine",
+        "",
+        f"    {result['command']}",
+        "",
+        f"{result['date']}: {result['device']}, {result['cores']} cores, {result['versions']}. Fidelity *standard*, "
+        f"seed {SEED}. Wall milliseconds for one grasp of a launch on {result['hands_object']}, by one process; judge "
+        f"and table on the CPU's cores, of at most {JUDGED} grasps. *Moved*: how far any hand lies from where the same "
+        "launch put it before.",
+        "",
+        "| hand | a launch | planner ms | postures ms | raw grasps/s | judge ms | table ms | hold | moved mm |",
+        "| --- | --: | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    for hand, rows in result["speed"].items():
+        for row in rows:
+            each = row["planner_ms"] + row["postures_ms"]
+            lines.append(
+                f"| {hand} | {row['batch']} | {row['planner_ms']:.2f} | {row['postures_ms']:.3f} | {1e3 / each:.0f} | "
+                f"{row['judge_ms']:.1f} | {row['quality_ms']:.1f} | {row['gsr']:.2f} | {row['moved_mm']:.1f} |"
+            )
+    lines += [
+        "",
+        "The grasps are as good as the CPU's: GPU / CPU of the same seeds, judged and measured by the same code "
+        f"({result['grasps']} grasps of a pair; a share is good to {1.96 * (0.25 / result['grasps']) ** 0.5:.2f}).",
+        "",
+        "| hand | object | hold | ε | depth mm | contact cm² |",
+        "| --- | --- | --: | --: | --: | --: |",
+    ]
+    for hand, meshes in result["accuracy"].items():
+        for mesh, both in meshes.items():
+            gpu, cpu = both["gpu"], both["cpu"]
+            cells = " | ".join(f"{gpu[key]:.{digits}f} / {cpu[key]:.{digits}f}" for key, digits in SHOWN.items())
+            lines.append(f"| {hand} | {mesh} | {cells} |")
+    pairs = [both for meshes in result["accuracy"].values() for both in meshes.values()]
+    if pairs:
+        cells = " | ".join(
+            " / ".join(f"{np.mean([both[at][key] for both in pairs]):.{digits}f}" for at in ("gpu", "cpu"))
+            for key, digits in SHOWN.items()
+        )
+        lines.append(f"| all | | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--batches", type=int, nargs="+", default=[32, 256, 1024])
     parser.add_argument("--grasps", type=int, default=64, help="of each pair whose quality is compared")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="all figures, written as they come")
+    parser.add_argument("--page", type=Path, help="the report")
     wanted = parser.parse_args()
     device = Device(wanted.device).resolve()
-    say(f"{date.today()}: {device_name(device)}, Warp {wp.config.version}, Python {sys.version.split()[0]}\n")
-    result: dict[str, Any] = {"device": device_name(device), "speed": {}, "accuracy": {}}
+    result: dict[str, Any] = {
+        "command": f"python -m benchmarks.on_gpu DATA --batches {' '.join(map(str, wanted.batches))} "
+        f"--grasps {wanted.grasps}",
+        "date": str(date.today()),
+        "device": device_name(device),
+        "cores": available_cores(),
+        "versions": f"graspd {PACKAGE_VERSION}, Warp {wp.config.version}, MuJoCo {mujoco.__version__}, "
+        f"Python {sys.version.split()[0]}",
+        "hands_object": f"`{OBJECTS[0]}`",
+        "grasps": wanted.grasps,
+        "speed": {},
+        "accuracy": {},
+    }
+
+    def keep() -> None:
+        if wanted.json:
+            wanted.json.write_text(json.dumps(result, indent=1) + "\n")
+        if wanted.page:
+            wanted.page.write_text(page(result))
+
     hands = {name: hand_from_path(str(wanted.data / "hands" / path)) for name, path in HANDS.items()}
     meshes = {name: object_from_path(str(wanted.data / "objects" / name / "clean.stl")) for name in OBJECTS}
     for name, hand in hands.items():
-        obj = meshes["025_mug"]
-        rows = speed(hand, obj, device, wanted.batches)
-        result["speed"][name] = rows
-        for row in rows:
-            say(f"{name} {json.dumps({key: round(value, 4) for key, value in row.items()})}")
-    pair = planner.pair_of(hands["Allegro"], meshes["025_mug"], FIDELITY, device)
+        result["speed"][name] = speed(hand, meshes[OBJECTS[0]], device, wanted.batches)
+        keep()
+    pair = planner.pair_of(hands["Allegro"], meshes[OBJECTS[0]], FIDELITY, device)
     result["kernels"] = {str(n): kernel_shares(pair, FIDELITY, n) for n in wanted.batches}
-    say(json.dumps(result["kernels"]))
     for name, hand in hands.items():
+        found = result["accuracy"].setdefault(name, {})
         for mesh, obj in meshes.items():
-            both = {at: quality(hand, obj, at, wanted.grasps) for at in (device, "cpu")}
-            result["accuracy"].setdefault(name, {})[mesh] = both
-            cells = " | ".join(f"{both[device][key]:.3f} / {both['cpu'][key]:.3f}" for key in both["cpu"])
-            say(f"| {name} | {mesh} | {cells} |")
-            if wanted.json:
-                wanted.json.write_text(json.dumps(result, indent=1))
+            found[mesh] = {
+                which: quality(hand, obj, at, wanted.grasps) for which, at in (("gpu", device), ("cpu", "cpu"))
+            }
+            keep()
+    say(page(result))
 
 
 if __name__ == "__main__":
