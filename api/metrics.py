@@ -65,7 +65,7 @@ class Snapshot:
             self._set("graspd_queue_oldest_task_seconds", lane, stage, value=oldest)
             self._set("graspd_tasks_running", lane, stage, value=queue.running.get((lane, stage), 0))
         states = [pulse.state for pulse in queue.workers.values()]
-        for state in ("idle", "busy", "stopping"):
+        for state in ("checking", "idle", "busy", "stopping", "quarantined"):
             self._set("graspd_workers", state, value=states.count(state))
         for name, pulse in queue.workers.items():
             self._set("graspd_worker_lease_age_seconds", name, pulse.device, value=pulse.lease_age_s)
