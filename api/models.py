@@ -158,6 +158,9 @@ class GraspDetail(GraspView):
     scene: GraspScene | None = Field(None, description="where it was planned; None: around a free object")
     pushes: list[Push] = Field(description="verdict per direction of push; empty: the referee did not judge")
     verdict_margin: float | None = Field(None, description="worst motion over its limit; below 1: held")
+    judged_by: Literal["mujoco", "mujoco_warp"] | None = Field(
+        None, description="whose verdict it is: of MuJoCo on the CPU, which certifies, or of the first judge"
+    )
     audit: bool | None = Field(None, description="verdict by the letter of the protocol; None: not audited")
     friction: float | None = Field(None, description="Coulomb coefficient of the metrics")
 

@@ -45,6 +45,9 @@ class Settings(BaseSettings):
     worker_number: int | None = Field(
         None, ge=0, description="of a worker among those of its machine: with device auto, number k takes the k-th GPU"
     )
+    first_judge: Literal["auto", "on", "off"] = Field(
+        "auto", description="whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed"
+    )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     join: str = Field(
         "auto",

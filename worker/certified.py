@@ -26,6 +26,7 @@ from worker.planners import Trial, Wanted, fitting_pairs, synthesize
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.first.screening import first_terms
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lifting import judge_lifts, lift_key
@@ -221,7 +222,10 @@ class _Work:
 
     def _key(self, pieces: ConvexPieces) -> str:
         if self.scenes is None:
-            return verdict_key(self.hand, self.obj, self._level, False, pieces=pieces)
+            return verdict_key(
+                self.hand, self.obj, self._level, False, pieces=pieces,
+                first_judge=first_terms(self.hand, self._level, self._run),
+            )  # fmt: skip
         placed = self.scenes.placed(np.zeros(0, int))
         return lift_key(self.hand, self.obj, placed, lift_level(self.request.referee), False, pieces=pieces)
 
@@ -311,6 +315,7 @@ class _Work:
             "quality/success": verdicts.success,
             "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
             "quality/verdict_margin": verdicts.margin,
+            **({"quality/judged_by": verdicts.judged_by} if first_terms(self.hand, self._level, self._run) else {}),
         }
 
     def _measured(self, grasps: GraspSet) -> Arrays:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal
 
 from service.model.cores import available_cores
 from service.model.errors import TaskCancelled
 from worker.meeting import Meeting
 
+FirstJudge = Literal["auto", "on", "off"]
 Progress = Callable[[float, float, str], None]
 """Told what is done, of how much, and a word on it; from any thread, often."""
 Cancelled = Callable[[], bool]
@@ -26,7 +27,7 @@ def _never() -> bool:
 
 @dataclass(frozen=True)
 class Run:
-    """Where and how work is done; what it makes does not depend on it, but for the rounding of a GPU."""
+    """Where and how work is done; what it makes does not depend on it, but for the rounding of a GPU and who judges."""
 
     device: str = "cpu"
     """Warp device."""
@@ -36,6 +37,8 @@ class Run:
     cancelled: Cancelled = _never
     meeting: Meeting | None = None
     """Where it meets others like it, to be done with them in one launch; None: it is done by itself."""
+    first_judge: FirstJudge = "auto"
+    """Whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed."""
 
     @property
     def cores(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from api.catalog.grasp_scenes import scene, way
 from api.models import GraspDetail, Posture, Push
@@ -59,6 +59,7 @@ class GraspFiles:
             scene=scene(file, row),
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
+            judged_by=_judged_by(file, row),
             audit=_verdict(file, "quality/audit", row),
             friction=_number(file.attributes.get("mu")),
         )
@@ -74,6 +75,13 @@ class GraspFiles:
 def _posture(file: Shard, name: str, row: int) -> Posture:
     pose, joints = file[f"{name}/hand_pose"][row], file[f"{name}/joint_positions"][row]
     return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
+
+
+def _judged_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
+    if "quality/success" not in file.arrays:
+        return None
+    judged = file.arrays.get("quality/judged_by")
+    return "mujoco_warp" if judged is not None and judged[row] == 1 else "mujoco"
 
 
 def _pushes(file: Shard, row: int) -> list[Push]:

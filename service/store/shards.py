@@ -105,6 +105,14 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "worst displacement or rotation of the pushes over its limit; below 1: held",
             optional=True,
         ),
+        "quality/judged_by": Column(
+            "N",
+            "u1",
+            "enum",
+            "none",
+            "whose verdict success is: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the first judge",
+            optional=True,
+        ),
         "quality/audit": Column(
             "N",
             "i1",

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, reporting_errors
+from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.domain import FIDELITIES, JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import parse_scene
@@ -91,7 +91,7 @@ def synth(
     with _bar(quiet=json) as progress:
         made = synthesized(
             hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
-            join=join, progress=progress,
+            first_judge=load_settings().first_judge, join=join, progress=progress,
         )  # fmt: skip
     out.write_bytes(write_shard("base", made.arrays, made.attributes))
     found = {"file": str(out), **made.summary()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from functools import cache
+from importlib.metadata import version
 from typing import Any
 
 from service.model.errors import InputError
@@ -15,6 +16,17 @@ def has_mujoco_warp() -> bool:
     return importlib.util.find_spec("mujoco_warp") is not None
 
 
+def mujoco_warp_version() -> str:
+    """Name and version.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    if not has_mujoco_warp():
+        raise InputError("the first judge needs mujoco-warp; run pip install 'graspd[gpu]'")
+    return f"mujoco-warp {version('mujoco-warp')}"
+
+
 @cache
 def mujoco_warp() -> Any:
     """The module, with Warp started.
@@ -22,8 +34,7 @@ def mujoco_warp() -> Any:
     Raises:
         InputError: it is not installed.
     """
-    if not has_mujoco_warp():
-        raise InputError("the first judge needs mujoco-warp; run pip install 'graspd[gpu]'")
+    mujoco_warp_version()
     backend.start()
     import mujoco_warp as engine
 

@@ -26,7 +26,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
-from worker.run import Progress, Run
+from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
 from worker.together import certified_batches
 
@@ -100,6 +100,7 @@ def synthesized(
     mesh: Mapping[str, Any] | None = None,
     device: str = "auto",
     threads: int = 0,
+    first_judge: FirstJudge = "auto",
     join: int | str = "auto",
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
@@ -115,6 +116,7 @@ def synthesized(
         mesh: how the object's file is read: units, scale_to, keep_largest, allow_open.
         device: cpu, cuda:0 or auto.
         threads: CPU threads; 0: one per core.
+        first_judge: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
         join: batches of 32 whose grasps are planned in one launch, or auto; the grasps are the same.
         progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
@@ -135,7 +137,7 @@ def synthesized(
     if place.kind != "free":
         where, poses = scenes_of(place, thing, others, count=scenes, seed=request.seed)
     sizes = [min(BATCH_SIZE, request.grasps - first) for first in range(0, request.grasps, BATCH_SIZE)]
-    run = Run(chosen, threads)
+    run = Run(chosen, threads, first_judge=first_judge)
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
     joined = batches_at_once(chosen, wanted)

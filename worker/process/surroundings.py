@@ -57,4 +57,7 @@ class Surroundings:
                 return None
 
         device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
-        return TaskContext(self.store, device=device, threads=self.settings.threads, tell=tell)
+        chosen = self.settings
+        return TaskContext(
+            self.store, device=device, threads=chosen.threads, first_judge=chosen.first_judge, tell=tell
+        )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Final
 from service.model.errors import TaskCancelled
 from service.store.store import Store
 from worker.meeting import Meeting
-from worker.run import Run
+from worker.run import FirstJudge, Run
 
 #: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
 _REPORT_EVERY_S: Final = 0.25
@@ -35,12 +35,14 @@ class TaskContext:
         *,
         device: str = "cpu",
         threads: int = 0,
+        first_judge: FirstJudge = "auto",
         tell: Callable[[float, float, str], float | None] | None = None,
     ) -> None:
         """`tell` takes done, total and a message, and may answer when it wants to hear more [s]."""
         self.store = store
         self.device = device
         self.threads = threads
+        self.first_judge: FirstJudge = first_judge
         self.meeting: Meeting | None = None
         """Where the task is done beside others; None: by itself."""
         self._tell = tell
@@ -60,7 +62,9 @@ class TaskContext:
     @property
     def run(self) -> Run:
         """What the engine room needs to know of the task."""
-        return Run(self.device, self.threads, self.progress, self.cancelled, self.meeting)
+        return Run(
+            self.device, self.threads, self.progress, self.cancelled, self.meeting, self.first_judge,
+        )  # fmt: skip
 
     def cancelled(self) -> bool:
         """Whether to stop at the next launch."""

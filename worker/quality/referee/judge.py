@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +20,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.first.screening import Screened, first_terms, screened
 from worker.quality.referee.key import Level, postures_key, verdict_key
 from worker.quality.referee.model import COARSE, MujocoOptions
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
@@ -26,6 +28,7 @@ from worker.run import ALONE, Run
 
 Floats = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
 LEVELS: Final = ("letter", "certificate", "screen")
 
 
@@ -54,10 +57,16 @@ class Verdicts:
     """`verdict_key`: digest of all that moves a verdict but the grasp. Rates of different terms do not compare."""
     key: str
     """Digest of the terms and of the postures that were judged."""
+    judged_by: NDArray[np.uint8]
+    """(N,) `JudgedBy`: whose verdict it is. Only those of MuJoCo on the CPU are certificates."""
     seconds: float
     """Wall time."""
     steps: int
     """Simulation steps of all trials."""
+    audited: int = 0
+    """Verdicts of the first judge that the CPU was asked for as well; where they differ the CPU's stands."""
+    contradicted: int = 0
+    """How many of them differed."""
 
     @property
     def reasons(self) -> list[str]:
@@ -85,7 +94,8 @@ def judge(
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.quality.referee.protocol` for the levels.
 
-    MuJoCo releases the interpreter lock while it steps, so threads use all cores.
+    MuJoCo releases the interpreter lock while it steps, so threads use all cores. Where `run` has a first judge it
+    gives the clear verdicts, see `worker.quality.referee.first.screening`.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
@@ -107,21 +117,18 @@ def judge(
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
     bench = _Bench(hand, obj, pieces, level, hard, run.cores)
-    done, lock = 0, threading.Lock()
-
-    def work(row: int) -> Trial:
-        nonlocal done
-        run.check("the referee")
-        trial = bench.trial(grasps, row)
-        with lock:
-            done += 1
-            run.progress(done, len(grasps), "referee")
-        return trial
-
-    with ThreadPoolExecutor(bench.threads, thread_name_prefix="referee") as pool:
-        trials = list(pool.map(work, range(len(grasps))))
-    terms = verdict_key(hand, obj, level, hard, pieces=pieces)
-    return _verdicts(trials, bench, terms, postures_key(terms, grasps), time.perf_counter() - began)
+    first_judge = first_terms(hand, level, run)
+    terms = verdict_key(hand, obj, level, hard, pieces=pieces, first_judge=first_judge)
+    first = screened(bench.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
+    trials = dict(first.stands)
+    bench.judge(grasps, [row for row in range(len(grasps)) if row not in trials], trials, run)
+    contradicted = first.contradicted(trials)
+    if not first.believed(contradicted):
+        log.warning("%d of %d audited verdicts are contradicted: the CPU judges all", contradicted, len(first.audited))
+        bench.judge(grasps, list(first.stands), trials, run)
+    ordered = [trials[row] for row in range(len(grasps))]
+    found = _verdicts(ordered, bench, terms, postures_key(terms, grasps), time.perf_counter() - began)
+    return replace(found, audited=len(first.audited), contradicted=contradicted)
 
 
 class _Bench:
@@ -134,12 +141,28 @@ class _Bench:
         self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
         self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
         levels = [MujocoOptions().hardened(), COARSE.hardened()] if hard else [MujocoOptions(), COARSE]
-        full = scene_of(hand, obj, pieces, levels[0])
+        full = self.scene = scene_of(hand, obj, pieces, levels[0])
         coarse = scene_of(hand, obj, pieces, levels[1]) if level == "screen" else None
         for _ in range(threads):
             self._full.put(Test(full))
             if coarse is not None:
                 self._coarse.put(Test(coarse))
+
+    def judge(self, grasps: GraspSet, rows: list[int], trials: dict[int, Trial], run: Run) -> None:
+        """Put the trials of some grasps among those that are there."""
+        done, lock = len(grasps) - len(rows), threading.Lock()
+
+        def work(row: int) -> None:
+            nonlocal done
+            run.check("the referee")
+            trial = self.trial(grasps, row)
+            with lock:
+                trials[row] = trial
+                done += 1
+                run.progress(done, len(grasps), "referee")
+
+        with ThreadPoolExecutor(self.threads, thread_name_prefix="referee") as pool:
+            list(pool.map(work, rows))
 
     def trial(self, grasps: GraspSet, row: int) -> Trial:
         if self.level == "screen":
@@ -169,6 +192,7 @@ def _verdicts(trials: list[Trial], bench: _Bench, terms: str, key: str, seconds:
         margin=np.array([t.margin for t in trials], float),
         penetration_depth_mm=np.array([t.penetration_m for t in trials], float) * 1e3,
         self_penetration_depth_mm=np.array([t.self_penetration_m for t in trials], float) * 1e3,
+        judged_by=np.array([t.judged_by for t in trials], np.uint8),
         level=bench.level,
         hard=bench.hard,
         pieces=len(bench.pieces),

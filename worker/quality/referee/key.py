@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
@@ -57,11 +58,13 @@ def verdict_key(
     *,
     pieces: ConvexPieces | None = None,
     cache: Path | None = None,
+    first_judge: Sequence[Any] = (),
 ) -> str:
     """Digest of the terms of a verdict: all that it follows from but the grasp's own postures.
 
     In it: level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
-    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine.
+    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `first_judge`,
+    the first judge's terms where it takes part.
 
     Raises:
         MeshError: `pieces` is not given and the object has none that are usable.
@@ -82,6 +85,7 @@ def verdict_key(
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
             # Of grippers alone: the keys of hands stay what they are.
             **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
+            **({"first_judge": list(first_judge)} if first_judge else {}),
         }
     )
 

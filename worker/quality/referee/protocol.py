@@ -55,6 +55,13 @@ class Outcome(IntEnum):
     DIVERGED = 6
 
 
+class JudgedBy(IntEnum):
+    """Whose verdict it is. Only MuJoCo on the CPU gives certificates."""
+
+    MUJOCO = 0
+    MUJOCO_WARP = 1
+
+
 @dataclass
 class Trial:
     """Verdict on one grasp."""
@@ -65,6 +72,7 @@ class Trial:
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0
+    judged_by: JudgedBy = JudgedBy.MUJOCO
 
     @property
     def success(self) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any, Final, Self
 
 import numpy as np
@@ -20,6 +22,10 @@ PATIENCE: Final = 5
 #: Ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided: a grasp that holds takes 32 at least, 1 of 100
 #: more than 47. Few creepers would keep a launch waiting.
 MOST_TICKS: Final = 48
+#: One clear verdict in so many is asked of the CPU as well.
+AUDIT_ONE_IN: Final = 50
+#: Raise when the code changes what the first judge says, constants aside.
+REVISION: Final = 1
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,19 @@ class FirstTrials:
         kinds = (Outcome.LOST_WHILE_CLOSING, Outcome.DISPLACED, Outcome.ROTATED)
         lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
         return np.asarray((inside | lost) & ~self.overflow)
+
+    def parts(self, sizes: Sequence[int]) -> list[Self]:
+        """The trials of grasps that were joined, set by set."""
+        ends = np.cumsum([0, *sizes])
+        return [
+            replace(self, **{field.name: getattr(self, field.name)[a:b] for field in fields(self)})
+            for a, b in pairwise(ends)
+        ]
+
+    @staticmethod
+    def terms(engine: str) -> list[Any]:
+        """What verdicts of a version of the engine follow from, beside the certificate's own terms."""
+        return [engine, REVISION, *BAND, PATIENCE, MOST_TICKS, AUDIT_ONE_IN]
 
     def put(self, rows: NDArray[np.intp], again: Self) -> Self:
         """The same with some rows replaced by those of other trials."""
