@@ -4,7 +4,7 @@
     python -m benchmarks.gallery --sources /tmp/hands
 
 Nothing of the packages is run: their files are read as a user's folder is. Each hand goes through
-`graspd hands check --self-test`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content, so
+`graspd hands check`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content, so
 a broken run goes on where it was, and a hand that is read in another way is tried anew.
 """
 
@@ -167,7 +167,7 @@ def page(done: dict[str, Any]) -> str:
     lines = [
         "# Gallery of hands", "",
         "Real hands and grippers, read from the files in which they are published. Each was tried as",
-        "`graspd hands check HAND --self-test` does: 64 raw grasps of a sphere, a box and a cylinder of a size that",
+        "`graspd hands check HAND` does: 64 raw grasps of a sphere, a box and a cylinder of a size that",
         f"suits it, judged by the certificate; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
         "best of them, from two sides.", "", "```sh",
         f"pip install --no-deps --target /tmp/hands {PACKAGES}",

@@ -143,7 +143,7 @@ def main(
     end = time.monotonic() + 60 * minutes
     run.up()
     for name, urdf in HANDS.items():
-        typer.echo(run.graspd("hands", "add", str(data / "hands" / urdf), "--name", name)["message"])
+        typer.echo(run.graspd("hands", "add", str(data / "hands" / urdf), "--name", name, "--no-self-test")["message"])
     create = (
         "datasets", "create", DATASET, "--hands", ",".join(HANDS), "--objects", str(data / "objects"),
         "--grasps", str(grasps), "--fidelity", fidelity, "--yes",

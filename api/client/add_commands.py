@@ -66,12 +66,12 @@ def add_hand(
     source: SourceOption = None,
     self_test: Annotated[
         bool, typer.Option("--self-test/--no-self-test", help="Record how many of 64 grasps of plain objects hold.")
-    ] = False,
+    ] = True,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload a hand, wait for its check, say what was guessed, and with --self-test what it holds."""
+    """Upload a hand, wait for its check, say what was guessed and what it holds of plain objects."""
     options = hand_options(
         urdf=urdf, xacro=xacro, palm=palm, approach=approach, root=root, pre_shape=pre_shape, closing=closing,
         fingertips=fingertips, fix=fix, drop=drop,

@@ -95,7 +95,7 @@ def graspd(service: Supervisor, files: Path) -> Shell:
 
 
 def test_a_hand_is_added_with_its_guesses(graspd: Shell) -> None:
-    code, hand, _ = graspd("hands", "add", "pincer.urdf")
+    code, hand, _ = graspd("hands", "add", "pincer.urdf", "--no-self-test")
     assert (code, hand["name"], hand["verdict"]) == (0, "pincer", "accept")
     assert hand["facts"]["palm_approach"] == [0.0, 0.0, 1.0]
 
@@ -124,7 +124,7 @@ def test_an_open_mesh_needs_a_word(graspd: Shell) -> None:
 def test_a_folder_of_objects_becomes_a_dataset_and_its_files(
     graspd: Shell, service: Supervisor, tmp_path: Path
 ) -> None:
-    graspd("hands", "add", "pincer.urdf")
+    graspd("hands", "add", "pincer.urdf", "--no-self-test")
     wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
     cheap = ("--fidelity", "draft", "--want", "raw", "--referee", "none")
     code, seen, _ = graspd(*wanted, *cheap, "--dry-run")

@@ -18,6 +18,9 @@ from worker.hands.tree import Tree
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25
+#: Fingertips that end so many times as far from each other as they began have opened; those that close end at 0.2 to
+#: 0.8 of it.
+PARTED = 1.3
 
 
 def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
@@ -28,6 +31,7 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
         hand = replace(hand, closing=_closing_seen(hand, dict(_by_dof(hand, tree, options.closing))))
         if (jaws := find_jaws(hand)) is not None:
             return _gripper(hand, jaws, tree, options)
+    hand = _closed_together(hand)
     approach = _stated_approach(tree, options)
     if approach is None:
         approach = _guess_approach(hand)
@@ -103,6 +107,25 @@ def _closing_by_limits(hand: HandModel) -> Floats:
     """Fingers bend far one way and little the other; what moves as far both ways spreads."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     return np.where(up > 2 * down, 1.0, np.where(down > 2 * up, -1.0, 0.0))
+
+
+def _closed_together(hand: HandModel) -> HandModel:
+    """The hand; one whose fingertips part as it closes by its limits closes by what brings them together instead.
+
+    Limits from 0 on say nothing of a hand that is closed at 0.
+    """
+    opened, half, closed = (posture(hand, share) for share in (0.0, 0.5, 1.0))
+    if _apart(hand, closed) <= PARTED * _apart(hand, opened):
+        return hand
+    steps = np.diag(0.1 * hand.span)
+    parting = np.array([_apart(hand, half + step) - _apart(hand, half - step) for step in steps])
+    return replace(hand, closing=np.where(hand.closing != 0, -np.sign(parting), 0.0))
+
+
+def _apart(hand: HandModel, q: Floats) -> float:
+    """Mean distance of the fingertips from their middle [m]."""
+    tips = _tips(hand, q)
+    return float(np.linalg.norm(tips - tips.mean(axis=0), axis=1).mean())
 
 
 def posture(hand: HandModel, share: float) -> Floats:

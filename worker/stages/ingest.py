@@ -17,7 +17,6 @@ from typing import Any, Final
 
 from service.model import names
 from service.model.domain import AssetKind, IngestMessage
-from service.model.errors import InputError
 from service.store.assets import pack, unpack
 from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
 from worker.stages.context import TaskContext
@@ -51,13 +50,9 @@ def run(message: IngestMessage, context: TaskContext) -> None:
 def _self_test(message: IngestMessage, files: dict[str, bytes], context: TaskContext) -> dict[str, Any]:
     """How many grasps of plain objects hold. A hand that finds none is no error: that is what it tells."""
     from worker.hands.load import load_hand
-    from worker.stages.hand_self_test import failed, self_test
+    from worker.stages.hand_self_test import tried_softly
 
-    try:
-        hand = load_hand(files, name=message.name, digest=message.digest)
-        return self_test(hand, context.run).facts()
-    except InputError as error:
-        return failed(str(error))
+    return tried_softly(lambda: load_hand(files, name=message.name, digest=message.digest), context.run)
 
 
 def check_in_child(

@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
+from service.model.errors import InputError, TaskCancelled
 from tests.worker.hands.grippers import OPENING, gripper
 from tests.worker.hands.urdfs import joint, link, robot
+from worker.certified import Certified
 from worker.hands.jaws import jaws_of
 from worker.hands.load import load_hand
-from worker.stages.hand_self_test import OF_OPENING, OF_REACH, SelfTest, fitting_width, plain_objects, self_test
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.run import Run
+from worker.stages import hand_self_test
+from worker.stages.hand_self_test import (
+    OF_OPENING,
+    OF_REACH,
+    SelfTest,
+    fitting_width,
+    plain_objects,
+    self_test,
+    tried_softly,
+)
 
 _PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'
 _FINGER = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.012 0.012 0.1"/></geometry></collision>'
+
+
+def held(count: int) -> Certified:
+    """`count` grasps that hold, equally well."""
+    ones = np.ones(count)
+    columns = {"quality/success": ones, "quality/epsilon": ones[:, None], "quality/verdict_margin": ones}
+    grasps = SimpleNamespace(grasp=SimpleNamespace(take=lambda rows: None))
+    return cast(Certified, SimpleNamespace(columns=columns, grasps=grasps))
 
 
 def test_objects_are_as_wide_as_suits_the_opening() -> None:
@@ -42,6 +67,50 @@ def test_a_finger_of_one_joint_reaches_to_its_pad_and_not_only_to_its_base() -> 
     assert jaws_of(hand) is None
     # Its joints lie 30 mm from the palm's middle, its pads beyond half of the 100 mm of a finger.
     assert OF_REACH * 0.05 < fitting_width(hand) < OF_REACH * 0.11
+
+
+def test_what_is_tried_in_time_counts_and_what_is_not_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(hand_self_test.time, "monotonic", lambda: now[0])
+
+    def batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> list[Certified]:
+        # Kernels that are compiled before the first step of planning take none of the hand's time.
+        now[0] += 100.0 if now[0] == 0.0 else 0.0
+        run.check("compiling")
+        run.progress(1, 10, "planning")
+        now[0] += 40.0
+        run.check("planning")
+        return [held(count)]
+
+    monkeypatch.setattr(hand_self_test, "_batches", batches)
+    found = self_test(gripper(), grasps=6, budget_s=60.0)
+    assert (found.n, found.left) == (2, ("box", "cylinder"))
+    assert found.line == "ready: 100 % hold (of 2; no time was left for the box and the cylinder)"
+    now[0] = 0.0
+    assert self_test(gripper(), grasps=6).n == 6
+    with pytest.raises(TaskCancelled, match="40 s were too short"):
+        self_test(gripper(), grasps=6, budget_s=30.0)
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (InputError("no way in"), "suspicious: no way in"),
+        (TaskCancelled("60 s were too short"), "not tried: 60 s were too short"),
+        (ValueError("array"), "not tried: the test itself failed (ValueError)"),
+    ],
+)
+def test_a_test_that_ends_badly_is_told_and_stops_nothing(
+    error: Exception, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def breaks(hand: HandModel, run: Run, *, budget_s: float) -> SelfTest:
+        raise error
+
+    monkeypatch.setattr(hand_self_test, "self_test", breaks)
+    assert tried_softly(gripper)["says"] == says
+    if isinstance(error, TaskCancelled):
+        with pytest.raises(TaskCancelled):
+            tried_softly(gripper, Run(cancelled=lambda: True))
 
 
 @pytest.mark.slow

@@ -81,7 +81,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
     """The trial itself is tested beside it: here that it runs on the hand that was checked, and what is kept."""
     tried = []
 
-    def stand_in(hand: HandModel, run: Run) -> SelfTest:
+    def stand_in(hand: HandModel, run: Run, *, budget_s: float) -> SelfTest:
         tried.append(hand.name)
         return SelfTest(0.9, 64, 0.04, {"box": 0.9})
 
@@ -101,7 +101,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
 def test_a_hand_that_finds_no_grasp_is_taken_and_says_why(
     context: TaskContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stand_in(hand: HandModel, run: Run) -> SelfTest:
+    def stand_in(hand: HandModel, run: Run, *, budget_s: float) -> SelfTest:
         raise InputError("no way in")
 
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
