@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
 from service.model.errors import InputError, LimitError
 from service.store.assets import MAX_FILES
 from service.store.hand_main import SUFFIXES, format_of
+from service.store.mesh_looks import HEAD_BYTES, MESHES, beside, named_by
 
 #: What says more of a hand than its URDF does; the first goes over the second.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
@@ -36,7 +37,27 @@ def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
         InputError: a folder without a description.
         LimitError: too many files.
     """
-    return (_of_folder(path), "") if path.is_dir() else _of_description(path)
+    files, main = (_of_folder(path), "") if path.is_dir() else _of_description(path)
+    return files | _looks(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
+
+
+def _looks(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
+    """Material libraries and pictures that meshes name, where they lie inside the root."""
+    found: dict[str, Path] = {}
+    waiting = [name for name in files if name.lower().endswith(MESHES)]
+    while waiting and len(files) + len(found) < MAX_FILES:
+        mesh = waiting.pop()
+        for reference in named_by(mesh, _head(root / mesh)):
+            name = beside(mesh, reference, lambda one: _inside(root / one, root))
+            if name and name not in files and name not in found:
+                found[name] = root / name
+                waiting += [name] if name.lower().endswith(".mtl") else []
+    return found
+
+
+def _head(file: Path) -> bytes:
+    with file.open("rb") as opened:
+        return opened.read(HEAD_BYTES)
 
 
 def _of_folder(folder: Path) -> dict[str, Path]:

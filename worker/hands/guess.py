@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
@@ -21,6 +22,8 @@ PRESHAPE_SHARE = 0.25
 #: Fingertips that end so many times as far from each other as they began have opened; those that close end at 0.2 to
 #: 0.8 of it.
 PARTED = 1.3
+#: A wrist or a rim that stands so far above the palm between the fingers is not the palm [m].
+RIM_M = 0.02
 
 
 def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
@@ -219,7 +222,30 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     through = (middle + bases.mean(axis=0)) / 2 if len(bases) else middle
     height = float((corners @ approach).max())
-    return PalmFrame(through + (height - through @ approach) * approach, approach)
+    centre = through + (height - through @ approach) * approach
+    if len(bases):
+        # Beneath what the half-closed fingers reach over.
+        beneath = (bases.mean(axis=0) + _tips(hand, posture(hand, 0.5)).mean(axis=0)) / 2
+        surface = _leaves(parts, beneath, approach)
+        if surface is not None and surface < height - RIM_M:
+            return PalmFrame(beneath + (surface - beneath @ approach) * approach, approach)
+    return PalmFrame(centre, approach)
+
+
+def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
+    """How far along `direction` a line through `point` leaves the last of some convex parts (V, 3); None: it meets
+    none."""
+    ends = []
+    for corners in parts:
+        planes = ConvexHull(corners).equations
+        rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
+        # Planes along the line bound nothing; those that the point lies outside of are not met at all.
+        across = np.abs(rate) > 1e-9
+        first = np.max(room[across & (rate < 0)] / rate[across & (rate < 0)], initial=-np.inf)
+        last = np.min(room[across & (rate > 0)] / rate[across & (rate > 0)], initial=np.inf)
+        if first <= last and (room[~across] >= 0).all():
+            ends.append(float(point @ direction) + float(last))
+    return max(ends, default=None)
 
 
 def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = PRESHAPE_SHARE) -> Floats:

@@ -16,10 +16,11 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.model.transforms import Floats, apply
+from service.store.mesh_looks import MAX_NAMES, beside, looks_of
 from worker.hands.primitives import tessellate
 from worker.hands.references import find_mesh
 from worker.hands.robot import Ints, Shape
-from worker.objects.formats import Soup, read_mesh
+from worker.objects.formats import Nearby, Soup, read_mesh
 
 #: A hand's visual meshes together [faces]: beyond that a picture shows no more.
 MAX_FACES: Final = 400_000
@@ -68,7 +69,8 @@ class Visuals:
             for part in shape.mesh or ():
                 whole.update(np.ascontiguousarray(part).tobytes())
             if shape.filename and (name := _file_of(item, self.files, self.base)):
-                whole.update(hashlib.sha256(self.files[name]).digest())
+                for file in (name, *looks_of(name, self.files)):
+                    whole.update(hashlib.sha256(self.files[file]).digest())
         return whole.hexdigest()[:32]
 
     @cached_property
@@ -112,7 +114,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
     name = _file_of(item, files, base)
     try:
         if name and name not in soups:
-            soups[name] = read_mesh(name, files[name])
+            soups[name] = read_mesh(name, files[name], _nearby(name, files))
     except InputError:
         return []
     if not name:
@@ -124,6 +126,27 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
         VisualMesh(item.body, *_used(vertices, faces[chosen]), shape.colour or colour)
         for colour, chosen in soup.by_colour()
     ]
+
+
+def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
+    """What a mesh names of a hand's files, and what its libraries name; so many and no more."""
+    naming = [mesh]
+    asked = 0
+
+    def find(reference: str) -> bytes | None:
+        nonlocal asked
+        asked += 1
+        if asked > MAX_NAMES:
+            return None
+        found = (beside(one, reference, files.__contains__) for one in reversed(naming))
+        name = next((one for one in found if one), None)
+        if name is None:
+            return None
+        if name.lower().endswith(".mtl"):
+            naming.append(name)
+        return files[name]
+
+    return find
 
 
 def _used(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import InputError, TaskCancelled
@@ -23,6 +24,7 @@ from worker.hands.model import Floats, HandModel
 from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import load_object
+from worker.quality.referee.protocol import Outcome
 from worker.run import ALONE, Run
 
 #: Grasps in all, and the share that must hold of a hand that is ready.
@@ -38,6 +40,9 @@ OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
 _IDENTITY: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
+
+#: Servos that go from nothing to their limit within less of a fingertip's way press by chance [m].
+SOFT_M: Final = 0.0015
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +68,10 @@ class SelfTest:
     """None: nothing was held."""
     left: tuple[str, ...] = ()
     """Objects for which no time was left."""
+    lost: float = 0.0
+    """Share of the grasps that do not hold whose object was lost while the hand closed; others slip when pushed."""
+    give_m: float = math.inf
+    """Way of a fingertip within which its stiffest servo goes from nothing to its limit [m]."""
 
     @property
     def line(self) -> str:
@@ -73,7 +82,13 @@ class SelfTest:
         if self.gsr >= READY:
             return f"ready: {share}"
         worst = min(self.by_object, key=lambda name: self.by_object[name])
-        return f"suspicious: {share}, {100 * self.by_object[worst]:.0f} % of a {worst}; look at palm, closing and pads"
+        says = f"suspicious: {share}, {100 * self.by_object[worst]:.0f} % of a {worst}; "
+        if self.lost > 0.5:
+            return says + "most are lost while it closes: look at palm, closing and pads"
+        if self.give_m < SOFT_M:
+            give = f"{1e3 * self.give_m:.1f} mm of a fingertip's way"
+            return says + f"its servos reach their limits within {give}: give less stiffness in asset.json"
+        return says + "most slip when pushed: look at effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
         """As a check reports it."""
@@ -123,6 +138,7 @@ def self_test(
     """
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
+    lost: list[bool] = []
     best: Best | None = None
     objects, clock = plain_objects(width), _Clock(run, budget_s)
     for number, (name, obj) in enumerate(objects.items()):
@@ -135,6 +151,7 @@ def self_test(
                 raise
             break
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
+        lost += [bool(one) for batch in found for one in _lost(batch)]
         better = [_best(obj, batch) for batch in found]
         best = max((one for one in (best, *better) if one), key=lambda one: one.rank, default=None)
     if not held:
@@ -142,7 +159,28 @@ def self_test(
     every = [value for values in held.values() for value in values]
     by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
     left = tuple(name for name in objects if name not in held)
-    return SelfTest(float(np.mean(every)), len(every), width, by_object, best, left)
+    share = float(np.mean(lost)) if lost else 0.0
+    return SelfTest(float(np.mean(every)), len(every), width, by_object, best, left, share, _give(hand))
+
+
+def _lost(batch: Certified) -> NDArray[np.bool_]:
+    """Of the grasps that do not hold, whether the object was lost while the hand closed."""
+    failed = batch.columns["quality/success"] != 1
+    outcome = batch.columns["quality/verdict_outcome"][failed]
+    return np.asarray((outcome == Outcome.LOST_WHILE_CLOSING).any(axis=1))
+
+
+def _give(hand: HandModel) -> float:
+    """Least way of a fingertip [m] within which a dof that closes goes from no torque to its limit."""
+    if jaws_of(hand) is not None:
+        return math.inf
+    step = 1e-4
+    q = hand.preshape + np.concatenate([np.zeros((1, hand.dofs)), step * np.eye(hand.dofs)])
+    poses = body_poses(hand, np.tile(_IDENTITY, (len(q), 1)), hand.expand(q))
+    pads = np.stack([apply(poses[:, tip], fingertip_pad(hand, tip).centre) for tip in hand.fingertips], axis=1)
+    lever = np.linalg.norm(pads[1:] - pads[0], axis=2).max(axis=1) / step
+    closes = (hand.closing != 0) & (lever > 0)
+    return float(np.min((hand.effort / hand.stiffness * lever)[closes], initial=math.inf))
 
 
 def _batches(hand: HandModel, obj: ObjectModel, count: int, seed: int, run: Run) -> list[Certified]:

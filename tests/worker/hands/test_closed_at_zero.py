@@ -51,3 +51,20 @@ def test_fingers_that_meet_at_zero_close_towards_it() -> None:
 def test_what_is_stated_counts_for_more() -> None:
     hand = three_fingers(1.0, closing={"bend0": 1})
     assert hand.closing.tolist() == [1, -1, -1]
+
+
+def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
+    """A plate of 10 mm whose fingers bend over it, on a wrist that stands 60 mm ahead of it."""
+    plate = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.01 0.08 0.1"/></geometry></collision>'
+    wrist = '<collision><origin xyz="0 0 -0.03"/><geometry><box size="0.13 0.08 0.06"/></geometry></collision>'
+    finger = '<collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.01 0.08"/></geometry></collision>'
+    thumb = '<collision><origin xyz="0.04 0 0"/><geometry><box size="0.08 0.01 0.01"/></geometry></collision>'
+    fingers = [
+        part
+        for number, y in enumerate((-0.03, 0.0, 0.03))
+        for part in (link(f"f{number}", finger), joint(f"j{number}", "palm", f"f{number}", origin=f"0 {y} 0.1"))
+    ]
+    fingers += [link("thumb", thumb), joint("t", "palm", "thumb", origin="0.005 0 0.01", axis="0 -1 0")]
+    hand = load_hand({"r.urdf": robot(link("palm", plate + wrist), *fingers)}, name="r", digest="0" * 32)
+    assert hand.palm.approach == pytest.approx([1, 0, 0])
+    assert hand.palm.centre[0] == pytest.approx(0.005) and 0.05 < hand.palm.centre[2] < 0.1

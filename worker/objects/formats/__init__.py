@@ -10,9 +10,10 @@ import numpy as np
 
 from service.model.errors import GraspdError, MeshError
 from worker.objects.formats import dae, glb, obj, off, ply, stl
+from worker.objects.formats.mtl import Nearby, nothing_nearby
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
 
-__all__ = ["MAX_FACES", "READERS", "Soup", "read_mesh"]
+__all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 
 READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
     ".stl": stl.read,
@@ -24,8 +25,17 @@ READERS: Final[dict[str, Callable[[bytes], Soup]]] = {
 }
 
 
-def read_mesh(filename: str, data: bytes) -> Soup:
+#: Those that look at files beside the mesh for its colours.
+_WITH_LOOKS: Final[dict[str, Callable[[bytes, Nearby], Soup]]] = {".obj": obj.read, ".dae": dae.read}
+
+
+def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
     """Vertices and triangles of a mesh file; the extension names the format.
+
+    Args:
+        filename: its name.
+        data: its bytes.
+        nearby: gives material libraries and pictures by the names that the file has for them.
 
     Raises:
         MeshError: unknown format, unreadable, no faces, a bad index or a coordinate that is not finite.
@@ -41,7 +51,8 @@ def read_mesh(filename: str, data: bytes) -> Soup:
     try:
         # Wild numbers are found by the check below, not by NumPy's warnings.
         with np.errstate(all="ignore"):
-            return check_soup(reader(data))
+            looks = _WITH_LOOKS.get(suffix)
+            return check_soup(looks(data, nearby) if looks else reader(data))
     except GraspdError as error:
         raise type(error)(f"{filename}: {error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:

@@ -1,4 +1,5 @@
-"""COLLADA: triangles of all meshes of the scene in metres, with the diffuse colours of their materials.
+"""COLLADA: triangles of all meshes of the scene in metres, with the diffuse colours of their materials or the means of
+their pictures.
 
 The file's unit is applied and its up axis is not: so do the viewers of ROS, for which such meshes are made.
 """
@@ -15,6 +16,7 @@ from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
 from service.model.errors import MeshError
+from worker.objects.formats.mtl import Nearby, colour_of, nothing_nearby
 from worker.objects.formats.soup import Soup, check_face_count, fan
 
 _MAX_DEPTH: Final = 32
@@ -24,10 +26,10 @@ Element = ElementTree.Element
 _Primitive = tuple[np.ndarray, np.ndarray, str]
 
 
-def read(data: bytes) -> Soup:
+def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
     """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     root = _parse(data)
-    library = _Library(root)
+    library = _Library(root, nearby)
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colours: list[np.ndarray] = []
@@ -76,7 +78,8 @@ def _unit(root: Element) -> float:
 class _Library:
     """What the parts of a file call each other by."""
 
-    def __init__(self, root: Element) -> None:
+    def __init__(self, root: Element, nearby: Nearby) -> None:
+        self._nearby = nearby
         self._known = {identity: element for element in root.iter() if (identity := element.get("id"))}
         self._primitives: dict[str, list[_Primitive]] = {}
         self._colours: dict[str, np.ndarray] = {}
@@ -130,12 +133,31 @@ class _Library:
             self._colours[material] = self._diffuse(material)
         return self._colours[material]
 
+    def _picture(self, effect: Element, sampler: str) -> str:
+        """The file behind a sampler: it names a surface, and that an image."""
+        name = sampler
+        for _ in range(2):
+            param = next((p for p in effect.iter("newparam") if p.get("sid") == name), None)
+            if param is None:
+                break
+            source = next(param.iter("source"), None)
+            source = next(param.iter("init_from"), None) if source is None else source
+            name = (source.text or "").strip() if source is not None else name
+        image = self.named(name)
+        said = next(image.iter("init_from"), None)
+        inner = said.find("ref") if said is not None else None
+        text = (inner if inner is not None else said).text if said is not None else ""  # type: ignore[union-attr]
+        return (text or "").strip()
+
     def _diffuse(self, material: str) -> np.ndarray:
         unknown = np.full(3, np.nan)
         try:
             instance = self.named(material).find("instance_effect")
             effect = self.named(instance.get("url") if instance is not None else None)
             found = next(effect.iter("diffuse"), None)
+            if found is not None and (texture := found.find("texture")) is not None:
+                picture = colour_of(self._picture(effect, texture.get("texture", "")), self._nearby)
+                return unknown if picture is None else picture
             values = _numbers(found.find("color") if found is not None else None)
         except (MeshError, ValueError):
             return unknown

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
 
 from service.model.transforms import Floats
+from worker.objects.formats.pictures import UNREADABLE, mean_colour
 
-#: Larger textures are not looked at [pixels].
-MAX_PIXELS: Final = 2**24
 _UNKNOWN: Final = np.full(3, np.nan)
 
 
@@ -27,7 +23,7 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
             colour = _of_linear(factor)
         else:
             return _UNKNOWN
-    except (LookupError, ValueError, TypeError, AttributeError, OSError, SyntaxError, Image.DecompressionBombError):
+    except (LookupError, TypeError, AttributeError, *UNREADABLE):
         # A picture says nothing of the shape: what cannot be read of it is left out.
         return _UNKNOWN
     return np.clip(colour, 0, 1) if np.isfinite(colour).all() else _UNKNOWN
@@ -40,13 +36,7 @@ def _mean(document: dict[str, Any], binary: bytes, texture: dict[str, Any]) -> F
     start = int(view.get("byteOffset", 0))
     if start < 0 or view.get("buffer", 0) != 0:
         raise ValueError("the image is not in the file")
-    data = io.BytesIO(binary[start : start + int(view["byteLength"])])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        with Image.open(data, formats=("PNG", "JPEG")) as opened:
-            if opened.width * opened.height > MAX_PIXELS:
-                raise ValueError("the image is too large")
-            return np.asarray(opened.convert("RGB").resize((1, 1), Image.Resampling.BOX), float)[0, 0] / 255
+    return mean_colour(binary[start : start + int(view["byteLength"])])
 
 
 def _to_linear(colour: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: positions, colours of vertices, polygons; textures, normals, groups, materials are passed over."""
+"""Wavefront OBJ: positions, polygons, colours of vertices or materials; normals and groups are passed over."""
 
 from __future__ import annotations
 
@@ -7,18 +7,24 @@ from collections.abc import Iterable
 import numpy as np
 
 from service.model.errors import MeshError
+from service.store.mesh_looks import MAX_NAMES
+from worker.objects.formats import mtl
+from worker.objects.formats.mtl import Nearby, nothing_nearby
 from worker.objects.formats.soup import Soup, check_face_count, fan
 
 _SHADES = 8
 _NO_COLOUR = [b"nan", b"nan", b"nan"]
 
 
-def read(data: bytes) -> Soup:
-    """Polygons cut into fans; negative indices count from the latest vertex. A face has its corners' mean colour."""
+def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
+    """Polygons cut into fans; negative indices count from the latest vertex. A face has its corners' mean colour, or
+    where they have none that of its material."""
     vertices: list[list[bytes]] = []
     shades: list[list[bytes]] = []
     corners: list[int] = []
     counts: list[int] = []
+    libraries: list[bytes] = []
+    used: list[tuple[int, bytes]] = []
     for line in _lines(data):
         if line.startswith(b"v "):
             numbers = line.split(None, 7)[1:7]
@@ -33,9 +39,42 @@ def read(data: bytes) -> Soup:
             counts.append(len(face))
             if len(counts) % 65536 == 0:
                 check_face_count(len(corners) - 2 * len(counts))
+        elif line.startswith(b"usemtl "):
+            used.append((len(counts), line[7:].strip()))
+        elif line.startswith(b"mtllib ") and len(libraries) < MAX_NAMES:
+            libraries.append(line[7:].strip())
     points = np.array(vertices, dtype="S40").astype(float).reshape(-1, 3)
     faces = fan(np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64))
-    return Soup(points, faces, _face_colours(shades, faces))
+    shown = _face_colours(shades, faces)
+    if used and libraries:
+        shown = _material_colours(used, libraries, nearby, np.array(counts, np.int64), shown)
+    return Soup(points, faces, shown)
+
+
+def _material_colours(
+    used: list[tuple[int, bytes]],
+    libraries: list[bytes],
+    nearby: Nearby,
+    counts: np.ndarray,
+    shown: np.ndarray | None,
+) -> np.ndarray | None:
+    """(F, 3) `shown`, and the colour of its material for each face without one; None where none has one."""
+    known: dict[bytes, np.ndarray] = {}
+    for name in libraries:
+        data = nearby(name.decode(errors="replace"))
+        known |= mtl.read(data, nearby) if data is not None else {}
+    if not known:
+        return shown
+    unknown = np.full(3, np.nan)
+    names = dict.fromkeys(name for _, name in used)
+    row = {name: 1 + number for number, name in enumerate(names)}
+    palette = np.array([unknown, *(known.get(name, unknown) for name in names)])
+    starts = np.array([first for first, _ in used])
+    # Polygons before the first `usemtl` have no material; each becomes as many triangles as `fan` makes of it.
+    material = np.array([0, *(row[name] for _, name in used)])
+    of_polygon = material[np.searchsorted(starts, np.arange(len(counts)), side="right")]
+    colours = palette[np.repeat(of_polygon, np.maximum(counts - 2, 0))]
+    return colours if shown is None else np.where(np.isnan(shown), colours, shown)
 
 
 def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | None:

@@ -1,0 +1,60 @@
+"""Material libraries of OBJ: the diffuse colour of each material, or the mean of its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from service.model.transforms import Floats
+from service.store.mesh_looks import MAX_NAMES, reference_of
+from worker.objects.formats.pictures import UNREADABLE, mean_colour
+
+#: Materials that a library may have.
+MAX_MATERIALS: Final = 1024
+Nearby = Callable[[str], bytes | None]
+"""Bytes of a file by the name that a mesh gives it; None: it is not among the hand's files."""
+
+
+def nothing_nearby(reference: str) -> bytes | None:
+    """For a mesh that stands alone."""
+    return None
+
+
+def read(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
+    """(3,) sRGB of each material, 0 .. 1. A picture goes over the number; what cannot be read is left out."""
+    found: dict[bytes, Floats] = {}
+    name: bytes | None = None
+    pictures = 0
+    for line in data.splitlines():
+        key, _, rest = line.strip().partition(b" ")
+        if key == b"newmtl" and len(found) < MAX_MATERIALS:
+            name = rest.strip()
+        elif key == b"Kd" and name is not None:
+            colour = _numbers(rest)
+            if colour is not None:
+                found.setdefault(name, colour)
+        elif key.lower() == b"map_kd" and name is not None and pictures < MAX_NAMES:
+            pictures += 1
+            picture = colour_of(reference_of(rest), nearby)
+            if picture is not None:
+                found[name] = picture
+    return found
+
+
+def colour_of(reference: str, nearby: Nearby) -> Floats | None:
+    """Mean colour of a picture beside the mesh; None where it is not there or cannot be read."""
+    try:
+        data = nearby(reference)
+        return None if data is None else mean_colour(data)
+    except UNREADABLE:
+        return None
+
+
+def _numbers(text: bytes) -> Floats | None:
+    try:
+        values = np.array(text.split()[:3], dtype="S40").astype(float)
+    except ValueError:
+        return None
+    return np.clip(values, 0, 1) if len(values) == 3 and np.isfinite(values).all() else None
