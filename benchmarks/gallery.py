@@ -94,7 +94,9 @@ HANDS = (
     _of(_MODELS, "pr2", "PR2", "pr2_gripper.xml",
         "in `asset.json` `couplings`, as one motor moves all four joints, and `stiffness` 20 N m/rad instead of 1,000, "
         "with which it throws the object out", couplings=_LINKAGE_PR2, stiffness=20.0),
-    _of(_SUITE, "jaco", "Kinova Jaco, three fingers", "jaco_three_finger_gripper.xml"),
+    _of(_SUITE, "jaco", "Kinova Jaco, three fingers", "jaco_three_finger_gripper.xml",
+        "in `asset.json` `stiffness` 5 N m/rad instead of 20, at which its 0.3 N m are reached within 1 mm of a "
+        "fingertip's way", stiffness=5.0),
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
     _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml"),
     _of(_DATA, "unitree-dex3", "Unitree Dex3 of a G1", "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",

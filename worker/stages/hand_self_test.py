@@ -159,8 +159,8 @@ def self_test(
     every = [value for values in held.values() for value in values]
     by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
     left = tuple(name for name in objects if name not in held)
-    share = float(np.mean(lost)) if lost else 0.0
-    return SelfTest(float(np.mean(every)), len(every), width, by_object, best, left, share, _give(hand))
+    slack = float(np.mean(lost)) if lost else 0.0
+    return SelfTest(float(np.mean(every)), len(every), width, by_object, best, left, slack, _give(hand))
 
 
 def _lost(batch: Certified) -> NDArray[np.bool_]:

@@ -146,7 +146,7 @@ class _Library:
         image = self.named(name)
         said = next(image.iter("init_from"), None)
         inner = said.find("ref") if said is not None else None
-        text = (inner if inner is not None else said).text if said is not None else ""  # type: ignore[union-attr]
+        text = (inner if inner is not None else said).text if said is not None else ""
         return (text or "").strip()
 
     def _diffuse(self, material: str) -> np.ndarray:
