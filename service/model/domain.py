@@ -193,7 +193,9 @@ class JobOptions(Model):
     )
     budget: float = Field(4.0, ge=1, le=100, description="grasps tried for each valid grasp wanted, at most")
     referee: Literal["letter", "certificate", "screen", "none"] = Field(
-        "certificate", description="level at which MuJoCo judges the grasps; none: nobody, grasps are sound at best"
+        "certificate",
+        description="level at which MuJoCo judges the grasps (screen: on a GPU, MuJoCo Warp gives the clear verdicts); "
+        "none: nobody, grasps are sound at best",
     )
     audits: int = Field(
         AUDITS, ge=0, le=10_000,

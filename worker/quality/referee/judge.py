@@ -116,8 +116,10 @@ def judge(
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
-    bench = _Bench(hand, obj, pieces, level, hard, run.cores)
     first_judge = first_terms(hand, level, run)
+    # What the first judge leaves over is near a limit: coarse physics would ask the certificate as well.
+    of_the_cpu: Level = "certificate" if first_judge else level
+    bench = _Bench(hand, obj, pieces, of_the_cpu, hard, run.cores)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, first_judge=first_judge)
     first = screened(bench.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
     trials = dict(first.stands)
@@ -128,7 +130,7 @@ def judge(
         bench.judge(grasps, list(first.stands), trials, run)
     ordered = [trials[row] for row in range(len(grasps))]
     found = _verdicts(ordered, bench, terms, postures_key(terms, grasps), time.perf_counter() - began)
-    return replace(found, audited=len(first.audited), contradicted=contradicted)
+    return replace(found, level=level, audited=len(first.audited), contradicted=contradicted)
 
 
 class _Bench:

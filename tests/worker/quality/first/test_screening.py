@@ -62,11 +62,14 @@ def test_at_level_screen_clear_verdicts_stand_both_ways_and_the_band_is_the_cpus
     first = verdicts(ON, "screen")
     for held in (0, 1):
         assert (first.judged_by[first.success == held] == JudgedBy.MUJOCO_WARP).any()
-    np.testing.assert_array_equal(first.success, verdicts(Run()).success)
+    certificate = verdicts(Run())
+    assert first.level == "screen"
+    np.testing.assert_array_equal(first.success, certificate.success)
     monkeypatch.setattr(trials, "BAND", (0.0, 1e9))
     band = verdicts(ON, "screen")
     inside = band.outcome[:, 0] == 2
     assert (band.judged_by[~inside] == JudgedBy.MUJOCO).all()
+    np.testing.assert_array_equal(band.margin[~inside], certificate.margin[~inside])
 
 
 def test_the_letter_knows_no_first_judge() -> None:
