@@ -59,7 +59,7 @@ class GraspFiles:
             scene=scene(file, row),
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
-            judged_by=_judged_by(file, row),
+            judged_by=judged_by(file, row),
             audit=_verdict(file, "quality/audit", row),
             friction=_number(file.attributes.get("mu")),
         )
@@ -77,7 +77,8 @@ def _posture(file: Shard, name: str, row: int) -> Posture:
     return Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
 
 
-def _judged_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
+def judged_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
+    """Whose verdict a grasp of a base shard has; None: nobody judged it."""
     if "quality/success" not in file.arrays:
         return None
     judged = file.arrays.get("quality/judged_by")

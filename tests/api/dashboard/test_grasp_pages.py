@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from api.catalog.grasp_files import OUTCOMES
+from api.catalog.grasp_files import OUTCOMES, judged_by
 from service.pipeline.backends import Parts
-from service.store.shards import read_shard
+from service.store.shards import Shard, read_shard
 from tests.api.factories import JOINTS, add_job, finish_all
-from worker.quality.referee.protocol import Outcome
+from worker.quality.referee.protocol import JudgedBy, Outcome
 
 
 def test_a_grasp_is_the_row_of_its_shard(http: TestClient, parts: Parts) -> None:
@@ -45,6 +45,13 @@ def test_a_grasp_whose_file_is_gone_is_a_clear_error(http: TestClient, parts: Pa
 
 def test_pushes_are_called_what_the_referee_calls_them() -> None:
     assert {int(outcome): outcome.name.lower().replace("_", " ") for outcome in Outcome} == OUTCOMES
+
+
+def test_a_verdict_says_whose_it_is() -> None:
+    success, judged = np.array([1, 0], np.int8), np.array([JudgedBy.MUJOCO, JudgedBy.MUJOCO_WARP], np.uint8)
+    files = [{"quality/success": success, "quality/judged_by": judged}, {"quality/success": success}, {}]
+    told = [[judged_by(Shard("base", {}, arrays), row) for row in (0, 1)] for arrays in files]
+    assert told == [["mujoco", "mujoco_warp"], ["mujoco", "mujoco"], [None, None]]
 
 
 def test_the_page_of_a_grasp_tells_quality_and_where_it_is_kept(http: TestClient, parts: Parts) -> None:
