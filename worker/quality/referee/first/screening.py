@@ -30,10 +30,10 @@ from worker.run import ALONE, Run
 
 log = logging.getLogger(__name__)
 
-#: Worlds of a pool at most.
-WORLDS: Final = {"cuda": 1024, "cpu": 32}
+#: Worlds of a pool, for few grasps and for many: pools of any size would be made anew for nearly every launch.
+WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
 #: Pools that are kept, each with its model, arrays and graph: those of the pairs that were judged last.
-_KEPT_POOLS: Final = 2
+_KEPT_POOLS: Final = 4
 #: Share of audited verdicts that the CPU may contradict, beyond one, before the first judge is not believed.
 _MOST_CONTRADICTED: Final = 0.05
 
@@ -115,7 +115,8 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Run
 
 def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
     """Worlds for so many grasps of a scene. The last ones are kept: a graph takes longer to make than to use once."""
-    size = min(WORLDS[device.partition(":")[0]], 1 << max(0, count - 1).bit_length())
+    few, many = WORLDS[device.partition(":")[0]]
+    size = few if count <= few else many
     key = (terms, device, size)
     if key not in _pools:
         while len(_pools) >= _KEPT_POOLS:
