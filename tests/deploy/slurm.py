@@ -51,6 +51,9 @@ class Element:
     """One element of an array, or a job without one."""
 
     id: int
+    """Its own; that of one element is the number of its array as well."""
+    name: str
+    """As users write it: `array_element`, or the number of a job without an array."""
     script: Path
     environment: Mapping[str, str]
     log: Path
@@ -104,8 +107,8 @@ class FakeSlurm:
         made = []
         for number in range(array or 1):
             of_array = {"SLURM_ARRAY_JOB_ID": str(first), "SLURM_ARRAY_TASK_ID": str(number)} if array else {}
-            log = self.folder / f"{first}_{number}.log"
-            made.append(Element(first + number, script, {**base, **of_array}, log))
+            name = f"{first}_{number}" if array else str(first)
+            made.append(Element(first + number, name, script, {**base, **of_array}, self.folder / f"{name}.log"))
             made[-1].start()
         self.elements += made
         return made
@@ -125,15 +128,16 @@ class FakeSlurm:
         self._again(element)
 
     def reach_time_limit(self, element: Element, *, notice_s: float) -> bool:
-        """SIGUSR1 to the batch shell, SIGKILL after the notice; whether the script asked to be queued again."""
+        """SIGUSR1 to the batch shell, SIGKILL after the notice; whether it asked to be queued again, it alone."""
         element.signal(signal.SIGUSR1, everybody=False)
         element.wait(notice_s)
-        asked = self.folder / "requeued" / str(element.id)
-        if not asked.exists():
-            return False
-        asked.unlink()
-        self._again(element)
-        return True
+        asked = {file.name for file in (self.folder / "requeued").iterdir()}
+        for name in asked:
+            (self.folder / "requeued" / name).unlink()
+        if asked == {element.name}:
+            self._again(element)
+        # The number of an array means all its elements.
+        return asked == {element.name}
 
     def logs(self) -> str:
         return "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in sorted(self.folder.glob("*.log")))

@@ -69,8 +69,8 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
         first, second, third = slurm.sbatch(SLURM / "worker.sbatch", slow, array=3)
         busy = lambda: len(system.parts.index.jobs.tasks(job=job, state=State.RUNNING).items)  # noqa: E731
         system.until(lambda: busy() == 3, READY_S, f"three busy workers\n{slurm.logs()}")
-        slurm.preempt(first, grace_s=30)
-        assert slurm.reach_time_limit(second, notice_s=30), slurm.logs()
+        slurm.preempt(second, grace_s=30)
+        assert slurm.reach_time_limit(first, notice_s=30), slurm.logs()
         slurm.lose_node(third)
         (done,) = system.finish(job, seconds=120)
         assert done.state is State.SUCCEEDED
