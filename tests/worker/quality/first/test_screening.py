@@ -120,6 +120,19 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
     assert "the CPU judges all" in caplog.text
 
 
+def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> Any:
+        raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
+
+    monkeypatch.setattr(screening, "WorldPool", full)
+    with caplog.at_level(logging.WARNING):
+        found = verdicts(ON)
+    assert (found.judged_by == JudgedBy.MUJOCO).all()
+    assert "no memory for the first judge" in caplog.text
+
+
 def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "AUDIT_ONE_IN", 2)
     grasps = every_kind()

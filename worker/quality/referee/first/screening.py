@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.engines.cuda_errors import check_device
+from worker.engines.cuda_errors import check_device, is_out_of_memory
 from worker.engines.mujoco_warp import has_mujoco_warp, mujoco_warp_version
 from worker.grasps import GraspSet, joined
 from worker.hands.jaws import jaws_of
@@ -98,11 +98,17 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Run
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
         return Screened({}, {})
-    if run.meeting is None:
-        found = work([postures])[0]
-    else:
-        key = ("first judge", terms, run.device)
-        found = run.meeting.ask(key, postures, work, size=len(grasps), cancelled=run.cancelled)
+    try:
+        if run.meeting is None:
+            found = work([postures])[0]
+        else:
+            key = ("first judge", terms, run.device)
+            found = run.meeting.ask(key, postures, work, size=len(grasps), cancelled=run.cancelled)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        log.warning("%s has no memory for the first judge: the CPU judges %d grasps", run.device, len(grasps))
+        return Screened({}, {})
     clear = found.clearly_failed | (found.clearly_held if level == "screen" else False)
     audited = clear & _drawn(grasps)
     if found.overflow.any():
