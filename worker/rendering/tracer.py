@@ -71,8 +71,10 @@ class Tracer:
         self._state = self._model.state()
         self._sensor = SensorCamera(self._model, load_textures=False)
         self._config = SensorCamera.RenderConfig(
-            enable_shadows=True, enable_ambient_lighting=False, enable_particles=False, max_distance=100.0
-        )
+            enable_shadows=True, enable_ambient_lighting=False, enable_particles=False, max_distance=100.0,
+            # One picture after the other: neighbouring rays meet the same part of one tree.
+            render_order=SensorCamera.RenderOrder.VIEW_PRIORITY,
+        )  # fmt: skip
         self._clear = SensorCamera.ClearData(clear_depth=float("inf"), clear_shape_index=NO_SHAPE)
         self._traced = False
         self._poses = np.zeros((self.worlds, len(self.solids), 7))
