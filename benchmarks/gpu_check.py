@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import pkgutil
 import re
 import subprocess
 import sys
@@ -25,7 +24,8 @@ from pathlib import Path
 
 import warp as wp
 
-ARCHITECTURES = (80, 90, 100)
+from worker.engines.baked import ARCHITECTURES, modules
+
 STACK_BYTES = 512
 HOT_REGISTERS = 128
 #: What a kernel takes where fewer registers would spill: the 6 x 6 system and its factor stay in registers.
@@ -61,17 +61,8 @@ class Kernel:
         return found
 
 
-def modules() -> list[str]:
-    """Names of all modules of Warp kernels."""
-    worker = import_module("worker")
-    names = (info.name for info in pkgutil.walk_packages(worker.__path__, "worker.") if not info.ispkg)
-    return [name for name in names if ".kernels." in name or name.endswith(".kernels")]
-
-
-def ptx_of(name: str, arch: int, folder: Path) -> Path | None:
-    """The PTX of a module; None if it has functions only."""
-    if not any(isinstance(value, wp.Kernel) for value in vars(import_module(name)).values()):
-        return None
+def ptx_of(name: str, arch: int, folder: Path) -> Path:
+    """The PTX of a module."""
     made = wp.compile_aot_module(import_module(name), arch=arch, module_dir=folder, use_ptx=True)
     return next(path for path in (made or sorted(folder.glob("*.ptx"))) if str(path).endswith(".ptx"))
 
@@ -80,8 +71,6 @@ def kernels(name: str, arch: int, assembler: Path) -> list[Kernel]:
     """What the assembler says of a module's kernels."""
     with tempfile.TemporaryDirectory() as folder:
         path = ptx_of(name, arch, Path(folder))
-        if path is None:
-            return []
         text = path.read_bytes().rstrip(b"\0")  # Warp ends it as C does; the assembler takes that for a character
         path.write_bytes(text)
         done = subprocess.run(

@@ -44,6 +44,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("api", "api.server_command", "Parts of the service", "The HTTP API and the dashboard."),
     ("keeper", "service.run.commands", "Parts of the service", "Reaper, delayed retries and indexer."),
     ("worker", "worker.commands.worker", "Parts of the service", "One worker on one device."),
+    ("kernels", "worker.commands.kernels", "Parts of the service", "Compile all kernels ahead of time."),
     ("index", "service.run.commands", "Parts of the service", "Rebuild the index from the store."),
     ("store", "service.run.store_commands", "Parts of the service", "Check the store, and mend it."),
     ("keys", "api.client.commands", "Parts of the service", "Make, list and revoke API keys."),

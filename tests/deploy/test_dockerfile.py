@@ -119,12 +119,21 @@ def test_the_engine_is_not_in_the_image_of_the_front_door() -> None:
 @pytest.mark.parametrize("room", ["api", "worker"])
 def test_dependencies_and_code_are_layers_of_their_own(room: str) -> None:
     assert [keyword for keyword, rest in stages()[f"build-{room}"] if keyword == "COPY"] == [], "no code among them"
-    image = stages()["api" if room == "api" else "worker-cpu"]
+    image = stages()[room]
     layers = [rest for keyword, rest in image if keyword == "COPY"]
     assert layers == [f"--from=build-{room} /opt/graspd /opt/graspd", f"--from=code-{room} /code /opt/graspd"]
     version = re.search(r"python:(\d+\.\d+)", DOCKERFILE.read_text())
     assert version is not None
     assert dict(inherited(f"code-{room}"))["ENV"] == f"CODE=/code/lib/python{version[1]}/site-packages"
+
+
+def test_workers_bring_kernels_that_are_compiled_already() -> None:
+    place = dict(rest.split("=", 1) for keyword, rest in inherited("worker-cuda") if keyword == "ENV" and "=" in rest)
+    for image, made in (("worker-cpu", "kernels-cpu"), ("worker-cuda", "kernels-cuda")):
+        (copied_from,) = [rest for keyword, rest in stages()[image] if keyword == "COPY"]
+        assert copied_from == f"--from={made} {place['GRASPD_KERNELS']} {place['GRASPD_KERNELS']}"
+        (command,) = [rest for keyword, rest in stages()[made] if keyword == "RUN"]
+        assert command.startswith(f"graspd kernels {place['GRASPD_KERNELS']} ")
 
 
 def test_no_image_asks_a_hub_for_how_to_build_it() -> None:

@@ -6,10 +6,12 @@ import os
 import sys
 import tempfile
 import threading
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
+from worker.engines.baked import lay_out
 from worker.engines.kernel_cache import kernel_cache
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
@@ -59,4 +61,5 @@ def start() -> None:
                 if _HARMLESS not in line:
                     os.write(2, line)
         _default_of_each_thread()
+        lay_out(Path(wp.config.kernel_cache_dir))
         _started = True
