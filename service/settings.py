@@ -81,6 +81,10 @@ class Settings(BaseSettings):
         1.0, ge=0, description="how fast the keeper reads through the store for damage [MiB/s]; 0: never"
     )
     stop_grace_s: float = Field(10.0, gt=0, description="time a process has to stop before it is killed [s]")
+    kernels: Path | None = Field(
+        None,
+        description="folder of kernels that `graspd kernels` compiled ahead; what Warp's cache lacks is copied from it",
+    )
     heartbeat_file: Path | None = Field(
         None, description="file that a keeper or worker touches while it lives, for health checks; unset: none"
     )
