@@ -7,6 +7,7 @@ kernels and meshes anew each time.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import secrets
 import signal
@@ -103,6 +104,8 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self.gave_up = False
         """Whether it ended because it is unfit for tasks."""
         self._stop_requested: bool = False
+        self.found_none = False
+        """Whether it ended because no task waits."""
         self.makes_room = False
         """Whether it ended so that its supervisor starts a fresh one."""
         self._contexts: list[TaskContext] = []
@@ -240,6 +243,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 told = True
                 time.sleep(_REFUSED_PAUSE_S)
 
+    def dequeue_job_and_maintain_ttl(self, *args: Any, **options: Any) -> Any:
+        """The next task, or None where none waits."""
+        found = super().dequeue_job_and_maintain_ttl(*args, **options)
+        self.found_none = found is None
+        return found
+
     def reorder_queues(self, reference_queue: Any) -> None:
         """RQ calls this after each task it took: which lane comes first for the next one."""
         self._taken += 1
@@ -345,7 +354,9 @@ def run_worker(
         AllowedJob.function = None
         heart.stop()
         queue.close()
-    return not worker.gave_up and (not does_all or worker.was_told_to_stop or worker.makes_room)
+    # RQ's loop ends in the same way where an error that nobody foresaw broke it off.
+    is_done = not does_all and (worker.found_none or surroundings.tasks_done >= (max_tasks or math.inf))
+    return not worker.gave_up and (is_done or worker.was_told_to_stop or worker.makes_room)
 
 
 def _admitted(fitness: Fitness, heart: Heartbeat, stages: Collection[Stage], *, limit_s: float, patient: bool) -> bool:

@@ -15,6 +15,7 @@ from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from tests.fakes import fake_synthesize, message_for
 from worker.process.main import run_worker
+from worker.process.surroundings import Surroundings
 from worker.stages.context import TaskContext
 
 
@@ -33,6 +34,26 @@ def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
     assert [record for record in caplog.records if "was taken from this worker" in record.getMessage()]
     assert not rq_queue.connection.keys("rq:job:*"), "nothing is left of it"
+
+
+def test_a_worker_that_an_error_broke_off_does_not_say_that_none_waits(
+    rq_queue: RqQueue, redis_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Batch scripts start it again then; where none waits any more, they end."""
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")  # type: ignore[arg-type]
+    table = {Stage.SYNTHESIZE: fake_synthesize}
+    assert run_worker(settings, table=table, burst=True), "none waits"
+
+    def broken(*_: object) -> None:
+        raise AttributeError("of another version")
+
+    rq_queue.enqueue([message_for()], Lane.BULK)
+    with monkeypatch.context() as patch:
+        patch.setattr(Surroundings, "context", broken)
+        assert not run_worker(settings, table=table, burst=True)
+    rq_queue.connection.flushdb()
+    rq_queue.enqueue([message_for()], Lane.BULK)
+    assert run_worker(settings, table=table, max_tasks=1), "as many as were wanted"
 
 
 def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> None:
