@@ -51,7 +51,8 @@ class Meeting:
         self._most, self._clock = most, clock
         self._changed = threading.Condition()
         self._seats: list[_Seat] = []
-        self._wait_s = FIRST_WAIT_S
+        self._took_s: dict[Hashable, float] = {}
+        """How long the last work of each kind took."""
         self._closed = False
         self.served: list[int] = []
         """How many were served at once, each time."""
@@ -112,7 +113,7 @@ class Meeting:
         while (group := self._next()) is not None:
             began = self._clock()
             self._do(group)
-            self._wait_s = self._clock() - began
+            self._took_s[group[0].key] = self._clock() - began
 
     def _next(self) -> list[_Seat] | None:
         """Those who are served next, as soon as it is time; None: the meeting is over."""
@@ -128,20 +129,31 @@ class Meeting:
         return None
 
     def _due(self) -> tuple[list[_Seat], float | None]:
-        """Who is served, or else for how long to wait."""
-        if not self._seats:
-            return [], None
-        first, group, size = self._seats[0], list[_Seat](), 0
+        """Who is served, or else for how long to wait: of what is asked for the oldest that fills a launch, or that has
+        waited long enough, or whatever is the oldest where nobody else can come."""
+        waiting: dict[Hashable, list[_Seat]] = {}
         for seat in self._seats:
-            if seat.key == first.key and (not group or size + seat.size <= self._most):
+            waiting.setdefault(seat.key, []).append(seat)
+        if not waiting:
+            return [], None
+        groups = [self._group(seats) for seats in waiting.values()]
+        if len(self._seats) >= self.members:
+            return groups[0], None
+        left = [self._took_s.get(group[0].key, FIRST_WAIT_S) + group[0].since - self._clock() for group in groups]
+        for group, seats, left_s in zip(groups, waiting.values(), left, strict=True):
+            # Rounds are not all of one size: what is left of a launch that the next one would overfill stays empty.
+            if sum(seat.size for seat in seats) >= self._most or left_s <= 0:
+                return group, None
+        return [], min(left)
+
+    def _group(self, seats: Sequence[_Seat]) -> list[_Seat]:
+        """Of those who ask for the same as many as one launch takes, the oldest among them."""
+        group, size = list[_Seat](), 0
+        for seat in seats:
+            if not group or size + seat.size <= self._most:
                 group.append(seat)
                 size += seat.size
-        left_s = first.since + self._wait_s - self._clock()
-        # Rounds are not all of one size: what is left of a launch that the next one would overfill stays empty.
-        full = size >= self._most or len(group) < sum(seat.key == first.key for seat in self._seats)
-        if full or len(self._seats) >= self.members or left_s <= 0:
-            return group, None
-        return [], left_s
+        return group
 
     def _do(self, group: list[_Seat]) -> None:
         try:

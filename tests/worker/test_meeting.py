@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from typing import Any
 
 import pytest
@@ -84,18 +84,10 @@ def test_who_leaves_is_not_waited_for() -> None:
 
 
 def test_nobody_waits_longer_than_a_launch_takes() -> None:
-    now = [0.0]
-
-    def slow(items: Sequence[Any]) -> list[Any]:
-        now[0] += 0.02
-        return doubled(items)
-
-    with Meeting(3, 2, clock=lambda: now[0]) as meeting:
-        asked(meeting, [0, 2], slow)
-        with ThreadPoolExecutor(1) as pool:
-            alone: Future[Any] = pool.submit(meeting.ask, "same", 8, slow, size=1, cancelled=lambda: False)
-            now[0] += 0.03
-            assert alone.result(timeout=20) == 16
+    with Meeting(3, 2) as meeting:
+        asked(meeting, [0, 2])  # full: nobody waits, and now a launch is known to take no time
+        assert asked(meeting, [8]) == [16]
+    assert meeting.served == [2, 1]
 
 
 def test_what_differs_is_not_done_together() -> None:
@@ -108,8 +100,34 @@ def test_what_differs_is_not_done_together() -> None:
     with Meeting(4, 100) as meeting, ThreadPoolExecutor(2) as pool:
         one = pool.submit(asked, meeting, [0, 2], noting, "a")
         two = pool.submit(asked, meeting, [4, 6], noting, "b")
+        for _ in range(2):  # one key is served where all four wait, the other when those who were served have left
+            wait((one, two), return_when=FIRST_COMPLETED)
+            meeting.leave()
+            meeting.leave()
         assert (one.result(), two.result()) == ([0, 4], [8, 12])
     assert sorted(seen) == [[0, 2], [4, 6]]
+
+
+def test_what_fills_a_launch_goes_before_what_was_asked_for_earlier() -> None:
+    order: list[str] = []
+
+    def noting(name: str) -> Callable[[Sequence[Any]], list[Any]]:
+        def work(items: Sequence[Any]) -> list[Any]:
+            order.append(name)
+            return list(items)
+
+        return work
+
+    with Meeting(4, 2) as meeting, ThreadPoolExecutor(1) as pool:
+        early = pool.submit(meeting.ask, "early", 1, noting("early"), size=1, cancelled=lambda: False)
+        while not meeting._seats:
+            threading.Event().wait(0.005)
+        asked(meeting, [2, 4], noting("full"), "full")
+        meeting.leave()
+        meeting.leave()
+        meeting.leave()
+        early.result(timeout=20)
+    assert order == ["full", "early"]
 
 
 def test_who_is_cancelled_waits_no_longer_and_is_not_served() -> None:
