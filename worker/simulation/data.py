@@ -37,14 +37,14 @@ class Contacts:
     def __init__(self, capacity: int, points: int) -> None:
         shape = (capacity, points)
         self.count = wp.zeros(capacity, dtype=wp.int32)
-        self.body = wp.zeros(shape, dtype=wp.int32)
-        self.point = wp.zeros(shape, dtype=wp.vec3)
-        self.normal = wp.zeros(shape, dtype=wp.vec3)
-        self.distance = wp.zeros(shape, dtype=wp.float32)
-        self.weight = wp.zeros(shape, dtype=wp.float32)
-        self.gradient = wp.zeros(shape, dtype=wp.float32)
+        self.body = wp.empty(shape, dtype=wp.int32)
+        self.point = wp.empty(shape, dtype=wp.vec3)
+        self.normal = wp.empty(shape, dtype=wp.vec3)
+        self.distance = wp.empty(shape, dtype=wp.float32)
+        self.weight = wp.empty(shape, dtype=wp.float32)
+        self.gradient = wp.empty(shape, dtype=wp.float32)
         self.near_count = wp.zeros(capacity, dtype=wp.int32)
-        self.near = wp.zeros(shape, dtype=wp.int32)
+        self.near = wp.empty(shape, dtype=wp.int32)
         self.mark = wp.zeros((0, 0), dtype=wp.int32)
 
 

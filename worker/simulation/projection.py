@@ -60,11 +60,11 @@ def _residuals(capacity: int) -> Any:
     out = kernels.Residuals()
     out.count = wp.zeros(capacity, dtype=wp.int32)
     for name in ("body", "other"):
-        setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.int32))
+        setattr(out, name, wp.empty((capacity, CAPACITY), dtype=wp.int32))
     for name in ("point", "direction"):
-        setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.vec3))
+        setattr(out, name, wp.empty((capacity, CAPACITY), dtype=wp.vec3))
     for name in ("value", "weight"):
-        setattr(out, name, wp.zeros((capacity, CAPACITY), dtype=wp.float32))
+        setattr(out, name, wp.empty((capacity, CAPACITY), dtype=wp.float32))
     return out
 
 

@@ -49,6 +49,12 @@ def test_the_rate_is_that_of_all_batches_of_a_launch(result: tuple[dict[str, obj
         assert run["ms_per_iteration"] == pytest.approx(1e3 * run["seconds"] / run["iterations"], rel=0.01)
 
 
+def test_the_host_takes_some_of_the_time_of_a_grasp_and_not_all(result: tuple[dict[str, object], Path]) -> None:
+    host, runs = result[0]["host_ms_per_grasp"], result[0]["runs"]
+    assert isinstance(runs, list) and isinstance(host, float)
+    assert 0.0 < host < max(1e3 * run["seconds"] / run["grasps"] for run in runs)
+
+
 def test_json_table_and_plot_are_written(result: tuple[dict[str, object], Path]) -> None:
     found, out = result
     assert json.loads((out / "bench.json").read_text())["runs"] == found["runs"]

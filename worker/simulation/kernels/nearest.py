@@ -122,6 +122,24 @@ def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
     return out
 
 
+@wp.func
+def face_key(face: Face, centre: wp.vec3):
+    """Distance of a face from a cell's centre."""
+    at = on_face(face, centre)
+    return wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre)
+
+
+@wp.func
+def cell_of(cell: wp.int32, shape: wp.vec3i):
+    """A cell's place along the axes from its index."""
+    return wp.vec3i(cell // (shape[1] * shape[2]), (cell // shape[2]) % shape[1], cell % shape[2])
+
+
+@wp.func
+def cell_centre(place: wp.vec3i, low: wp.vec3, size: wp.float32):
+    return low + size * wp.vec3(float(place[0]) + 0.5, float(place[1]) + 0.5, float(place[2]) + 0.5)
+
+
 @wp.kernel
 def count_faces(
     # In:
@@ -138,23 +156,19 @@ def count_faces(
     """Faces to list for each cell that has a corner with a distance of at most `within`, and how far they may be from
     its centre. Launch over the cells, in the order of their index."""
     cell = wp.tid()
-    ny = field_in.shape[1] - 1
-    nz = field_in.shape[2] - 1
-    i = cell // (ny * nz)
-    j = (cell // nz) % ny
-    k = cell % nz
+    place = cell_of(cell, wp.vec3i(field_in.shape[0] - 1, field_in.shape[1] - 1, field_in.shape[2] - 1))
     least = float(1.0e3)
     low = float(1.0e3)
     high = float(-1.0e3)
     for corner in range(8):
-        value = field_in[i + corner // 4, j + (corner // 2) % 2, k + corner % 2]
+        value = field_in[place[0] + corner // 4, place[1] + (corner // 2) % 2, place[2] + corner % 2]
         least = wp.min(least, wp.abs(value))
         low = wp.min(low, value)
         high = wp.max(high, value)
     count_out[cell] = 0
     if least > within_in and low * high > 0.0:
         return
-    centre = low_in + size_in * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
+    centre = cell_centre(place, low_in, size_in)
     query = wp.mesh_query_point_no_sign(mesh_in, centre, 1.0e3)
     if not query.result:
         return
@@ -166,9 +180,7 @@ def count_faces(
     index = wp.int32(0)
     count = wp.int32(0)
     while wp.mesh_query_aabb_next(near, index):
-        face = faces_in.face[index]
-        at = on_face(face, centre)
-        if wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre) <= radius:
+        if face_key(faces_in.face[index], centre) <= radius:
             count += 1
     count_out[cell] = count
 
@@ -192,19 +204,14 @@ def list_faces(
     start = first_in[cell]
     if first_in[cell + 1] == start:
         return
-    i = cell // (shape_in[1] * shape_in[2])
-    j = (cell // shape_in[2]) % shape_in[1]
-    k = cell % shape_in[2]
-    centre = low_in + size_in * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
+    centre = cell_centre(cell_of(cell, shape_in), low_in, size_in)
     radius = radius_in[cell]
     extent = wp.vec3(radius, radius, radius)
     near = wp.mesh_query_aabb(mesh_in, centre - extent, centre + extent)
     index = wp.int32(0)
     count = wp.int32(0)
     while wp.mesh_query_aabb_next(near, index):
-        face = faces_in.face[index]
-        at = on_face(face, centre)
-        key = wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre)
+        key = face_key(faces_in.face[index], centre)
         if key <= radius and start + count < first_in[cell + 1]:
             place = start + count
             # Equal keys stand in the order of their faces: what is nearest does not depend on the tree.

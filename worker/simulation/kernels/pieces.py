@@ -13,6 +13,8 @@ CYLINDER = wp.constant(2)
 CAPSULE = wp.constant(3)
 HULL = wp.constant(4)
 
+vec6i = wp.types.vector(length=6, dtype=wp.int32)
+
 
 @wp.struct
 class Pieces:
@@ -146,6 +148,27 @@ def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.f
 
 
 @wp.func
+def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
+    """The cells that a box of these half extents about p meets: first and last along x, y, z; first > last: none."""
+    low = samples.low
+    size = samples.size
+    shape = samples.shape
+    xs = cell_range(p[0] - extent[0], p[0] + extent[0], low[0], size, shape[0])
+    ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
+    zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
+    if xs[0] > xs[1] or ys[0] > ys[1] or zs[0] > zs[1]:
+        return vec6i(0, -1, 0, -1, 0, -1)
+    return vec6i(xs[0], xs[1], ys[0], ys[1], zs[0], zs[1])
+
+
+@wp.func
+def samples_of(samples: Samples, i: wp.int32, j: wp.int32, first: wp.int32, last: wp.int32):
+    """The first sample in a run of cells along z, and the first behind it."""
+    row = (i * samples.shape[1] + j) * samples.shape[2]
+    return wp.vec2i(samples.first[row + first], samples.first[row + last + 1])
+
+
+@wp.func
 def clip_depth(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
     """`piece_distance`, or some distance that is larger than `above` where the distance is."""
     if pieces.kind[piece] != HULL:
@@ -203,33 +226,27 @@ def object_in_pieces(
     force = wp.vec3(0.0)
     torque = wp.vec3(0.0)
     deepest = float(0.0)
-    low = samples_in.low
-    size = samples_in.size
-    shape = samples_in.shape
-    xs = cell_range(p[0] - extent[0], p[0] + extent[0], low[0], size, shape[0])
-    ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
-    zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
-    if xs[0] <= xs[1] and ys[0] <= ys[1] and zs[0] <= zs[1]:
-        for i in range(xs[0], xs[1] + 1):
-            for j in range(ys[0], ys[1] + 1):
-                row = (i * shape[1] + j) * shape[2]
-                for index in range(samples_in.first[row + zs[0]], samples_in.first[row + zs[1] + 1]):
-                    x = samples_in.position[index]
-                    offset = x - p
-                    local = wp.vec3(
-                        turn[0, 0] * offset[0] + turn[1, 0] * offset[1] + turn[2, 0] * offset[2],
-                        turn[0, 1] * offset[0] + turn[1, 1] * offset[1] + turn[2, 1] * offset[2],
-                        turn[0, 2] * offset[0] + turn[1, 2] * offset[1] + turn[2, 2] * offset[2],
-                    )
-                    if in_box(local, half):
-                        nd = clip_depth(pieces_in, piece, local, 0.0)
-                        depth = -nd[3]
-                        if depth > 0.0:
-                            n = turn * wp.vec3(nd[0], nd[1], nd[2])
-                            f = (weight * depth) * n
-                            force += f
-                            torque += wp.cross(x, f)
-                            deepest = wp.max(deepest, depth)
+    cells = cells_around(samples_in, p, extent)
+    for i in range(cells[0], cells[1] + 1):
+        for j in range(cells[2], cells[3] + 1):
+            mine = samples_of(samples_in, i, j, cells[4], cells[5])
+            for index in range(mine[0], mine[1]):
+                x = samples_in.position[index]
+                offset = x - p
+                local = wp.vec3(
+                    turn[0, 0] * offset[0] + turn[1, 0] * offset[1] + turn[2, 0] * offset[2],
+                    turn[0, 1] * offset[0] + turn[1, 1] * offset[1] + turn[2, 1] * offset[2],
+                    turn[0, 2] * offset[0] + turn[1, 2] * offset[1] + turn[2, 2] * offset[2],
+                )
+                if in_box(local, half):
+                    nd = clip_depth(pieces_in, piece, local, 0.0)
+                    depth = -nd[3]
+                    if depth > 0.0:
+                        n = turn * wp.vec3(nd[0], nd[1], nd[2])
+                        f = (weight * depth) * n
+                        force += f
+                        torque += wp.cross(x, f)
+                        deepest = wp.max(deepest, depth)
     if deepest > 0.0:
         add_wrench(wrench_inout, b, body, force, torque)
         wp.atomic_max(depth_inout, b, deepest)

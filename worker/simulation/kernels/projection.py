@@ -12,12 +12,13 @@ from worker.simulation.kernels.pieces import (
     BodyPoints,
     Pieces,
     Samples,
-    cell_range,
+    cells_around,
     clip_depth,
     in_box,
     may_touch,
     piece_centre,
     piece_rotation,
+    samples_of,
     world_extent,
 )
 
@@ -114,27 +115,20 @@ def sample_residuals(
     q = piece_rotation(pieces_in, piece, b, body_q_in)
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
-    extent = world_extent(q, half)
-    low = samples_in.low
-    size = samples_in.size
-    shape = samples_in.shape
-    xs = cell_range(p[0] - extent[0], p[0] + extent[0], low[0], size, shape[0])
-    ys = cell_range(p[1] - extent[1], p[1] + extent[1], low[1], size, shape[1])
-    zs = cell_range(p[2] - extent[2], p[2] + extent[2], low[2], size, shape[2])
     back = wp.transpose(wp.quat_to_matrix(q))
-    if xs[0] <= xs[1] and ys[0] <= ys[1] and zs[0] <= zs[1]:
-        for i in range(xs[0], xs[1] + 1):
-            for j in range(ys[0], ys[1] + 1):
-                row = (i * shape[1] + j) * shape[2]
-                for index in range(samples_in.first[row + zs[0]], samples_in.first[row + zs[1] + 1]):
-                    x = samples_in.position[index]
-                    local = back * (x - p)
-                    if in_box(local, half):
-                        nd = clip_depth(pieces_in, piece, local, near_in)
-                        if nd[3] < near_in:
-                            n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                            # The link moving along its own outward normal comes nearer: d falls.
-                            emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
+    cells = cells_around(samples_in, p, world_extent(q, half))
+    for i in range(cells[0], cells[1] + 1):
+        for j in range(cells[2], cells[3] + 1):
+            mine = samples_of(samples_in, i, j, cells[4], cells[5])
+            for index in range(mine[0], mine[1]):
+                x = samples_in.position[index]
+                local = back * (x - p)
+                if in_box(local, half):
+                    nd = clip_depth(pieces_in, piece, local, near_in)
+                    if nd[3] < near_in:
+                        n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
+                        # The link moving along its own outward normal comes nearer: d falls.
+                        emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
 
 
 @wp.kernel

@@ -104,83 +104,97 @@ def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
     return mesh_distance(surface, point, reach)
 
 
+@wp.struct
+class Cube:
+    """The grid's distances at the corners of the cell that a point is in, and where in it that is."""
+
+    inside: wp.bool
+    at: wp.vec3  # 0 to 1 along each axis
+    f000: wp.float32
+    f100: wp.float32
+    f010: wp.float32
+    f110: wp.float32
+    f001: wp.float32
+    f101: wp.float32
+    f011: wp.float32
+    f111: wp.float32
+
+
 @wp.func
-def field_value(surface: Surface, point: wp.vec3):
-    """Trilinear interpolation of the grid; 1e3 m outside it."""
-    out = float(1.0e3)
+def cube_around(surface: Surface, point: wp.vec3):
+    """The cell that a point is in; `inside` tells whether the grid has one."""
+    cube = Cube()
     x = (point - surface.field_origin) / surface.field_cell
     i = int(wp.floor(x[0]))
     j = int(wp.floor(x[1]))
     k = int(wp.floor(x[2]))
-    if (
+    cube.inside = (
         i >= 0
         and j >= 0
         and k >= 0
         and i + 1 < surface.field.shape[0]
         and j + 1 < surface.field.shape[1]
         and k + 1 < surface.field.shape[2]
-    ):
-        a = x[0] - float(i)
-        b = x[1] - float(j)
-        c = x[2] - float(k)
-        f000 = surface.field[i, j, k]
-        f100 = surface.field[i + 1, j, k]
-        f010 = surface.field[i, j + 1, k]
-        f110 = surface.field[i + 1, j + 1, k]
-        f001 = surface.field[i, j, k + 1]
-        f101 = surface.field[i + 1, j, k + 1]
-        f011 = surface.field[i, j + 1, k + 1]
-        f111 = surface.field[i + 1, j + 1, k + 1]
-        f00 = f000 + a * (f100 - f000)
-        f10 = f010 + a * (f110 - f010)
-        f01 = f001 + a * (f101 - f001)
-        f11 = f011 + a * (f111 - f011)
-        f0 = f00 + b * (f10 - f00)
-        f1 = f01 + b * (f11 - f01)
-        out = f0 + c * (f1 - f0)
-    return out
+    )
+    if cube.inside:
+        cube.at = wp.vec3(x[0] - float(i), x[1] - float(j), x[2] - float(k))
+        cube.f000 = surface.field[i, j, k]
+        cube.f100 = surface.field[i + 1, j, k]
+        cube.f010 = surface.field[i, j + 1, k]
+        cube.f110 = surface.field[i + 1, j + 1, k]
+        cube.f001 = surface.field[i, j, k + 1]
+        cube.f101 = surface.field[i + 1, j, k + 1]
+        cube.f011 = surface.field[i, j + 1, k + 1]
+        cube.f111 = surface.field[i + 1, j + 1, k + 1]
+    return cube
+
+
+@wp.func
+def cube_distance(cube: Cube):
+    """Trilinear interpolation; 1e3 m outside the grid."""
+    if not cube.inside:
+        return float(1.0e3)
+    a = cube.at[0]
+    b = cube.at[1]
+    f00 = cube.f000 + a * (cube.f100 - cube.f000)
+    f10 = cube.f010 + a * (cube.f110 - cube.f010)
+    f01 = cube.f001 + a * (cube.f101 - cube.f001)
+    f11 = cube.f011 + a * (cube.f111 - cube.f011)
+    f0 = f00 + b * (f10 - f00)
+    f1 = f01 + b * (f11 - f01)
+    return f0 + cube.at[2] * (f1 - f0)
+
+
+@wp.func
+def cube_normal(cube: Cube):
+    """Direction of the exact gradient of the interpolation; 0 outside the grid."""
+    if not cube.inside:
+        return wp.vec3(0.0)
+    a = cube.at[0]
+    b = cube.at[1]
+    c = cube.at[2]
+    x00 = cube.f100 - cube.f000
+    x10 = cube.f110 - cube.f010
+    x01 = cube.f101 - cube.f001
+    x11 = cube.f111 - cube.f011
+    f00 = cube.f000 + a * x00
+    f10 = cube.f010 + a * x10
+    f01 = cube.f001 + a * x01
+    f11 = cube.f011 + a * x11
+    x0 = x00 + b * (x10 - x00)
+    x1 = x01 + b * (x11 - x01)
+    y = (f10 - f00) + c * ((f11 - f01) - (f10 - f00))
+    z = (f01 + b * (f11 - f01)) - (f00 + b * (f10 - f00))
+    return wp.normalize(wp.vec3(x0 + c * (x1 - x0), y, z))
 
 
 @wp.func
 def field_distance(surface: Surface, point: wp.vec3):
     """Trilinear interpolation of the grid with its exact gradient; distance 1e3 m outside the grid."""
+    cube = cube_around(surface, point)
     out = Sample()
-    out.distance = 1.0e3
-    out.normal = wp.vec3(0.0)
-    x = (point - surface.field_origin) / surface.field_cell
-    i = int(wp.floor(x[0]))
-    j = int(wp.floor(x[1]))
-    k = int(wp.floor(x[2]))
-    if (
-        i >= 0
-        and j >= 0
-        and k >= 0
-        and i + 1 < surface.field.shape[0]
-        and j + 1 < surface.field.shape[1]
-        and k + 1 < surface.field.shape[2]
-    ):
-        a = x[0] - float(i)
-        b = x[1] - float(j)
-        c = x[2] - float(k)
-        f000 = surface.field[i, j, k]
-        f100 = surface.field[i + 1, j, k]
-        f010 = surface.field[i, j + 1, k]
-        f110 = surface.field[i + 1, j + 1, k]
-        f001 = surface.field[i, j, k + 1]
-        f101 = surface.field[i + 1, j, k + 1]
-        f011 = surface.field[i, j + 1, k + 1]
-        f111 = surface.field[i + 1, j + 1, k + 1]
-        f00 = f000 + a * (f100 - f000)
-        f10 = f010 + a * (f110 - f010)
-        f01 = f001 + a * (f101 - f001)
-        f11 = f011 + a * (f111 - f011)
-        f0 = f00 + b * (f10 - f00)
-        f1 = f01 + b * (f11 - f01)
-        out.distance = f0 + c * (f1 - f0)
-        gx0 = (f100 - f000) + b * ((f110 - f010) - (f100 - f000))
-        gx1 = (f101 - f001) + b * ((f111 - f011) - (f101 - f001))
-        gy = (f10 - f00) + c * ((f11 - f01) - (f10 - f00))
-        out.normal = wp.normalize(wp.vec3(gx0 + c * (gx1 - gx0), gy, f1 - f0))
+    out.distance = cube_distance(cube)
+    out.normal = cube_normal(cube)
     return out
 
 
@@ -189,13 +203,15 @@ def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: w
     """The mesh's distance near the surface, the grid's where that is good enough; `reach` beyond that, and where the
     grid says more than `keep`, which is at least `exact_below`."""
     if surface.field.shape[0] > 0:
-        coarse = field_value(surface, point)
+        cube = cube_around(surface, point)
+        coarse = cube_distance(cube)
         if coarse > exact_below + surface.field_error:
-            if coarse < keep:
-                return field_distance(surface, point)
             out = Sample()
             out.distance = reach
             out.normal = wp.vec3(0.0)
+            if coarse < keep:
+                out.distance = coarse
+                out.normal = cube_normal(cube)
             return out
         return near_distance(surface, point, reach)
     return mesh_distance(surface, point, reach)
