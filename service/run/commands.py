@@ -32,14 +32,15 @@ def up(
     host: Annotated[str | None, typer.Option(help="Address the API binds; GRASPD_HOST.")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port of the API, 0: any; GRASPD_PORT.")] = None,
     device: Annotated[str | None, typer.Option(help="Device of the workers: cpu, cuda:0, auto; GRASPD_DEVICE.")] = None,
-    join: Annotated[
-        Path | None, typer.Option(help="Let workers of other machines join: write to this file what they need.")
+    share: Annotated[
+        Path | None,
+        typer.Option(help="Share the queue with other machines: write to this file what their workers need."),
     ] = None,
-    join_host: Annotated[
-        str | None, typer.Option(help="With --join: how they call this machine; default: its name.")
+    share_host: Annotated[
+        str | None, typer.Option(help="With --share: how they call this machine; default: its name.")
     ] = None,
     redis_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="With --join: port of Redis for them; 0: any free one.")
+        int, typer.Option(min=0, max=65535, help="With --share: port of Redis for them; 0: any free one.")
     ] = 0,
     data_dir: DataDir = None,
     json: JsonFlag = False,
@@ -54,7 +55,7 @@ def up(
     keep_private(settings)
     stop = stop_on_signals()
     console = Console(stderr=True)
-    others = joining(settings, join, host=join_host, port=redis_port) if join is not None else None
+    others = joining(settings, share, host=share_host, port=redis_port) if share is not None else None
     supervisor = Supervisor(settings, workers=workers, joining=others)
     supervisor.start()
     try:

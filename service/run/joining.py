@@ -76,7 +76,7 @@ def joining(settings: Settings, file: Path, *, host: str | None = None, port: in
         InputError: Redis or the store are not ones that other machines can share through this file.
     """
     if settings.redis_url is not None:
-        raise InputError("GRASPD_REDIS_URL names a Redis already: give that to the workers, and leave --join away")
+        raise InputError("GRASPD_REDIS_URL names a Redis already: give that to the workers, and leave --share away")
     if settings.store_url is None:
         raise InputError("other machines need the store: set GRASPD_STORE_URL to file:///SHARED/FOLDER or s3://BUCKET")
     name = host or socket.gethostname()
@@ -87,5 +87,5 @@ def joining(settings: Settings, file: Path, *, host: str | None = None, port: in
         ) as probe:
             free = int(probe.getsockname()[1])
     except OSError as error:
-        raise InputError(f"Redis cannot listen on {name}:{port or 'any'}: {error.strerror}; see --join-host") from None
+        raise InputError(f"Redis cannot listen on {name}:{port or 'any'}: {error.strerror}; see --share-host") from None
     return Joining(file.resolve(), f"[{name}]" if ":" in name else name, address, free, secrets.token_hex(24))

@@ -175,4 +175,4 @@ def test_redis_asks_for_the_password_of_the_file_and_nobody_else_reads_it(tmp_pa
             assert stat.S_IMODE(file.stat().st_mode) == 0o600
     with Supervisor(settings, workers=0, api=False) as alone:
         alone.wait_ready(READY_S)
-        assert Redis.from_url(redis_url(settings)).ping(), "without --join there is no password any more"
+        assert Redis.from_url(redis_url(settings)).ping(), "without --share there is no password any more"

@@ -48,8 +48,8 @@ def test_a_service_forgets_its_own_file_and_not_that_of_its_successor(settings: 
     [
         ({"store_url": None}, "127.0.0.1", "GRASPD_STORE_URL"),
         ({"redis_url": "redis://elsewhere"}, "127.0.0.1", "GRASPD_REDIS_URL"),
-        ({}, "192.0.2.1", "--join-host"),
-        ({}, "no-such-host.invalid", "--join-host"),
+        ({}, "192.0.2.1", "--share-host"),
+        ({}, "no-such-host.invalid", "--share-host"),
     ],
 )
 def test_what_cannot_be_shared_is_refused_with_its_mend(
