@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -12,21 +13,25 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.short import ShortLifts
+from worker.quality.referee.short import SLIPS, ShortLifts
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
-#: Score of a hand that would lift but cannot come: worse than what nearly lifts, better than what is lost.
-BLOCKED: Final = 5.0
+#: Added to the score of a hand that would lift but cannot come: worse than any that can and lets the object fall, since
+#: most of these come freely, better than what is lost.
+BLOCKED: Final = 8.0
+#: Added where only the referee sees the hand touch on its way, for the object's convex pieces stand out from it:
+#: the letter does not ask for the way.
+TOUCHES: Final = 2.0
 
 
 def lift_trial(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
 ) -> Callable[[GraspSet, Placed], Floats]:
     """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object when it hangs
-    and whose way is clear.
+    at half the friction, and below 2 at the whole of it, and whose way is clear.
 
     Args:
         hand: the hand.
@@ -38,10 +43,14 @@ def lift_trial(
 
     def trial(grasps: GraspSet, placed: Placed) -> Floats:
         score = lifts.scores(grasps, placed)
-        held = np.flatnonzero(score < 1.0)
+        held = np.flatnonzero(score < SLIPS + 1.0)
         if len(held):
-            way = plan_way(hand, obj, grasps.take(held), placed.take(held))
+            mine, where = grasps.take(held), placed.take(held)
+            way = plan_way(hand, obj, mine, where)
             score[held[~way.clear]] += BLOCKED
+            free = np.flatnonzero(way.clear)
+            coming = replace(mine, approach=way.approach, coming=way.open).take(free)
+            score[held[free[~lifts.come(coming, where.take(free))]]] += TOUCHES
         return score
 
     return trial

@@ -19,6 +19,7 @@ from worker.planners import Wanted, synthesize
 from worker.planners.fast_graspd import candidates
 from worker.planners.fast_graspd.candidates import Seated
 from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.short import SLIPS
 from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.trial import lift_trial
@@ -42,7 +43,7 @@ def taken(
     were tried, and those that were seated."""
     monkeypatch.setattr(candidates, "with_postures", plain)
     n, each = np.shape(scores)
-    flat, worth = np.ravel(scores), np.ravel(merit if merit is not None else np.tile(np.arange(each), (n, 1)))
+    flat, worth = np.ravel(scores), np.ravel(merit if merit is not None else np.tile(0.01 * np.arange(each), (n, 1)))
     tries: list[int] = []
     seats: list[int] = []
 
@@ -82,7 +83,15 @@ def test_the_others_are_seated_only_where_the_first_two_fail(monkeypatch: pytest
 
 
 def test_of_the_seated_the_one_of_better_merit_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert taken([[0.5, 0.5, 0.5]], monkeypatch, merit=[[1.0, 0.5, 0.0]])[:2] == ([1], [1])
+    assert taken([[0.5, 0.5, 0.5]], monkeypatch, merit=[[0.2, 0.1, 0.0]])[:2] == ([1], [1])
+
+
+def test_what_balances_too_badly_is_not_tried_but_where_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = 2 * candidates.HOPEFUL
+    merit = [[0.0, bad, bad, 0.1], [2 * bad, bad, bad, bad]]
+    rows, tries, _ = taken([[3.0, 0.1, 0.1, 0.2], [3.0, 2.0, 0.1, 0.1]], monkeypatch, merit=merit)
+    assert tries == [0, 3, 5]
+    assert rows == [3, 5]
 
 
 def test_where_none_is_good_enough_the_least_score_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,6 +122,6 @@ def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> 
     one, two = (synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=threads)) for threads in (1, 4))
     assert np.array_equal(one.grasp.hand_pose, two.grasp.hand_pose)
     # What merit alone takes is among the candidates: where it holds, so does what is taken.
-    held, before = trial(one, placed) < 1.0, trial(plain, placed) < 1.0
+    held, before = trial(one, placed) < 1.0 + SLIPS, trial(plain, placed) < 1.0 + SLIPS
     assert held.any()
     assert (held >= before).all()

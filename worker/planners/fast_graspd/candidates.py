@@ -22,6 +22,11 @@ Floats = NDArray[np.float64]
 
 #: Hands of each grasp that are seated and tried before the others are: seating costs as much as a trial.
 FIRST: Final = 2
+#: Merit beyond which a seated hand is not tried but where its grasp has nothing else: half of all hands have more, and
+#: of those that hold one of thirty.
+HOPEFUL: Final = 0.5
+#: Score beyond which that of a grasp is as good as nothing: lost, or its way is blocked.
+POOR: Final = 7.0
 #: Score of what has none.
 HOPELESS: Final = 1e9
 
@@ -76,7 +81,7 @@ def tried(
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
 
     The first `FIRST` of each grasp are seated and tried in the order of their merit, then, of grasps that have none
-    yet, the others.
+    yet, the others. Hands that balance too badly are not tried, but for the first of each grasp.
 
     Args:
         hand: the hand.
@@ -93,9 +98,9 @@ def tried(
             break
         seated = seat(wave[left], left)
         for rows in ranked(seated.merit, len(left)).T:
-            open_ = ~(taken.score[left] < 1.0)
+            open_ = ~(taken.score[left] < 1.0) & ((seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR))
             if not open_.any():
-                break
+                continue
             which = left[open_]
             found = with_postures(
                 hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], placed.take(which), device=device

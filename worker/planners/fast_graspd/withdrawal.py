@@ -24,8 +24,9 @@ Floats = NDArray[np.float64]
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
 #: Depth that is no hindrance [m]: a hand can open a little otherwise than plainly.
 TOLERATED_M: Final = 0.001
-#: Merit lost for each metre of depth: 5 mm outweigh a grasp that balances by a fifth of its forces.
-WEIGHT: Final = 50.0
+#: Merit lost for each metre of depth: little, for hands that hold well reach around the object, and most of these get
+#: out again in some way.
+WEIGHT: Final = 25.0
 DEEPEST_M: Final = 0.01
 #: Shares of the lift at which what stands above is looked for.
 UP: Final = (0.5, 1.0)

@@ -1,8 +1,9 @@
 """A short lift in coarse physics: what a planner asks of its candidates before it chooses.
 
 The hand closes and squeezes around the object on its support in two fifths of the time of the lift test; then the
-support is gone, and for a moment gravity, doubled for the jerk of a lift, pulls. Not a verdict: it ranks candidates for
-a fifth of a verdict's cost, and what it chooses the lift test judges all the same.
+support is gone, and for a moment gravity, doubled for the jerk of a lift, pulls. All this at half the friction: what
+slips then hangs once more, from the same closed hand, at the whole friction. Not a verdict: it ranks candidates for a
+fifth of a verdict's cost, and what it chooses the lift test judges all the same.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ from worker.quality.referee.protocol import LOST_ROTATION, MAX_DISPLACEMENT_M, P
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
+_T = TypeVar("_T")
 
 #: The root is fixed: a hand that hangs on a spring, as the protocol has it, costs twice as much. In so short a time
 #: nothing slips that would not slip without it: no iterations against slip.
@@ -38,16 +41,32 @@ HANGING: Final = 3
 PULL: Final = 2.0 * PUSH
 #: How far supports go away [m]: farther than any scene is high.
 AWAY_M: Final = 10.0
+#: Added to the score of what holds at the whole friction only.
+SLIPS: Final = 1.0
 #: Score of what is lost while closing, and of what starts too deep.
 LOST: Final = 10.0
 DEEP: Final = 20.0
 
 
+@dataclass(frozen=True)
+class Frictions:
+    """The scene built with `PHYSICS`, at half the friction and at the whole of it; all else is the same."""
+
+    half: Scene
+    whole: Scene
+
+
 class ShortLift(Lift):
-    """Runs short lifts of grasps in one scene built with `PHYSICS`. Not for several threads at once."""
+    """Runs short lifts of grasps in one scene. Not for several threads at once."""
+
+    def __init__(self, scenes: Frictions, placed: Placed) -> None:
+        super().__init__(scenes.half, placed)
+        self._scenes = scenes
 
     def score(self, grasps: GraspSet, row: int) -> float:
-        """Displacement or rotation over its limit when the object has hung: below 1 it would pass for lifted."""
+        """Displacement or rotation over its limit when the object has hung at half the friction: below 1 it would pass
+        for lifted. Else that at the whole friction, and `SLIPS`."""
+        self.scene = self._scenes.half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
@@ -57,10 +76,25 @@ class ShortLift(Lift):
                 moved, turned = self._motion()
                 if void(self.data) or moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
                     return LOST
-        self.data.mocap_pos[1] -= AWAY_M * self._up
+        self._save()
+        hung = self._hung()
+        if hung < 1.0:
+            return hung
+        self.scene = self._scenes.whole
+        self._restore()
+        return SLIPS + self._hung()
+
+    def _hung(self) -> float:
+        """Displacement or rotation over its limit when the support has gone."""
+        self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -PULL * self._up
         self._run(HANGING * STAGE_S)
         return LOST if void(self.data) else self._excess()
+
+    def comes(self, grasps: GraspSet, row: int) -> bool:
+        """Whether the open hand reaches its pregrasp as the lift test asks; `grasps.approach` says how it comes."""
+        self._begin(grasps, row)
+        return not self._touches(grasps, row)
 
 
 class ShortLifts:
@@ -71,26 +105,38 @@ class ShortLifts:
         self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
     ) -> None:
         self.hand, self.obj, self._pieces, self._threads = hand, obj, pieces, threads
-        self._scene: Scene | None = None
+        self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
     def scores(self, grasps: GraspSet, placed: Placed) -> Floats:
         """(N,) see `ShortLift.score`."""
-        scene = self._compiled(placed)
+        return np.array(self._each(ShortLift.score, grasps, placed), float)
 
-        def work(rows: NDArray[np.intp]) -> list[float]:
-            test = ShortLift(scene, placed)
-            return [test.score(grasps, int(row)) for row in rows]
+    def come(self, grasps: GraspSet, placed: Placed) -> NDArray[np.bool_]:
+        """(N,) see `ShortLift.comes`."""
+        return np.array(self._each(ShortLift.comes, grasps, placed), bool)
+
+    def _each(self, ask: Callable[[ShortLift, GraspSet, int], _T], grasps: GraspSet, placed: Placed) -> list[_T]:
+        scenes = self._compiled(placed)
+
+        def work(rows: NDArray[np.intp]) -> list[_T]:
+            test = ShortLift(scenes, placed)
+            return [ask(test, grasps, int(row)) for row in rows]
 
         parts = np.array_split(np.arange(len(grasps)), max(1, min(self._threads, len(grasps))))
         if len(parts) == 1:
-            return np.array(work(parts[0]), float)
+            return work(parts[0])
         with ThreadPoolExecutor(len(parts), thread_name_prefix="short-lift") as pool:
-            return np.array([score for part in pool.map(work, parts) for score in part], float)
+            return [answer for part in pool.map(work, parts) for answer in part]
 
-    def _compiled(self, placed: Placed) -> Scene:
+    def _compiled(self, placed: Placed) -> Frictions:
         with self._lock:
-            if self._scene is None:
+            if self._scenes is None:
                 pieces = self._pieces()
-                self._scene = scene_of(self.hand, self.obj, pieces, PHYSICS, placed.supports, placed.neighbours)
-            return self._scene
+                self._scenes = Frictions(
+                    *(
+                        scene_of(self.hand, self.obj, pieces, physics, placed.supports, placed.neighbours)
+                        for physics in (PHYSICS.hardened(), PHYSICS)
+                    )
+                )
+            return self._scenes
