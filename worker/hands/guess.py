@@ -35,7 +35,7 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
         if (jaws := find_jaws(hand)) is not None:
             return _gripper(hand, jaws, tree, options)
     hand = _closed_together(hand)
-    approach = _stated_approach(tree, options)
+    approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _guess_approach(hand)
     # A dof that turns a whole finger about the approach direction spreads it; it closes nothing.
@@ -51,7 +51,7 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
 
 def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
     """The hand with what its jaws tell: it comes open, the pads ahead, and takes hold between them."""
-    approach = _stated_approach(tree, options)
+    approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _snapped(_ahead(hand, jaws))
     pads = tuple(body for side in jaws.bodies for body in side if body > 0)
@@ -107,9 +107,27 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 
 
 def _closing_by_limits(hand: HandModel) -> Floats:
-    """Fingers bend far one way and little the other; what moves as far both ways spreads."""
+    """Fingers bend far one way and little the other; what moves as far both ways spreads. A wrist closes nothing."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
-    return np.where(up > 2 * down, 1.0, np.where(down > 2 * up, -1.0, 0.0))
+    closing = np.where(up > 2 * down, 1.0, np.where(down > 2 * up, -1.0, 0.0))
+    carrying = set(_carriers(hand))
+    for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
+        if body in carrying and name in hand.dof_names:
+            closing[hand.dof_names.index(name)] = 0.0
+    return closing
+
+
+def _carriers(hand: HandModel) -> list[int]:
+    """Bodies that carry all fingertips, the root first and the palm last: between them are a forearm and a wrist."""
+    if len(hand.fingertips) < 2:
+        return [0]
+    chains = []
+    for tip in hand.fingertips:
+        chain = [tip]
+        while chain[-1] > 0:
+            chain.append(int(hand.parent[chain[-1]]))
+        chains.append(chain[::-1])
+    return [same[0] for same in zip(*chains, strict=False) if len(set(same)) == 1]
 
 
 def _closed_together(hand: HandModel) -> HandModel:
@@ -149,12 +167,12 @@ def _tips(hand: HandModel, q: Floats) -> Floats:
 def _dof_axes(hand: HandModel) -> tuple[Floats, NDArray[np.bool_]]:
     """(D, 3) axis of each dof's own joint in the root frame, hand open; (D,) whether its finger starts there."""
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.0)))[0]
-    axes, at_base = np.zeros((hand.dofs, 3)), np.zeros(hand.dofs, dtype=bool)
+    axes, at_base, palm = np.zeros((hand.dofs, 3)), np.zeros(hand.dofs, dtype=bool), _carriers(hand)[-1]
     for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
         if name in hand.dof_names:
             dof = hand.dof_names.index(name)
             axes[dof] = quat_rotate(poses[body, 3:], hand.axis[body])
-            at_base[dof] = hand.parent[body] == 0
+            at_base[dof] = hand.parent[body] == palm
     return axes, at_base
 
 
@@ -166,8 +184,10 @@ def _guess_approach(hand: HandModel) -> Floats:
     gripper but also far along the fingers of a human-like hand. Their sum errs least.
     """
     way = (_tips(hand, posture(hand, 0.4)) - _tips(hand, posture(hand, 0.05))).sum(axis=0)
-    palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
-    ahead = _tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else 0.0)
+    body = _carriers(hand)[-1]
+    pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
+    palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
+    ahead = _tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3])
     mean = _unit(way) + _unit(ahead)
     if np.linalg.norm(mean) < 1e-6:
         return np.array([0.0, 0, 1])
@@ -187,13 +207,16 @@ def _unit(vector: Floats) -> Floats:
     return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
-def _stated_approach(tree: Tree, options: HandOptions) -> Floats | None:
+def _stated_approach(hand: HandModel, tree: Tree, options: HandOptions) -> Floats | None:
+    """In the root frame, the joints between root and palm at rest."""
     stated = options.palm.approach if options.palm and options.palm.approach else options.approach
     if stated is None:
         return None
     if np.linalg.norm(stated) < 1e-9:
         raise HandError("the palm's approach direction is zero; give a direction such as [0, 0, 1]")
-    _, pose = _palm_link(tree, options)
+    body, link_pose = _palm_link(tree, options)
+    rest = hand.expand(np.clip(0.0, hand.lower, hand.upper))
+    pose = compose(body_poses(hand, IDENTITY_POSE, rest)[0, body], link_pose)
     direction = quat_rotate(pose[3:], np.asarray(stated))
     return direction / np.linalg.norm(direction)
 

@@ -263,6 +263,13 @@ def test_the_check_says_which_joints_are_left_out_and_how_to_keep_them(shared_da
     assert check_hand(files, "shadow", {"root": "world"})["facts"]["notes"] == []
 
 
+def test_on_its_forearm_a_palm_faces_where_its_fingers_close_and_the_wrist_closes_nothing(shared_data: Path) -> None:
+    hand = hand_from_path(shared_data / "hands/shadow/shadow_hand_right.urdf", {"root": "world"})
+    # Noted in the frame of the palm link, (0, -1, 0); the forearm turns that by a quarter about z.
+    np.testing.assert_allclose(hand.palm.approach, [1, 0, 0], atol=1e-4)
+    assert [hand.closing[hand.dof_names.index(name)] for name in ("WRJ1", "WRJ2", "FFJ3")] == [0, 0, 1]
+
+
 def test_shadow_forearm_and_wrist_are_left_out(shared_data: Path) -> None:
     hand = bare(shared_data, "shadow")
     assert hand.root_link == "palm" and hand.dofs == 22
