@@ -28,16 +28,26 @@ exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
 
 from __future__ import annotations
 
+import re
 from typing import ClassVar, Final
+
+#: Control characters and every line or paragraph separator that `str.splitlines` knows.
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
 class GraspdError(Exception):
-    """Base of all errors that graspd reports to its user."""
+    """Base of all errors that graspd reports to its user; its text is one line, whatever it quotes."""
 
     slug: ClassVar[str] = "internal"
     status: ClassVar[int] = 500
     exit_code: ClassVar[int] = 1
     title: ClassVar[str] = "Something went wrong"
+
+    def __str__(self) -> str:
+        # A quoted key, file name or message of a library may carry line breaks and escapes: they would forge lines in
+        # logs and terminals. What a printable text holds stays as it is.
+        text = super().__str__()
+        return text if text.isprintable() else _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
 
 
 class InputError(GraspdError):
