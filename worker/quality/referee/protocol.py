@@ -8,6 +8,7 @@ screen: coarser physics (fixed root, 6 ms); where the margin is not clear, the c
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Final
@@ -172,15 +173,20 @@ class Test:
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False) -> bool:
         """From pregrasp over grasp to squeeze; False as soon as the object is lost, if told to give up."""
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        for hand_pose, joints in self._way(grasps, row):
+            self.scene.command(self.data, hand_pose, joints)
+            self._run(STAGE_S)
+            if give_up:
+                moved, turned = self._motion()
+                if moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
+                    return False
+        return True
+
+    def _way(self, grasps: GraspSet, row: int) -> Iterator[tuple[Floats, Floats]]:
+        """Commanded postures (7,), (J,) from pregrasp over grasp to squeeze, one a stage."""
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
             for stage in range(1, STAGES + 1):
-                self.scene.command(self.data, *blend(a, b, row, stage / STAGES))
-                self._run(STAGE_S)
-                if give_up:
-                    moved, turned = self._motion()
-                    if moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
-                        return False
-        return True
+                yield blend(a, b, row, stage / STAGES)
 
     def _save(self) -> None:
         mujoco.mj_getState(self.scene.model, self.data, self._saved, mujoco.mjtState.mjSTATE_INTEGRATION)

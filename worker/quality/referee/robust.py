@@ -1,0 +1,156 @@
+"""Whether grasps hold in other models of the same hand and object, and along which axis they fail first.
+
+A grasp is judged in k models, each of which departs from the nominal one along one axis (`variant`). Axes take turns
+in an order at random; all is drawn from the seed and the grasp's own numbers, so a grasp meets the same models wherever
+it stands, and the first 8 of 16 are those of 8.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.robust import MODELS, Axis
+from worker.grasps import GraspSet
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.model import MujocoOptions
+from worker.quality.referee.variant import Variant, dealt, draw
+from worker.quality.referee.varied import Models
+from worker.run import ALONE, Run
+
+Floats = NDArray[np.float64]
+
+NOT_JUDGED: Final = -1
+#: Shares are wanted to this: 0.9 of 10 models is 9 of them.
+_EXACT: Final = 1e-9
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What became of N grasps in k models."""
+
+    held: NDArray[np.int8]
+    """(N, k) 1 held, 0 not, -1 not judged: the grasp was not tried, or its share was decided."""
+    axis: NDArray[np.uint8]
+    """(N, k) `Axis` of each model."""
+    wanted: float
+    seconds: float
+
+    @property
+    def share(self) -> Floats:
+        """(N,) share of the models in which a grasp holds; nan: not tried. Where judging ended early, what it is at
+        least if the wanted share was reached, at most if it was missed."""
+        models = self.held.shape[1]
+        held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
+        reached = held >= needed(self.wanted, models)
+        share = np.where(reached, held, models - failed) / models
+        return np.where((self.held == NOT_JUDGED).all(axis=1), np.nan, share)
+
+    @property
+    def weakest(self) -> NDArray[np.uint8]:
+        """(N,) `Axis` of the first model in which a grasp does not hold; 0: there is none."""
+        failed = self.held == 0
+        first = failed.argmax(axis=1)
+        return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
+
+    def by_axis(self) -> dict[Axis, tuple[int, int]]:
+        """Of each axis that was judged: models in which a grasp held, and all of them."""
+        counts = {}
+        for axis in Axis:
+            found = self.held[(self.axis == axis) & (self.held != NOT_JUDGED)]
+            if len(found):
+                counts[axis] = (int(found.sum()), len(found))
+        return counts
+
+
+def needed(wanted: float, models: int) -> int:
+    """Models of `models` in which a grasp has to hold for the wanted share; none is wanted at 0, so all are judged."""
+    return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
+
+
+def robust(
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    *,
+    held: NDArray[np.generic] | None = None,
+    models: int = MODELS,
+    wanted: float = 0.0,
+    seed: int = 0,
+    hard: bool = False,
+    pieces: ConvexPieces | None = None,
+    cache: Path | None = None,
+    run: Run = ALONE,
+) -> Robustness:
+    """Judge grasps in models around the nominal one, at the level of the certificate.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        grasps: N grasps.
+        held: (N,) verdicts of the nominal model; only grasps with 1 are tried. By default all.
+        models: for each grasp.
+        wanted: share of them; judging a grasp ends when it is sure whether it is reached. 0: all are judged.
+        seed: of the models, with the grasp's own numbers.
+        hard: at the hard protocol's friction.
+        pieces: convex pieces of the object; by default its CoACD pieces.
+        cache: folder of the pieces, see `decompose`.
+        run: told of grasps done; asked between models whether to stop.
+
+    Raises:
+        MeshError: the object has no usable convex pieces.
+        TaskCancelled: when `run.cancelled()` answers True.
+    """
+    began = time.perf_counter()
+    verdicts = np.full((len(grasps), models), NOT_JUDGED, np.int8)
+    axes = np.zeros((len(grasps), models), np.uint8)
+    tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
+    if not len(tried):
+        return Robustness(verdicts, axes, wanted, 0.0)
+    physics = MujocoOptions().hardened() if hard else MujocoOptions()
+    around = Models(hand, obj, pieces or decompose(obj, cache=cache), physics)
+    least, done, lock = needed(wanted, models), 0, threading.Lock()
+
+    def work(row: int) -> None:
+        nonlocal done
+        for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
+            run.check("robustness")
+            axes[row, k] = axis
+            verdicts[row, k] = around.certificate(grasps, row, variant).success
+            ok, lost = (verdicts[row] == 1).sum(), (verdicts[row] == 0).sum()
+            if wanted > 0 and (ok >= least or models - lost < least):
+                break
+        with lock:
+            done += 1
+            run.progress(done, len(tried), "robustness")
+
+    with ThreadPoolExecutor(run.cores, thread_name_prefix="robust") as pool:
+        list(pool.map(work, tried.tolist()))
+    return Robustness(verdicts, axes, wanted, time.perf_counter() - began)
+
+
+def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
+    """The models in which a grasp is judged, in their order."""
+    words = (seed, *_words(grasps, row))
+    axes = dealt(hand, models, words)
+    return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
+
+
+def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
+    """A grasp's own numbers as a seed."""
+    whole = hashlib.sha256()
+    for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
+        for array in (part.hand_pose, part.joint_positions):
+            whole.update(np.ascontiguousarray(array[row], "<f8").tobytes())
+    return tuple(np.frombuffer(whole.digest()[:16], "<u4").tolist())

@@ -1,0 +1,148 @@
+"""Variants of the referee's model: other shapes, drives, masses and places that a real hand might as well have.
+
+A `Variant` says how a model departs from the nominal one, `draw` draws one along an axis, `varied.Models` judges in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.robust import Axis
+from worker.hands.model import HandModel
+from worker.quality.referee.refit import Fit, fits_of
+
+Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Coupling = Literal["own", "compliant"]
+
+#: How far each axis goes. Shapes stand out or back by this [m].
+GROWTH_M: Final = 1e-3
+#: Factors of drives and of the mass.
+FACTOR: Final = 2.0
+#: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow, which the protocol otherwise leaves out.
+ARMATURE: Final = 2e-4
+DRY_FRICTION: Final = 0.01
+#: Sliding friction over the nominal 0.6; the torsional coefficient goes with it.
+FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
+CENTRE_M: Final = 5e-3
+SHIFT_M: Final = 2e-3
+TURN: Final = float(np.radians(2.0))
+#: The last finger begins so much later than the first, as a share of the time of closing (0.8 s).
+LATEST: Final = 0.25
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A model around the nominal one; by default that itself."""
+
+    fit: Fit = "own"
+    """What the hand's collision shapes are replaced by, see `refit`."""
+    grown_m: float = 0.0
+    """How far the hand's collision shapes stand out from where they were [m]."""
+    armature: float | None = None
+    """Of every joint [kg m^2 or kg]; None: the model's own."""
+    dry_friction: float | None = None
+    """Of every joint [N m or N]; None: the model's own."""
+    damping: float = 1.0
+    """Joint damping over the model's own."""
+    gain: float = 1.0
+    """Position gain over the model's own; limits of torque stay."""
+    coupling: Coupling = "own"
+    """compliant: what couples joints gives way under load."""
+    friction: float = 1.0
+    """Sliding and torsional friction over the model's own."""
+    mass: float = 1.0
+    """Mass of the object over the model's own; what pushes it is its weight and grows with it."""
+    centre_m: Vector = (0.0, 0.0, 0.0)
+    """Shift of the object's centre of mass in its frame [m]."""
+    object_shift_m: Vector = (0.0, 0.0, 0.0)
+    """The object stands off by this, in its frame [m]."""
+    object_turn: Vector = (0.0, 0.0, 0.0)
+    """and turned by this rotation vector about its centre of mass [rad]."""
+    hand_shift_m: Vector = (0.0, 0.0, 0.0)
+    """The hand's root is off by this all the time, in its own frame [m]."""
+    lags: tuple[float, ...] = ()
+    """Of each fingertip: how much later than the first its finger begins, as a share of the time of closing."""
+
+
+NOMINAL: Final = Variant()
+
+
+def axes_of(hand: HandModel) -> tuple[Axis, ...]:
+    """Axes along which a model of this hand can differ: without coupled joints there is nothing to vary in them."""
+    missing = set() if coupled(hand) else {Axis.COUPLINGS}
+    missing |= {Axis.ORDER} if len(hand.fingertips) < 2 else set()
+    return tuple(axis for axis in Axis if axis is not Axis.NONE and axis not in missing)
+
+
+def coupled(hand: HandModel) -> bool:
+    """Whether a dof drives several joints."""
+    return len(hand.joint_body) > hand.dofs
+
+
+def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
+    """The axes of the first models of a grasp: all of the hand's in an order at random, then again."""
+    axes = axes_of(hand)
+    rounds = range(-(-models // len(axes)))
+    return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
+
+
+def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
+    """A variant of a hand along one axis. Directions are even over the sphere, sizes over their range, factors over
+    the logarithm of theirs.
+
+    Raises:
+        ValueError: the axis is none.
+    """
+    match axis:
+        case Axis.SHAPES:
+            fit, grown = SHAPES[int(rng.choice(_shapes(hand)))]
+            return Variant(fit=fit, grown_m=grown)
+        case Axis.JOINTS:
+            armature, dry = (float(rng.random() < 0.5) * _factor(rng) for _ in range(2))
+            return Variant(
+                armature=ARMATURE * armature, dry_friction=DRY_FRICTION * dry, damping=_factor(rng), gain=_factor(rng)
+            )
+        case Axis.COUPLINGS:
+            return Variant(coupling="compliant")
+        case Axis.FRICTION:
+            return Variant(friction=float(rng.uniform(*FRICTIONS)))
+        case Axis.MASS:
+            return Variant(mass=_factor(rng))
+        case Axis.CENTRE:
+            return Variant(centre_m=_vector(rng, CENTRE_M))
+        case Axis.POSE:
+            return Variant(object_shift_m=_vector(rng, SHIFT_M), object_turn=_vector(rng, TURN))
+        case Axis.CALIBRATION:
+            return Variant(hand_shift_m=_vector(rng, SHIFT_M))
+        case Axis.ORDER:
+            fingers = len(hand.fingertips)
+            return Variant(lags=tuple((LATEST * rng.permutation(fingers) / (fingers - 1)).tolist()))
+        case _:
+            raise ValueError("nothing varies along no axis")
+
+
+#: Ways in which collision shapes differ.
+SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
+    ("hull", 0.0), ("primitive", 0.0), ("capsule", 0.0), ("own", GROWTH_M), ("own", -GROWTH_M),
+)  # fmt: skip
+
+
+def _shapes(hand: HandModel) -> list[int]:
+    """Rows of `SHAPES` that change something in this hand."""
+    fits = fits_of(hand)
+    return [i for i, (fit, _) in enumerate(SHAPES) if fit == "own" or fit in fits]
+
+
+def _factor(rng: np.random.Generator) -> float:
+    return float(FACTOR ** rng.uniform(-1.0, 1.0))
+
+
+def _vector(rng: np.random.Generator, most: float) -> Vector:
+    direction = rng.normal(size=3)
+    x, y, z = (most * rng.random() * direction / np.linalg.norm(direction)).tolist()
+    return x, y, z

@@ -1,0 +1,164 @@
+"""The referee's test of a grasp in a variant of the model: shapes are compiled anew, numbers changed in a copy."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.transforms import compose, invert, quat_from_axis_angle
+from worker.grasps import GraspSet, Posture
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.quality.referee.compiled import scene_of
+from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.model import MujocoOptions, Scene, blend, build
+from worker.quality.referee.protocol import STAGES, Test, Trial
+from worker.quality.referee.refit import Fit, refitted
+from worker.quality.referee.variant import Variant
+
+Floats = NDArray[np.float64]
+
+#: What couples joints where it gives way: MuJoCo's default constraint, 2.5 times as slow as the protocol's and softer.
+COMPLIANT_SOLREF: Final = (0.02, 1.0)
+COMPLIANT_SOLIMP: Final = (0.9, 0.95, 1e-3, 0.5, 2.0)
+
+
+class Models:
+    """The models around a nominal one, of one hand and object; threads share it."""
+
+    def __init__(self, hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions) -> None:
+        self.hand, self.obj = hand, obj
+        self._pieces, self._physics = pieces, physics
+        self._scenes: dict[tuple[Fit, float], Scene] = {("own", 0.0): scene_of(hand, obj, pieces, physics)}
+        self._hands: dict[tuple[Fit, float], HandModel] = {("own", 0.0): hand}
+        self._lock = threading.Lock()
+        self._fingers = _fingers(hand)
+
+    def certificate(self, grasps: GraspSet, row: int, variant: Variant) -> Trial:
+        """The verdict on one grasp, at the level of the certificate, in a variant; the nominal one has the verdict of
+        `judge` bit for bit."""
+        test = VariantTest(self.scene(variant), variant, self._lags(variant))
+        return test.certificate(seen(self.obj, grasps, row, variant), 0)
+
+    def scene(self, variant: Variant) -> Scene:
+        """The compiled model of a variant; its places are those of `place` and `command`."""
+        shapes = (variant.fit, variant.grown_m)
+        with self._lock:
+            if shapes not in self._scenes:
+                self._hands[shapes] = refitted(self.hand, *shapes)
+                self._scenes[shapes] = build(self._hands[shapes], self.obj, self._pieces, self._physics)
+            scene = self._scenes[shapes]
+        if any(variant.centre_m):
+            # The body's frame stands in the centre of mass.
+            obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
+            scene = build(self._hands[shapes], obj, self._pieces, self._physics)
+        return _with_numbers(scene, variant)
+
+    def _lags(self, variant: Variant) -> Floats | None:
+        """(J,) when each joint begins, as a share of the time of closing; None: all at once."""
+        if not any(variant.lags):
+            return None
+        lags = np.array([0.0, *variant.lags])
+        return np.asarray(lags[self._fingers + 1])
+
+
+class VariantTest(Test):
+    """The test of one grasp with another weight and order of closing."""
+
+    __test__ = False
+
+    def __init__(self, scene: Scene, variant: Variant, lags: Floats | None) -> None:
+        super().__init__(scene)
+        self._weight, self._lags = variant.mass, lags
+
+    def _push(self, direction: int) -> None:
+        super()._push(direction)
+        self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
+
+    def _way(self, grasps: GraspSet, row: int) -> Iterator[tuple[Floats, Floats]]:
+        if self._lags is None:
+            yield from super()._way(grasps, row)
+            return
+        parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
+        for stage in range(1, 2 * STAGES + 1):
+            even = stage / STAGES
+            part = int(even >= 1)
+            pose, _ = blend(parts[part], parts[part + 1], row, even - part)
+            # Who begins later moves faster: all are there at the end.
+            late = np.clip((even / 2 - self._lags) / (1 - self._lags.max()), 0, 1) * 2
+            joints = [part.joint_positions[row] for part in parts]
+            first, second = np.minimum(late, 1), np.maximum(late - 1, 0)
+            closing = (1 - first) * joints[0] + first * joints[1]
+            yield pose, np.where(late <= 1, closing, (1 - second) * joints[1] + second * joints[2])
+
+
+def _with_numbers(scene: Scene, variant: Variant) -> Scene:
+    """The scene with the numbers of a variant, in a copy of its model; itself where there is none to change."""
+    plain = Variant(fit=variant.fit, grown_m=variant.grown_m, centre_m=variant.centre_m, lags=variant.lags,
+                    object_shift_m=variant.object_shift_m, object_turn=variant.object_turn,
+                    hand_shift_m=variant.hand_shift_m)  # fmt: skip
+    if variant == plain:
+        return scene
+    model = copy.copy(scene.model)
+    dofs = model.jnt_dofadr[[_joint_of(model, int(qpos)) for qpos in scene.joint_qpos]]
+    if variant.armature is not None:
+        model.dof_armature[dofs] = variant.armature
+    if variant.dry_friction is not None:
+        model.dof_frictionloss[dofs] = variant.dry_friction
+    model.dof_damping[dofs] *= variant.damping
+    model.actuator_gainprm[:, 0] *= variant.gain
+    model.actuator_biasprm[:, 1] *= variant.gain
+    model.geom_friction[:, :2] *= variant.friction
+    model.body_mass[scene.object_body] *= variant.mass
+    model.body_inertia[scene.object_body] *= variant.mass
+    if variant.coupling == "compliant":
+        of_joints = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
+        model.eq_solref[of_joints], model.eq_solimp[of_joints] = COMPLIANT_SOLREF, COMPLIANT_SOLIMP
+    # Inverse inertias that follow from masses and armature set how stiff contacts are.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(scene, model=model)
+
+
+def _joint_of(model: Any, qpos: int) -> int:
+    return int(np.flatnonzero(model.jnt_qposadr == qpos)[0])
+
+
+def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
+    """One grasp as the object meets it where that, or the hand, is not quite where it was thought to be."""
+    turn = np.array(variant.object_turn)
+    shift, angle = np.array(variant.object_shift_m), float(np.linalg.norm(turn))
+    one = grasps.take(np.array([row]))
+    if not (angle or shift.any() or any(variant.hand_shift_m)):
+        return one
+    turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
+    about = np.concatenate([obj.centre_of_mass + shift, turned])
+    motion = compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
+    off = np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
+
+    def moved(part: Posture) -> Posture:
+        return Posture(compose(compose(invert(motion), part.hand_pose), off), part.joint_positions)
+
+    return GraspSet(moved(one.grasp), moved(one.pregrasp), moved(one.squeeze), one.stability_loss)
+
+
+def _fingers(hand: HandModel) -> NDArray[np.intp]:
+    """(J,) the fingertip, as a place in `hand.fingertips`, that a joint moves; -1: several, or none."""
+    moved: list[set[int]] = [set() for _ in range(hand.bodies)]
+    for place, tip in enumerate(hand.fingertips):
+        body = tip
+        while body >= 0:
+            moved[body].add(place)
+            body = int(hand.parent[body])
+    # Joints of one dof move together: what they move, all of them move.
+    of_dof: dict[int, set[int]] = {}
+    for body in hand.joint_body.tolist():
+        of_dof.setdefault(int(hand.dof[body]), set()).update(moved[body])
+    found = [of_dof[int(hand.dof[body])] for body in hand.joint_body.tolist()]
+    return np.array([next(iter(one)) if len(one) == 1 else -1 for one in found], np.intp)
