@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -9,6 +10,7 @@ from typing import Final, Literal
 from service.model.cores import available_cores
 from service.model.errors import TaskCancelled
 from worker.meeting import Meeting
+from worker.pool.pool import Pool
 
 FirstJudge = Literal["auto", "on", "off"]
 Progress = Callable[[float, float, str], None]
@@ -39,6 +41,8 @@ class Run:
     """Where it meets others like it, to be done with them in one launch; None: it is done by itself."""
     first_judge: FirstJudge = "auto"
     """Whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed."""
+    pool: Pool | None = None
+    """Processes that judge and measure; None: threads of this one."""
 
     @property
     def cores(self) -> int:
@@ -66,6 +70,20 @@ class Run:
         """Raises TaskCancelled if the work should stop."""
         if self.cancelled():
             raise TaskCancelled(f"{what} was cancelled")
+
+
+class Count:
+    """Grasps that are done of a whole, told as they are counted by any thread."""
+
+    def __init__(self, total: int, run: Run, what: str, done: int = 0) -> None:
+        self._total, self._run, self._what, self._done = total, run, what, done
+        self._lock = threading.Lock()
+
+    def add(self, more: int) -> None:
+        """So many more are done."""
+        with self._lock:
+            self._done += more
+            self._run.progress(self._done, self._total, self._what)
 
 
 #: On the CPU with all its cores; nobody is told, nobody stops it.

@@ -17,6 +17,8 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.run import ALONE, Progress, Run
 from worker.simulation.surroundings import Scenes
 
+#: Modules whose work may be done by a `Pool`.
+MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
 #: Batches at work for each one in a launch: while one half is on the device, the other is judged and measured.
 PER_LAUNCH: Final = 2
 

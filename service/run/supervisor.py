@@ -181,7 +181,12 @@ class Supervisor:
         if self._api:
             children.append(child("api", *_PROGRAM, "api"))
         children += [
-            child(f"worker-{number}", *self._worker_command, GRASPD_WORKER_NUMBER=str(number))
+            child(
+                f"worker-{number}",
+                *self._worker_command,
+                GRASPD_WORKER_NUMBER=str(number),
+                GRASPD_WORKERS_HERE=str(self._workers),
+            )
             for number in range(self._workers)
         ]
         return children

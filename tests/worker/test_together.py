@@ -15,8 +15,9 @@ from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
+from worker.pool.pool import Pool
 from worker.run import Run
-from worker.together import certified_batches
+from worker.together import MODULES, certified_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
 
@@ -26,7 +27,25 @@ def pair():
     return hand_from_path("barrett"), object_from_path("block", face_error_m=REQUEST.knobs.face_error_m)
 
 
-def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def alone(pair):
+    """Batches done one after the other by this process."""
+    return certified_batches(*pair, REQUEST, sizes=[2, 2, 2], run=Run(threads=2))
+
+
+def assert_same(batches, others) -> None:
+    for one, other in zip(batches, others, strict=True):
+        assert (one.tried, one.rejected, one.planned, one.verdict_key) == (
+            other.tried, other.rejected, other.planned, other.verdict_key,
+        )  # fmt: skip
+        columns = one.grasps.to_columns() | one.columns
+        for name, values in (other.grasps.to_columns() | other.columns).items():
+            np.testing.assert_array_equal(columns[name], values, err_msg=name)
+
+
+def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
+    pair, alone, monkeypatch: pytest.MonkeyPatch
+) -> None:
     launches: list[Meeting] = []
 
     class Noted(Meeting):
@@ -36,19 +55,21 @@ def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, monkeyp
 
     monkeypatch.setattr(together, "Meeting", Noted)
     told: list[tuple[float, float]] = []
-    alone = certified_batches(*pair, REQUEST, sizes=[2, 2, 2], run=Run(threads=2))
     run = Run(threads=2, progress=lambda done, total, message: told.append((done, total)))
     joined = certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=3, run=run)
     assert launches[0].served[0] == 3, "the first launch has all three"
-    for one, other in zip(joined, alone, strict=True):
-        assert (one.tried, one.rejected, one.planned, one.verdict_key) == (
-            other.tried, other.rejected, other.planned, other.verdict_key,
-        )  # fmt: skip
-        columns = one.grasps.to_columns() | one.columns
-        for name, values in (other.grasps.to_columns() | other.columns).items():
-            np.testing.assert_array_equal(columns[name], values, err_msg=name)
+    assert_same(joined, alone)
     assert told[-1] == (6, 6)
     assert all(done <= total for done, total in told)
+
+
+def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone) -> None:
+    told: list[tuple[float, float]] = []
+    with Pool(2, MODULES) as pool:
+        run = Run(threads=2, pool=pool, progress=lambda done, total, message: told.append((done, total)))
+        assert_same(certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=2, run=run), alone)
+        assert len(pool.pids) == 2
+    assert told[-1] == (6, 6)
 
 
 def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:

@@ -88,10 +88,11 @@ def synth(
     )  # fmt: skip
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
     place = parse_scene(scene, faces=faces, touch=touch, beside=with_ or [])
+    settings = load_settings()
     with _bar(quiet=json) as progress:
         made = synthesized(
             hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
-            first_judge=load_settings().first_judge, join=join, progress=progress,
+            first_judge=settings.first_judge, join=join, processes=settings.processes, progress=progress,
         )  # fmt: skip
     out.write_bytes(write_shard("base", made.arrays, made.attributes))
     found = {"file": str(out), **made.summary()}

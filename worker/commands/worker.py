@@ -30,6 +30,10 @@ def worker(
     join: Annotated[
         str | None, typer.Option(help="Batches of one pair that are planned in one launch, or auto; GRASPD_JOIN.")
     ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes that judge and measure, 0: with a GPU one a core; GRASPD_PROCESSES."),
+    ] = None,
     burst: Annotated[bool, typer.Option("--burst", help="End when no task waits.")] = False,
     idle: Annotated[int, typer.Option(min=0, help="With --burst: end when none came for so long [s].")] = 0,
     once: Annotated[bool, typer.Option("--once", help="End after one task.")] = False,
@@ -40,7 +44,7 @@ def worker(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")] = None,
 ) -> None:
     """A worker on one device, or several: takes tasks from the queue until it is told to stop."""
-    settings = load_settings(device=device, threads=threads, join=join, data_dir=data_dir)
+    settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
     log_to_stderr(settings, "worker")
     keep_private(settings)
     if check:
@@ -70,7 +74,7 @@ def _run_several(count: int, settings: Settings, stages: str | None) -> None:
 
     _parse_stages(stages)
     arguments = ["worker", "--device", settings.device, "--threads", str(settings.threads)]
-    arguments += ["--join", settings.join]
+    arguments += ["--join", settings.join, "--processes", str(settings.processes)]
     arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
     run_workers(count, arguments, settings, stop_on_signals())
 

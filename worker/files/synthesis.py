@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -26,9 +27,11 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
+from worker.pool.pool import Pool
+from worker.pool.size import processes_at_once
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
-from worker.together import certified_batches
+from worker.together import MODULES, certified_batches
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].
@@ -102,6 +105,7 @@ def synthesized(
     threads: int = 0,
     first_judge: FirstJudge = "auto",
     join: int | str = "auto",
+    processes: int = 0,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Synthesized:
@@ -118,6 +122,7 @@ def synthesized(
         threads: CPU threads; 0: one per core.
         first_judge: whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed.
         join: batches of 32 whose grasps are planned in one launch, or auto; the grasps are the same.
+        processes: that judge and measure; 1: this one; 0: on a GPU one for each core less one, else 1.
         progress: told of the grasps that are done, and of how many.
         cancelled: asked often; True: the work stops.
 
@@ -141,7 +146,9 @@ def synthesized(
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
     joined = batches_at_once(chosen, wanted)
-    batches = certified_batches(model, thing, request, sizes=sizes, join=joined, scenes=where, run=run)
+    with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
+        run = replace(run, pool=pool)
+        batches = certified_batches(model, thing, request, sizes=sizes, join=joined, scenes=where, run=run)
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in _KEPT if name in poses}
@@ -150,6 +157,17 @@ def synthesized(
         attributes["scene"] = json_attribute(_as_stored(place, others))
         attributes |= beside_attributes(others, [one.object for one in place.neighbours])
     return Synthesized(arrays, attributes, batches, request, place, seconds)
+
+
+@contextmanager
+def _pool(processes: int) -> Iterator[Pool | None]:
+    """So many processes beside this one, which start while the first grasps are planned; None for one."""
+    if processes == 1:
+        yield None
+        return
+    with Pool(processes, MODULES) as pool:
+        pool.start()
+        yield pool
 
 
 def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:

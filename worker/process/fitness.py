@@ -41,8 +41,9 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 
 def first_loss(task: str) -> bool:
-    """Whether no GPU of this machine was lost over a task before. The first time nothing says that it is the task's
-    fault; one that takes every GPU down must use up its attempts, or it would go round for ever."""
+    """Whether no GPU of this machine, nor a process beside a worker, was lost over a task before. The first time
+    nothing says that it is the task's fault; one that takes each down must use up its attempts, or it would go round
+    for ever."""
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False

@@ -352,6 +352,7 @@ def run_worker(
         )
     finally:
         AllowedJob.function = None
+        surroundings.close()
         heart.stop()
         queue.close()
     # RQ's loop ends in the same way where an error that nobody foresaw broke it off.

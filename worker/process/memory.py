@@ -13,11 +13,14 @@ from service.model.cores import ROOT, memory_limits
 _STATUS: Final = Path("/proc/self/statm")
 
 
-def resident_mb() -> float:
-    """Resident memory of this process [MiB]; where the system does not tell, the most it ever was."""
+def resident_mb(pid: int | None = None) -> float:
+    """Resident memory of this process, or of another [MiB]; where the system does not tell, the most this one ever
+    had, or nothing of another."""
     try:
-        pages = int(_STATUS.read_text().split()[1])
+        pages = int((_STATUS if pid is None else Path(f"/proc/{pid}/statm")).read_text().split()[1])
     except (OSError, ValueError, IndexError):
+        if pid is not None:
+            return 0.0
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak / (2**20 if sys.platform == "darwin" else 2**10)
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -23,6 +23,7 @@ from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.records import put_record
 from worker.engines.cuda_errors import DeviceLost, check_device
+from worker.pool.pool import ProcessLost
 from worker.process.fitness import Fitness, first_loss
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.output import StageFunction, shard_of
@@ -140,14 +141,14 @@ class Runner:
         return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
     def _loss(self, error: Exception, context: TaskContext) -> str:
-        """What became of the device, if that is what the error comes from; "" if it works."""
+        """What became of the device, or of a process beside this one, if that is what the error comes from; else ""."""
         try:
             _on_device(context, lambda: self._check_device(context.device))
         except DeviceLost as lost:
             error = lost
         if isinstance(error, DeviceLost):
             self.device_lost = str(error)
-        return self.device_lost
+        return str(error) if isinstance(error, ProcessLost) else self.device_lost
 
     def _doubt(self, message: Message, error: Exception, context: TaskContext) -> str:
         """Why this worker is to blame for a failure; "" if it is not known to be."""

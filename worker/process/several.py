@@ -29,10 +29,8 @@ def run_workers(
         settings: how long a worker may take to stop.
         stop: set by whoever ends it all.
     """
-    children = [
-        Child(f"worker-{number}", (*program, *arguments), {"GRASPD_WORKER_NUMBER": str(number)}, None)
-        for number in range(count)
-    ]
+    of_each = [{"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(count)} for number in range(count)]
+    children = [Child(f"worker-{number}", (*program, *arguments), own, None) for number, own in enumerate(of_each)]
     try:
         for child in children:
             child.start()

@@ -13,8 +13,11 @@ from service.settings import Settings
 from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
+from worker.pool.pool import Pool
+from worker.pool.size import processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
+from worker.together import MODULES
 
 log = logging.getLogger(__name__)
 
@@ -29,13 +32,16 @@ class Surroundings:
         self._memory_mb = limit_mb(settings.worker_max_memory_mb)
         self.tasks_done = 0
         self._joined = 0
+        self._pool: Pool | None = None
+        self._processes = 0
 
     def outgrown(self) -> str:
         """Why this process should make room for a fresh one, "" if it need not."""
         most = self.settings.worker_max_tasks
         if most and self.tasks_done >= most:
             return f"it has done {self.tasks_done} tasks (GRASPD_WORKER_MAX_TASKS)"
-        if (held := resident_mb()) > self._memory_mb:
+        beside = sum(resident_mb(pid) for pid in self._pool.pids) if self._pool is not None else 0.0
+        if (held := resident_mb() + beside) > self._memory_mb:
             return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
@@ -44,6 +50,26 @@ class Surroundings:
         if not self._joined:
             self._joined = batches_at_once(self._device.resolve(), parse_join(self.settings.join))
         return self._joined
+
+    def pool(self, stage: str) -> Pool | None:
+        """The processes that judge and measure, if a task of this stage has work for them; waits until it is known how
+        many they are."""
+        if stage != Stage.SYNTHESIZE:
+            return None
+        if not self._processes:
+            chosen = self.settings
+            self._processes = processes_at_once(
+                self._device.resolve(), chosen.processes, threads=chosen.threads, workers=chosen.workers_here
+            )
+            self._pool = Pool(self._processes, MODULES) if self._processes > 1 else None
+        if self._pool is not None:
+            self._pool.start()
+        return self._pool
+
+    def close(self) -> None:
+        """End what was started for tasks."""
+        if self._pool is not None:
+            self._pool.close()
 
     def context(self, raw: Mapping[str, Any], events: Events) -> TaskContext:
         """The context of a task, which reports how far it is."""
@@ -59,5 +85,6 @@ class Surroundings:
         device = "cpu" if raw.get("stage") == Stage.INGEST else self._device.resolve()
         chosen = self.settings
         return TaskContext(
-            self.store, device=device, threads=chosen.threads, first_judge=chosen.first_judge, tell=tell
+            self.store, device=device, threads=chosen.threads, first_judge=chosen.first_judge,
+            pool=self.pool(raw.get("stage", "")), tell=tell,
         )  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from service.model.metrics import GRASP_METRICS
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
+from worker.objects.content import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
 from worker.quality.overlap import Overlap
@@ -24,9 +24,10 @@ from worker.quality.penetration import penetration_depth
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from worker.quality.volume import SharedVolume
 from worker.quality.wrench_space import Norm, measure_spaces, wrenches
-from worker.run import ALONE, Run
+from worker.run import ALONE, Count, Run
 
 Floats = NDArray[np.float64]
+Columns = dict[str, NDArray[np.generic]]
 
 #: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
@@ -71,46 +72,75 @@ def measure(
         raise InputError(
             f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
         )
-    pair = _Pair(hand, obj, friction, thresholds, norm, every_volume)
+    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), norm, every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
-    done, lock = 0, threading.Lock()
-
-    def work(chunk: slice) -> dict[str, NDArray[np.generic]]:
-        nonlocal done
-        run.check("the quality table")
-        columns = pair.columns(Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]))
-        with lock:
-            done += chunk.stop - chunk.start
-            run.progress(done, len(grasps), "quality")
-        return columns
-
-    with ThreadPoolExecutor(run.cores, thread_name_prefix="quality") as pool:
-        parts = list(pool.map(work, chunks))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else pair.empty()
+    postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
+    parts = _measured(terms, postures, Count(len(grasps), run, "quality"), run)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else terms.empty()
     columns["quality/thresholds_m"] = thresholds
     columns["quality/stability_loss"] = np.asarray(grasps.stability_loss, float)
     return columns
 
 
-class _Pair:
-    """What the chunks of one table share."""
+@dataclass(frozen=True)
+class _Terms:
+    """What is measured, and how."""
 
-    def __init__(
-        self, hand: HandModel, obj: ObjectModel, friction: float, thresholds: Floats, norm: Norm, every_volume: bool
-    ) -> None:
-        self.obj, self.friction, self.thresholds, self.norm = obj, friction, thresholds, norm
-        told = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
-        self.with_volume = (np.arange(len(thresholds)) == told) | every_volume
-        self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
-        self.volume = SharedVolume(hand, obj)
-        self.overlap = Overlap(hand, self.probe)
+    hand: HandModel
+    obj: ObjectModel
+    friction: float
+    thresholds: tuple[float, ...]
+    norm: Norm
+    every_volume: bool
 
-    def empty(self) -> dict[str, NDArray[np.generic]]:
+    @cached_property
+    def pair(self) -> _Pair:
+        """Kept with the terms, by a process of a pool too."""
+        return _Pair(self)
+
+    def empty(self) -> Columns:
         """Columns of no grasps."""
         swept = {metric.name for metric in GRASP_METRICS if metric.swept}
         return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
 
-    def columns(self, posture: Posture) -> dict[str, NDArray[np.generic]]:
+
+def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: Run) -> list[Columns]:
+    """The columns of each chunk, by threads or by the processes of a pool."""
+    if run.pool is not None:
+        return run.pool.map(
+            _columns, content_of(terms), terms, postures, cancelled=run.cancelled,
+            done=lambda k: done.add(len(postures[k])),
+        )  # fmt: skip
+    pair = terms.pair
+
+    def work(posture: Posture) -> Columns:
+        run.check("the quality table")
+        columns = pair.columns(posture)
+        done.add(len(posture))
+        return columns
+
+    with ThreadPoolExecutor(run.cores, thread_name_prefix="quality") as pool:
+        return list(pool.map(work, postures))
+
+
+def _columns(terms: _Terms, posture: Posture) -> Columns:
+    return terms.pair.columns(posture)
+
+
+class _Pair:
+    """What the chunks of one table share."""
+
+    def __init__(self, terms: _Terms) -> None:
+        hand, obj = terms.hand, terms.obj
+        self.obj, self.friction, self.norm = obj, terms.friction, terms.norm
+        self.thresholds = np.array(terms.thresholds)
+        told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
+        self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
+        self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+        self.volume = SharedVolume(hand, obj)
+        self.overlap = Overlap(hand, self.probe)
+
+    def columns(self, posture: Posture) -> Columns:
         chunk = _Chunk(self, self.probe.measure(posture))
         return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
 

@@ -11,6 +11,7 @@ from typing import Final
 from service.model.errors import TaskCancelled
 from service.store.store import Store
 from worker.meeting import Meeting
+from worker.pool.pool import Pool
 from worker.run import FirstJudge, Run
 
 #: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
@@ -36,6 +37,7 @@ class TaskContext:
         device: str = "cpu",
         threads: int = 0,
         first_judge: FirstJudge = "auto",
+        pool: Pool | None = None,
         tell: Callable[[float, float, str], float | None] | None = None,
     ) -> None:
         """`tell` takes done, total and a message, and may answer when it wants to hear more [s]."""
@@ -43,6 +45,7 @@ class TaskContext:
         self.device = device
         self.threads = threads
         self.first_judge: FirstJudge = first_judge
+        self.pool = pool
         self.meeting: Meeting | None = None
         """Where the task is done beside others; None: by itself."""
         self._tell = tell
@@ -63,7 +66,7 @@ class TaskContext:
     def run(self) -> Run:
         """What the engine room needs to know of the task."""
         return Run(
-            self.device, self.threads, self.progress, self.cancelled, self.meeting, self.first_judge,
+            self.device, self.threads, self.progress, self.cancelled, self.meeting, self.first_judge, self.pool,
         )  # fmt: skip
 
     def cancelled(self) -> bool:

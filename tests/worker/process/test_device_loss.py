@@ -18,6 +18,7 @@ from service.store.records import task_attempts
 from service.store.store import Store, open_store
 from tests.fakes import fake_synthesize, message_for
 from worker.engines.cuda_errors import DeviceLost
+from worker.pool.pool import ProcessLost
 from worker.process import main
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
@@ -59,6 +60,18 @@ def test_a_task_that_takes_down_one_gpu_after_the_other_uses_up_its_attempts() -
     assert event is not None and event.kind is EventKind.FAILED
     (attempt,) = task_attempts(store, message.task_id)
     assert (attempt.kind, attempt.last) == ("DeviceLost", False)
+
+
+def test_a_task_over_which_a_process_beside_the_worker_ended_goes_back_once_and_the_worker_goes_on() -> None:
+    def lost(message: TaskMessage, context: TaskContext) -> Any:
+        raise ProcessLost("a process beside the worker ended in the middle of its work (signal 9)")
+
+    store, message = open_store("memory://"), message_for()
+    event, runner = run(store, message, lost, lambda device: None)
+    assert event is not None and (event.kind, runner.device_lost) == (EventKind.RETURNED, "")
+    assert "signal 9" in event.message and not list(task_attempts(store, message.task_id))
+    event, _ = run(store, message, lost, lambda device: None)
+    assert event is not None and event.kind is EventKind.FAILED, "a task that ends each must use up its attempts"
 
 
 def test_a_device_that_works_is_not_blamed() -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -17,18 +17,21 @@ from numpy.typing import NDArray
 from service.model.errors import InputError
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
+from worker.objects.content import content_of
 from worker.objects.model import ObjectModel
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.first.screening import Screened, first_terms, screened
 from worker.quality.referee.key import Level, postures_key, verdict_key
-from worker.quality.referee.model import COARSE, MujocoOptions
+from worker.quality.referee.model import COARSE, MujocoOptions, Scene
 from worker.quality.referee.protocol import DIRECTIONS, SCREEN_BAND, Outcome, Test, Trial
-from worker.run import ALONE, Run
+from worker.run import ALONE, Count, Run
 
 Floats = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
+#: Grasps that a process of a pool judges at a time: few, so that those of one batch are shared by many processes.
+_CHUNK: Final = 2
 LEVELS: Final = ("letter", "certificate", "screen")
 
 
@@ -94,8 +97,8 @@ def judge(
 ) -> Verdicts:
     """Test grasps by the DexGraspBench force-closure protocol; see `worker.quality.referee.protocol` for the levels.
 
-    MuJoCo releases the interpreter lock while it steps, so threads use all cores. Where `run` has a first judge it
-    gives the clear verdicts, see `worker.quality.referee.first.screening`.
+    MuJoCo releases the interpreter lock while it steps, so threads use a few cores; for many `run` has a pool. Where
+    `run` has a first judge it gives the clear verdicts, see `worker.quality.referee.first.screening`.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
@@ -119,32 +122,75 @@ def judge(
     first_judge = first_terms(hand, level, run)
     # What the first judge leaves over is near a limit: coarse physics would ask the certificate as well.
     of_the_cpu: Level = "certificate" if first_judge else level
-    bench = _Bench(hand, obj, pieces, of_the_cpu, hard, run.cores)
+    case = _Case(hand, obj, pieces, of_the_cpu, hard)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, first_judge=first_judge)
-    first = screened(bench.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
+    first = screened(case.scene, terms, grasps, level=level, run=run) if first_judge else Screened({}, {})
     trials = dict(first.stands)
-    bench.judge(grasps, [row for row in range(len(grasps)) if row not in trials], trials, run)
+    _try(case, grasps, [row for row in range(len(grasps)) if row not in trials], trials, run)
     contradicted = first.contradicted(trials)
     if not first.believed(contradicted):
         log.warning("%d of %d audited verdicts are contradicted: the CPU judges all", contradicted, len(first.audited))
-        bench.judge(grasps, list(first.stands), trials, run)
+        _try(case, grasps, list(first.stands), trials, run)
     ordered = [trials[row] for row in range(len(grasps))]
-    found = _verdicts(ordered, bench, terms, postures_key(terms, grasps), time.perf_counter() - began)
+    found = _verdicts(ordered, case, terms, postures_key(terms, grasps), time.perf_counter() - began)
     return replace(found, level=level, audited=len(first.audited), contradicted=contradicted)
 
 
-class _Bench:
-    """The compiled scenes of one pair, and a test for each thread."""
+@dataclass(frozen=True)
+class _Case:
+    """What is judged, and how."""
 
-    def __init__(
-        self, hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, level: Level, hard: bool, threads: int
-    ) -> None:
-        self.level, self.hard, self.pieces, self.threads = level, hard, pieces, threads
+    hand: HandModel
+    obj: ObjectModel
+    pieces: ConvexPieces
+    level: Level
+    hard: bool
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Of the certificate."""
+        return self._scene(MujocoOptions())
+
+    @property
+    def coarse(self) -> Scene | None:
+        return self._scene(COARSE) if self.level == "screen" else None
+
+    def _scene(self, physics: MujocoOptions) -> Scene:
+        return scene_of(self.hand, self.obj, self.pieces, physics.hardened() if self.hard else physics)
+
+    @cached_property
+    def bench(self) -> _Bench:
+        """Of a process of a pool, which keeps it with the case."""
+        return _Bench(self, 1)
+
+
+def _try(case: _Case, grasps: GraspSet, rows: list[int], trials: dict[int, Trial], run: Run) -> None:
+    """Put the trials of some grasps among those that are there."""
+    if run.pool is None:
+        _Bench(case, run.cores).judge(grasps, rows, trials, run)
+        return
+    bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
+    parts = [bare.take(np.array(rows[k : k + _CHUNK], np.intp)) for k in range(0, len(rows), _CHUNK)]
+    done = Count(len(grasps), run, "referee", len(grasps) - len(rows))
+    made = run.pool.map(
+        _trials, content_of(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
+    )
+    trials.update(zip(rows, (trial for part in made for trial in part), strict=True))
+
+
+def _trials(case: _Case, grasps: GraspSet) -> list[Trial]:
+    """Of some grasps, one after the other."""
+    return [case.bench.trial(grasps, row) for row in range(len(grasps))]
+
+
+class _Bench:
+    """A test for each thread."""
+
+    def __init__(self, case: _Case, threads: int) -> None:
+        self.level, self.threads = case.level, threads
         self._full: queue.SimpleQueue[Test] = queue.SimpleQueue()
         self._coarse: queue.SimpleQueue[Test] = queue.SimpleQueue()
-        levels = [MujocoOptions().hardened(), COARSE.hardened()] if hard else [MujocoOptions(), COARSE]
-        full = self.scene = scene_of(hand, obj, pieces, levels[0])
-        coarse = scene_of(hand, obj, pieces, levels[1]) if level == "screen" else None
+        full, coarse = case.scene, case.coarse
         for _ in range(threads):
             self._full.put(Test(full))
             if coarse is not None:
@@ -152,16 +198,12 @@ class _Bench:
 
     def judge(self, grasps: GraspSet, rows: list[int], trials: dict[int, Trial], run: Run) -> None:
         """Put the trials of some grasps among those that are there."""
-        done, lock = len(grasps) - len(rows), threading.Lock()
+        done = Count(len(grasps), run, "referee", len(grasps) - len(rows))
 
         def work(row: int) -> None:
-            nonlocal done
             run.check("the referee")
-            trial = self.trial(grasps, row)
-            with lock:
-                trials[row] = trial
-                done += 1
-                run.progress(done, len(grasps), "referee")
+            trials[row] = self.trial(grasps, row)
+            done.add(1)
 
         with ThreadPoolExecutor(self.threads, thread_name_prefix="referee") as pool:
             list(pool.map(work, rows))
@@ -187,7 +229,7 @@ class _Bench:
             tests.put(test)
 
 
-def _verdicts(trials: list[Trial], bench: _Bench, terms: str, key: str, seconds: float) -> Verdicts:
+def _verdicts(trials: list[Trial], case: _Case, terms: str, key: str, seconds: float) -> Verdicts:
     return Verdicts(
         success=np.array([t.success for t in trials], np.int8),
         outcome=np.array([t.outcomes for t in trials], np.uint8).reshape(-1, len(DIRECTIONS)),
@@ -195,11 +237,11 @@ def _verdicts(trials: list[Trial], bench: _Bench, terms: str, key: str, seconds:
         penetration_depth_mm=np.array([t.penetration_m for t in trials], float) * 1e3,
         self_penetration_depth_mm=np.array([t.self_penetration_m for t in trials], float) * 1e3,
         judged_by=np.array([t.judged_by for t in trials], np.uint8),
-        level=bench.level,
-        hard=bench.hard,
-        pieces=len(bench.pieces),
-        volume_ratio=bench.pieces.volume_ratio,
-        excess_m=bench.pieces.excess_m,
+        level=case.level,
+        hard=case.hard,
+        pieces=len(case.pieces),
+        volume_ratio=case.pieces.volume_ratio,
+        excess_m=case.pieces.excess_m,
         terms=terms,
         key=key,
         seconds=seconds,

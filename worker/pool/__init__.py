@@ -1,0 +1,1 @@
+"""Processes beside this one, for work that threads of one process cannot share out to many cores."""
