@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.index.views import AttemptView, GraspView, ShardView, StageProgress, WorkerView
+from service.model.diversity import CELLS
 from service.model.domain import JobRequest, Stage, State
 from service.model.metric_fields import OfferedName, filters, means, with_fields
 from service.model.scene_spec import Box, HalfSpace, SceneKind
@@ -56,6 +57,18 @@ class MeanMetrics(BaseModel):
         def __getattr__(self, metric: str) -> float | None: ...
 
 
+class Diversity(BaseModel):
+    """How different the valid grasps of a job are, all that it kept where nobody judged them."""
+
+    grasps: int = Field(description="grasps looked at")
+    types: dict[str, int] = Field(description="how many are power, precision or lateral; none: not told")
+    type_entropy_bits: float = Field(description="0: all of one type; 1.58: the three alike")
+    directions_used: int = Field(description="cells of the sphere, in the object's frame, from which a palm comes")
+    directions: int = Field(CELLS, description="cells that there are, of equal area")
+    direction_entropy_bits: float = Field(description="0: all from one cell; 5.58: from all 48 alike")
+    evenness: float = Field(ge=0, le=1, description="2^entropy of the directions over their number")
+
+
 class Shard(ShardView):
     """A shard and where to download it."""
 
@@ -73,6 +86,7 @@ class JobDetail(Job):
     audit_held: int = Field(0, description="of these, grasps that held")
     attempts: list[AttemptView]
     mean: MeanMetrics
+    diversity: Diversity | None = Field(None, description="absent while there is no such grasp")
     shards: list[Shard]
 
 
@@ -87,6 +101,7 @@ class GraspQuery(BaseModel):
     object: str | None = Field(None, max_length=64)
     valid: bool | None = None
     success: bool | None = None
+    type: Literal["power", "precision", "lateral"] | None = Field(None, description="what the hand does")
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
         None, description="kind of the scene it was planned in; any: whichever, but not free"
     )

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from graspd.grasps import Grasps
 from service.cli import validation_line
+from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import parse_scene
@@ -27,6 +28,7 @@ def synthesize(
     beside: Sequence[str | Path] = (),
     want: Literal["valid", "raw"] = "valid",
     budget: float = 4.0,
+    min_distance: float = MIN_DISTANCE_M,
     referee: Literal["letter", "certificate", "screen", "none"] = "certificate",
     method: str = "fast_graspd",
     options: dict[str, Any] | None = None,
@@ -56,6 +58,7 @@ def synthesize(
         beside: up to eight other objects, files or names, that are dropped around it.
         want: valid: that many valid grasps; raw: of any kind.
         budget: grasps tried for each one wanted, at most.
+        min_distance: no two grasps are nearer [m]: mean distance of the same points of the hand, in the object's frame.
         referee: level at which MuJoCo judges; none: nobody, and grasps are sound at best.
         method: the planner.
         options: its own options, such as {"steps": 20000}.
@@ -82,7 +85,7 @@ def synthesize(
     try:
         request = JobOptions(
             grasps=count, want=want, budget=budget, referee=referee, method=method, options=options or {}, seed=seed,
-            friction=friction, audits=0,
+            friction=friction, min_distance=min_distance, audits=0,
         )  # fmt: skip
     except ValidationError as error:
         raise InputError(validation_line(error)) from None

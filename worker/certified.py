@@ -23,6 +23,7 @@ from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
 from worker.planners import Trial, Wanted, fitting_pairs, synthesize
+from worker.quality.diversity import POINTS, distinct, hand_points
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
@@ -46,9 +47,9 @@ ROUND_STRIDE: Final = 1 << 20
 SMALLEST_ROUND: Final = 8
 #: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
 _LEAST_RATE: Final = 0.1
-#: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, or it
-#: failed the geometric gate.
-REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate")
+#: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
+#: failed the geometric gate, or it is as good as the same as one that is kept.
+REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "alike")
 #: Shares of a round's progress: planned, judged, measured.
 _PARTS: Final = (0.6, 0.8, 1.0)
 
@@ -73,6 +74,12 @@ class Certified:
     shares: dict[str, float] = field(default_factory=dict)
     """In scenes, of all that were planned: clear_share (free of obstacles at contact, on the way and in the lift),
     lift_share (and lifted), lift_hard_share (and lifted at half the friction)."""
+
+    def keeping(self, kept: NDArray[np.bool_]) -> Certified:
+        """The same without the grasps that are not `kept` (N,): they were too like others."""
+        columns = {path: array if path == _THRESHOLDS else array[kept] for path, array in self.columns.items()}
+        rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + int((~kept).sum())}
+        return replace(self, grasps=self.grasps.take(np.flatnonzero(kept)), columns=columns, rejected=rejected)
 
 
 @dataclass
@@ -182,6 +189,7 @@ class _Work:
         self.scenes: Scenes | None = None
         self.tried = 0
         self._trials: Trial | None = None
+        self._kept = np.zeros((0, POINTS, 3))
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
         self._run = run
         self._round_run = run.part(0.0, 1.0)
@@ -288,9 +296,21 @@ class _Work:
             lost = np.delete(finite, rows)
             fates[lost[fates[lost] == "kept"]] = "dropped"
             fates[finite[rows[~wanted]]] = "gate"
+            alike = self._alike(grasps, wanted)
+            fates[finite[rows[alike]]] = "alike"
+            wanted &= ~alike
             grasps = grasps.take(np.flatnonzero(wanted))
             columns = {path: array if path == _THRESHOLDS else array[wanted] for path, array in columns.items()}
         return _Round(grasps, columns, fates, in_scene)
+
+    def _alike(self, grasps: GraspSet, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(N,) of those `wanted` the ones that are too near to a grasp of the batch that is kept."""
+        found, rows = np.zeros(len(grasps), bool), np.flatnonzero(wanted)
+        points = np.concatenate([self._kept, hand_points(self.hand, grasps.grasp.take(rows))])
+        kept = distinct(points, self.request.min_distance, given=len(self._kept))
+        found[rows] = ~kept[len(self._kept) :]
+        self._kept = points[kept]
+        return found
 
     def _judged_in_scenes(self, grasps: GraspSet, scenes: Scenes) -> tuple[GraspSet, Arrays, dict[str, int]]:
         """The grasps with their ways, their verdicts, and how many were clear and lifted."""

@@ -8,11 +8,14 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+import numpy as np
+
 from service.model.domain import BATCH_SIZE, JobOptions
 from worker.certified import Certified, certified_grasps
 from worker.hands.model import HandModel
 from worker.meeting import Meeting
 from worker.objects.model import ObjectModel
+from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.run import ALONE, Progress, Run
 from worker.simulation.surroundings import Scenes
@@ -21,6 +24,8 @@ from worker.simulation.surroundings import Scenes
 MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
 #: Batches at work for each one in a launch: while one half is on the device, the other is judged and measured.
 PER_LAUNCH: Final = 2
+#: Times that batches are made for grasps that were too like those of another batch.
+_REFILLS: Final = 3
 
 
 @dataclass
@@ -84,6 +89,37 @@ def certified_batches(
     if request.referee != "none":
         pieces(obj)  # once, and not by every batch at the same time
     return _together(batch, len(sizes), join, run)
+
+
+def distinct_batches(
+    hand: HandModel, request: JobOptions, batches: list[Certified], more: Callable[[int, int], Certified]
+) -> list[Certified]:
+    """The batches without grasps too like one of an earlier batch, and further batches in their place.
+
+    A job's tasks know nothing of each other, so this is for whoever has all batches at hand.
+
+    Args:
+        hand: the hand.
+        request: `min_distance` says what is too like; raw grasps are all kept.
+        batches: the batches of a job, from the first.
+        more: makes a batch of so many grasps, of that number within the job.
+    """
+    if request.want == "raw" or request.min_distance <= 0:
+        return batches
+    points = hand_points(hand, batches[0].grasps.grasp)
+    kept = [batches[0]]
+    waiting, missing, refills = batches[1:], 0, 0
+    while waiting:
+        batch = waiting.pop(0)
+        both = np.concatenate([points, hand_points(hand, batch.grasps.grasp)])
+        mask = distinct(both, request.min_distance, given=len(points))
+        points, mine = both[mask], mask[len(points) :]
+        kept.append(batch if mine.all() else batch.keeping(mine))
+        missing += int((~mine).sum())
+        if not waiting and missing and refills < _REFILLS:
+            waiting.append(more(missing, len(batches) + refills))
+            missing, refills = 0, refills + 1
+    return kept
 
 
 def _together(work: Callable[[int, Run], Certified], count: int, join: int, run: Run) -> list[Certified]:

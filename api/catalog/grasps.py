@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 from api.catalog.grasp_files import GraspFiles
-from api.models import GraspDetail, GraspQuery, Histogram, JobDetail
+from api.models import Diversity, GraspDetail, GraspQuery, Histogram, JobDetail
 from service.index.filters import GraspFilter, GraspSort, Metric
+from service.index.queries.statistics import Kinds
 from service.index.views import GraspView, JobView, Page
+from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
 from service.model.metrics import Indexed, indexed
 from service.pipeline.backends import Parts
 
@@ -22,6 +24,7 @@ class Grasps:
         self._index = parts.index
         self._files = GraspFiles(parts.store)
         self._histograms: dict[tuple[str, int], list[Histogram]] = {}
+        self._diversities: dict[tuple[str, int], Diversity | None] = {}
 
     def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         """Grasps that pass every filter."""
@@ -57,10 +60,39 @@ class Grasps:
             self._histograms[key] = found
         return found
 
+    def diversity(self, job: JobView | JobDetail) -> Diversity | None:
+        """Types and directions of the grasps whose distributions `histograms` gives."""
+        judged = job.request.referee != "none"
+        key = (job.id, count := job.valid if judged else job.grasps)
+        if not count:
+            return None
+        if key not in self._diversities:
+            if len(self._diversities) >= _KEPT_HISTOGRAMS:
+                self._diversities.clear()
+            where = GraspFilter(job=job.id, valid=True if judged else None)
+            self._diversities[key] = _told(self._index.statistics.kinds(where))
+        return self._diversities[key]
+
+
+def _told(kinds: Kinds) -> Diversity | None:
+    if not kinds.cells:
+        return None
+    return Diversity(
+        grasps=sum(kinds.cells.values()),
+        types={kind.name.lower(): kinds.types[kind] for kind in GraspType if kinds.types.get(kind)},
+        type_entropy_bits=round(entropy_bits(kinds.types.values()), 4),
+        directions_used=len(kinds.cells),
+        direction_entropy_bits=round(entropy_bits(kinds.cells.values()), 4),
+        evenness=round(evenness(kinds.cells.values(), CELLS), 4),
+    )
+
 
 def grasp_filter(query: GraspQuery) -> GraspFilter:
     """The index's filter behind a request's parameters."""
     bounds: dict[str, dict[Metric, float]] = {"min": {}, "max": {}}
+    if query.type is not None:
+        kind = float(GraspType[query.type.upper()])
+        bounds = {"min": {"grasp_type": kind}, "max": {"grasp_type": kind}}
     for end, metrics in bounds.items():
         for metric in MEAN_METRICS:
             value = getattr(query, f"{end}_{metric}", None)

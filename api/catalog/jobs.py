@@ -154,6 +154,7 @@ class Jobs:
             object_digest=job.object_digest,
             attempts=self._parts.index.jobs.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
+            diversity=self._grasps.diversity(job),
             shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
         )
 

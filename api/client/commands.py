@@ -20,6 +20,7 @@ from api.formatting import count, percent, size
 from api.models import Job
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
+from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import AUDITS, AssetKind, State
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
@@ -38,6 +39,9 @@ def submit(
     grasps: Annotated[int, typer.Option("--grasps", "-n", help="Number of grasps.")] = 32,
     want: Annotated[str, typer.Option(help="valid: that many valid grasps; raw: that many of any kind.")] = "valid",
     budget: Annotated[float, typer.Option(help="Tries for each valid grasp, at most.")] = 4.0,
+    min_distance: Annotated[
+        float, typer.Option(help="No two grasps of a batch are nearer [m], by the mean distance of the hand's points.")
+    ] = MIN_DISTANCE_M,
     referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
     audits: Annotated[
         int, typer.Option(help="Valid grasps judged again by the letter; 8 are spread over the job, one of 64.")
@@ -84,6 +88,7 @@ def submit(
                 "grasps": grasps,
                 "want": want,
                 "budget": budget,
+                "min_distance": min_distance,
                 "referee": referee,
                 "audits": audits,
                 "robustness": robustness,

@@ -12,7 +12,7 @@ from rich.table import Table
 from api.client.client import Client
 from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric, percent
-from api.models import JobDetail
+from api.models import Diversity, JobDetail
 from service.cli import emit, load_settings
 from service.model.domain import AssetKind, JobRequest, State
 from service.model.errors import InputError, TaskError
@@ -128,6 +128,15 @@ def means_of(job: JobDetail) -> str:
     )
 
 
+def diversity_of(found: Diversity) -> str:
+    """Types and directions, in a line."""
+    types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
+    return (
+        f"{types} ({found.type_entropy_bits:.2f} bit); {found.directions_used} of {found.directions} directions "
+        f"({found.direction_entropy_bits:.2f} bit)"
+    )
+
+
 def _print_job(job: JobDetail, url: str) -> None:
     console = Console(highlight=False)
     console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
@@ -144,3 +153,5 @@ def _print_job(job: JobDetail, url: str) -> None:
     console.print(table)
     if job.grasps:
         console.print(f"{yield_of(job)}; {means_of(job)}", markup=False)
+        if job.diversity:
+            console.print(diversity_of(job.diversity), markup=False)

@@ -25,6 +25,7 @@ DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
     "scene": "free", "faces": "drawn", "touch": 0.0, "neighbours": "", "scenes": 0, "views": 0, "stereo": False,
     "width": 320, "height": 240, "want": "valid", "referee": "certificate",
+    "min_distance": 0.005,
 }  # fmt: skip
 
 
@@ -38,7 +39,7 @@ def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
 @router.post("/submit", dependencies=[Depends(may_submit)], response_model=None)
 async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
     """Submit what the form says, after the upload of a hand or a mesh if there is one."""
-    async with request.form(max_files=2, max_fields=24) as fields:
+    async with request.form(max_files=2, max_fields=32) as fields:
         sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
         # A file that the form holds is read and awaited like one that was sent.
         has_upload = sent or any(fields.get(f"{kind.value}_held") for kind in FILE_FIELDS)

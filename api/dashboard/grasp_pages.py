@@ -14,6 +14,7 @@ from api.dashboard.rendering import render
 from api.models import GraspDetail, GraspQuery
 from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, may_read
 from api.routes.paging import next_address
+from service.model.diversity import GraspType
 from service.model.domain import AssetKind
 from service.model.metrics import GRASP_METRICS, Indexed, indexed
 
@@ -23,7 +24,7 @@ COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metri
 #: Metrics of which less is better: a first click sorts them upwards.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
 #: Metrics that stand beside the verdict of a grasp.
-_BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness"})
+_BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "grasp_type", "approach_cell"})
 
 router = APIRouter(include_in_schema=False)
 
@@ -81,6 +82,7 @@ def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shar
         shard=shard,
         job=shards.job_of(shard_id),
         metrics=_metrics(grasp),
+        type=GraspType(int(grasp.grasp_type or 0)),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
         loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
     )

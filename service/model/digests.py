@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, MutableMapping
 from contextlib import AbstractContextManager
 from typing import IO
 
+from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import AssetKind, JobRequest, Stage
 from service.model.version import STAGE_REVISIONS
 
@@ -103,6 +104,8 @@ def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
+        # Its default is part of the stage's revision.
+        found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.referee != "none":
         found |= {"referee": request.referee, "audits": request.audits_of(batch), "robustness": request.robustness}
     return found

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from service.model.diversity import MIN_DISTANCE_M
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
 from service.model.labels import Word as Word
@@ -192,6 +193,15 @@ class JobOptions(Model):
         "were tried",
     )
     budget: float = Field(4.0, ge=1, le=100, description="grasps tried for each valid grasp wanted, at most")
+    min_distance: float = Field(
+        MIN_DISTANCE_M,
+        ge=0,
+        le=0.1,
+        allow_inf_nan=False,
+        exclude_if=lambda value: value == MIN_DISTANCE_M,
+        description="a grasp that is nearer to an earlier one of its batch is not kept [m]: mean distance of the same "
+        "points of the hand, in the object's frame; 0: all are. Goes with want valid",
+    )
     referee: Literal["letter", "certificate", "screen", "none"] = Field(
         "certificate",
         description="level at which MuJoCo judges the grasps (screen: on a GPU, MuJoCo Warp gives the clear verdicts); "

@@ -45,6 +45,8 @@ class GraspMetric:
     """A value at each contact threshold; the index holds the one at `INDEX_THRESHOLD_M`."""
     whole: bool = False
     """A count."""
+    code: bool = False
+    """A number that stands for a kind: sums and means of it say nothing."""
     optional: bool = False
     """A shard may lack it."""
     indexed: Indexed = Indexed.NO
@@ -126,6 +128,15 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "contact_links", "1", "hand bodies within 2 mm of the object", title="Links in contact", whole=True,
         indexed=Indexed.KEPT, digits=0,
+    ),
+    GraspMetric(
+        "grasp_type", "enum", "0 not told, 1 power, 2 precision, 3 lateral: by what of the hand touches", title="Type",
+        whole=True, code=True, optional=True, indexed=Indexed.SORTED, bounds=(0, 3),
+    ),
+    GraspMetric(
+        "approach_cell", "1", "cell of 48 equal ones on the sphere, from which the palm comes, in the object's frame: "
+        "band of height times 12 plus azimuth", title="Cell of the approach", whole=True, code=True, optional=True,
+        indexed=Indexed.KEPT, bounds=(0, 47),
     ),
     GraspMetric(
         "stability_loss", "1", "planner's L_stable; nan: the planner has none", title="Stability loss",

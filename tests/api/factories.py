@@ -137,6 +137,10 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     ):  # fmt: skip
         arrays[f"quality/{name}"] = random.gamma(2.0, scale / 2, count)
     arrays["quality/contact_links"] = random.integers(2, 9, count).astype(np.int32)
+    # Drawn from a generator of their own, so that what stands below is what it was without them.
+    kinds = np.random.default_rng(count)
+    arrays["quality/grasp_type"] = kinds.integers(1, 4, count).astype(np.int32)
+    arrays["quality/approach_cell"] = kinds.integers(0, 48, count).astype(np.int32)
     arrays["quality/valid"] = (random.random(count) < 0.8).astype(np.uint8)
     if request.referee == "none":
         return arrays | {"quality/sound": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobRequest
 from service.model.errors import InputError
 from worker import certified
@@ -20,6 +21,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import Wanted
+from worker.quality.diversity import distances, hand_points
 
 COUNT = 6
 
@@ -71,6 +73,25 @@ def test_tries_count_up_to_the_last_grasp_that_is_kept(
     assert (found.tried, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 8, 3 + 2)
 
 
+def test_a_grasp_like_one_that_is_kept_makes_room_for_another(
+    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = certified.synthesize
+
+    def twins(*given: Any, **named: Any) -> GraspSet:
+        found = real(*given, **named)
+        return found.take(np.arange(len(found)) // 2 * 2)  # each grasp twice
+
+    monkeypatch.setattr(certified, "synthesize", twins)
+    plain = {"referee": "none", "fidelity": "draft", "budget": 8}
+    found = certified_grasps(hand, block, wish(**plain), count=COUNT)
+    points = hand_points(hand, found.grasps.grasp)
+    rows, others = np.triu_indices(len(points), 1)
+    assert len(found.grasps) == COUNT and distances(points, rows, others).min() >= MIN_DISTANCE_M
+    assert found.rejected["alike"] >= COUNT - 1
+    assert certified_grasps(hand, block, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
+
+
 def test_only_as_many_grasps_are_audited_as_were_asked_for(valid: Certified) -> None:
     assert (valid.columns["quality/audit"] >= 0).tolist() == [True] * 2 + [False] * (COUNT - 2)
 
@@ -86,7 +107,7 @@ def test_raw_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: Obj
     assert (len(found.grasps), found.tried, found.rejected) == (
         COUNT,
         COUNT,
-        {"diverged": 0, "dropped": 0, "gate": 0},
+        {"diverged": 0, "dropped": 0, "gate": 0, "alike": 0},
     )
     assert set(np.unique(found.columns["quality/success"])) <= {0, 1}
     assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()

@@ -10,6 +10,7 @@ import pytest
 from service.model.domain import JobOptions, resolve_fidelity
 from service.model.errors import InputError, MeshError, TaskCancelled
 from worker import together
+from worker.certified import Certified, certified_grasps
 from worker.engines.joins import batches_at_once, fitting, parse_join
 from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
@@ -17,7 +18,7 @@ from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
 from worker.pool.pool import Pool
 from worker.run import Run
-from worker.together import MODULES, certified_batches
+from worker.together import MODULES, certified_batches, distinct_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
 
@@ -70,6 +71,23 @@ def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone
         assert_same(certified_batches(*pair, REQUEST, sizes=[2, 2, 2], join=2, run=run), alone)
         assert len(pool.pids) == 2
     assert told[-1] == (6, 6)
+
+
+def test_grasps_alike_in_two_batches_are_replaced_by_those_of_another(pair) -> None:
+    request = REQUEST.model_copy(update={"referee": "none"})
+    first, third = (certified_batches(*pair, request, sizes=[size], run=Run(threads=2))[0] for size in (2, 3))
+    asked: list[tuple[int, int]] = []
+
+    def more(count: int, number: int) -> Certified:
+        asked.append((count, number))
+        return certified_grasps(*pair, request, count=count, batch=number, run=Run(threads=2))
+
+    found = distinct_batches(pair[0], request, [first, third], more)
+    # The second batch begins as the first one does: two of its three are there already.
+    assert asked == [(2, 2)] and [len(one.grasps) for one in found] == [2, 1, 2]
+    assert found[1].rejected["alike"] == 2 and len(found[1].columns["quality/epsilon"]) == 1
+    raw = request.model_copy(update={"want": "raw"})
+    assert distinct_batches(pair[0], raw, [first, third], more) == [first, third]
 
 
 def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.clock import timestamp
+from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
 from service.model.domain import AssetKind
 from service.model.metrics import GRASP_METRICS
 from service.model.version import PACKAGE_VERSION
 from worker.cards.contents import AssetFacts, Contents
-from worker.cards.directions import CELLS, ELEVATION_BINS, ENOUGH, cell_counts, evenness
+from worker.cards.directions import ELEVATION_BINS, ENOUGH, cell_counts
 from worker.cards.tally import CellTally, Tally
 from worker.grasps import Posture
 from worker.quality.diversity import explained_variance
@@ -172,7 +173,7 @@ def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
     for metric in GRASP_METRICS:
         values = np.concatenate([np.empty(0, np.float32), *(cell.column(metric.name) for cell in cells)])
         values = values[np.isfinite(values)].astype(float)
-        if len(values):
+        if len(values) and not metric.code:
             found[metric.name] = {
                 "n": len(values),
                 "mean": _six(values.mean()),
@@ -207,7 +208,21 @@ def _directions(cells: Iterable[CellTally]) -> Row | None:
     if not len(vectors):
         return None
     counts = cell_counts(vectors)
-    return {"grasps": len(vectors), "empty": int((counts == 0).sum()), "evenness": _six(evenness(counts))}
+    return {
+        "grasps": len(vectors),
+        "empty": int((counts == 0).sum()),
+        "evenness": _six(evenness(counts.ravel().tolist(), CELLS)),
+        "entropy_bits": _six(entropy_bits(counts.ravel().tolist())),
+    }
+
+
+def _types(cell: CellTally) -> Row | None:
+    """How many of each type; None if no shard tells."""
+    told = cell.column("grasp_type")
+    if not len(told):
+        return None
+    counts = {kind.name.lower(): int((told == kind).sum()) for kind in GraspType}
+    return {**{name: n for name, n in counts.items() if n}, "entropy_bits": _six(entropy_bits(counts.values()))}
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:
@@ -225,6 +240,7 @@ def _cells(contents: Contents, tally: Tally) -> list[Row]:
         row["median"] = {name: found["median"] for name, found in _quality([cell]).items()}
         row["clear_of_table"] = (_table([cell])["of_grasps"] or {}).get("share")
         row["directions"] = _directions([cell])
+        row["types"] = _types(cell)
         row["diversity"] = _diversity(cell)
         rows.append(row)
     return rows

@@ -85,10 +85,12 @@ def cells_table(card: Row) -> str:
              *(_fixed(median.get(name), QUALITY_NAMES[name][1]) for name in _SHOWN),
              percent(cell["clear_of_table"]), _fixed(cell["diversity"], 2),
              percent(1 - cell["directions"]["empty"] / card["directions"]["cells"]) if cell["directions"] else "-",
+             _bits(cell["directions"]), _bits(cell.get("types")),
              cell["missing_because"] or ""]
         )  # fmt: skip
     head = ["hand", "object", "asked", "tried", "valid", "of tries", *(QUALITY_NAMES[name][0] for name in _SHOWN),
-            "clear of table", "D", "directions used", "missing because"]  # fmt: skip
+            "clear of table", "D", "directions used", "entropy of directions, bit", "of types, bit",
+            "missing because"]  # fmt: skip
     if not any(row[-1] for row in rows):
         head, rows = head[:-1], [row[:-1] for row in rows]
     return markdown(head, rows, words=2)
@@ -129,13 +131,22 @@ def _spread(cell: Row | None, digits: int) -> str:
 
 def _rejected(rejected: Mapping[str, int] | None) -> str:
     """In words: what the tries came to that are not kept."""
-    words = {"dropped": "dropped by the referee", "gate": "failed the gate", "diverged": "diverged"}
+    words = {
+        "dropped": "dropped by the referee",
+        "gate": "failed the gate",
+        "diverged": "diverged",
+        "alike": "too like another",
+    }
     parts = [f"{count:,} {words.get(why, why)}" for why, count in (rejected or {}).items() if count]
     return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
 
 
 def _fixed(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _bits(found: Row | None) -> str:
+    return "-" if not found or "entropy_bits" not in found else f"{found['entropy_bits']:.2f}"
 
 
 def _number(value: int | None) -> str:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import FIDELITIES, JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import parse_scene
@@ -57,6 +58,12 @@ def synth(
     allow_open: AllowOpenOption = False,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core", min=0)] = 0,
+    min_distance: Annotated[
+        float,
+        typer.Option(
+            min=0, max=0.1, help="No two grasps are nearer [m]: mean distance of the same points of the hand; 0: any."
+        ),
+    ] = MIN_DISTANCE_M,
     join: Annotated[str, typer.Option(help="Batches of 32 that are planned in one launch, or auto.")] = "auto",
     scene: Annotated[
         str, typer.Option(help="Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.")
@@ -83,7 +90,7 @@ def synth(
     request = _request(want, budget, referee).model_copy(
         update={
             "grasps": grasps, "method": method, "options": parsed_options(option or []), "seed": seed,
-            "friction": friction, "fidelity": chosen_fidelity(fidelity, contact_solver),
+            "friction": friction, "min_distance": min_distance, "fidelity": chosen_fidelity(fidelity, contact_solver),
         }
     )  # fmt: skip
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
@@ -142,6 +149,8 @@ def _said(found: dict[str, Any]) -> str:
             f"; mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "
             f"penetration {mean['penetration_depth_mm']:.2f} mm"
         )
+        types = ", ".join(f"{number} {name}" for name, number in found["types"].items())
+        lines.append(f"{types}; from {found['directions_used']} of {CELLS} directions")
     if "scene" in found:
         lines.append(
             f"{found['scene']}, {found['scenes']} scenes: {found['clear_share']:.0%} of the tries are clear of what "

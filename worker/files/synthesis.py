@@ -11,12 +11,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.diversity import CELLS, GraspType, entropy_bits
 from service.model.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
-from worker.certified import Certified, joined_columns
+from worker.certified import Certified, certified_grasps, joined_columns
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
 from worker.files.base_attributes import base_attributes
@@ -31,7 +32,7 @@ from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
-from worker.together import MODULES, certified_batches
+from worker.together import MODULES, certified_batches, distinct_batches
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].
@@ -73,9 +74,21 @@ class Synthesized:
                 "penetration_depth_mm": self._mean("penetration_depth_mm", 3),
             },
         }
+        told |= self._diversity()
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
         return told
+
+    def _diversity(self) -> dict[str, Any]:
+        """Types of the grasps, and the entropies of types and of directions of approach."""
+        types = np.bincount(self.arrays["quality/grasp_type"], minlength=len(GraspType))
+        cells = np.bincount(self.arrays["quality/approach_cell"], minlength=CELLS)
+        return {
+            "types": {kind.name.lower(): int(types[kind]) for kind in GraspType if types[kind]},
+            "type_entropy_bits": round(entropy_bits(types.tolist()), 4),
+            "directions_used": int((cells > 0).sum()),
+            "direction_entropy_bits": round(entropy_bits(cells.tolist()), 4),
+        }
 
     def _mean(self, name: str, digits: int) -> float | None:
         values = self.arrays[f"quality/{name}"]
@@ -149,6 +162,12 @@ def synthesized(
     with _pool(processes_at_once(chosen, processes, threads=threads)) as pool:
         run = replace(run, pool=pool)
         batches = certified_batches(model, thing, request, sizes=sizes, join=joined, scenes=where, run=run)
+        batches = distinct_batches(
+            model, request, batches,
+            lambda count, number: certified_grasps(
+                model, thing, request, count=count, batch=number, scenes=where, run=run.quiet()
+            ),
+        )  # fmt: skip
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in _KEPT if name in poses}

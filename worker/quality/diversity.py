@@ -1,13 +1,25 @@
-"""How different the grasps of a set are (DexGraspBench)."""
+"""How different the grasps of a set are: variance (DexGraspBench), and near-duplicates."""
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from service.model.transforms import apply
 from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.hands.surface import sample_surface
 
 Floats = NDArray[np.float64]
+
+#: Points of the hand's surface by which two postures are compared, spread evenly over it.
+POINTS: Final = 64
+#: Pairs of grasps that are compared at a time.
+_PAIRS: Final = 4096
 
 
 def explained_variance(posture: Posture) -> Floats:
@@ -25,6 +37,45 @@ def explained_variance(posture: Posture) -> Floats:
     variance = singular**2
     total = float(variance.sum())
     return variance / total if total > 0 else np.zeros(len(variance))
+
+
+def hand_points(hand: HandModel, posture: Posture) -> Floats:
+    """(N, P, 3) where the same `POINTS` points of the hand's surface are in N postures, object frame [m].
+
+    The distance of two grasps is the mean distance of these points: a metric over the hand's pose and joints together,
+    in metres, in which a joint counts by what it moves. What an object's symmetry makes alike is not alike here.
+    """
+    points = sample_surface(hand, POINTS)
+    poses = body_poses(hand, posture.hand_pose, posture.joint_positions)
+    return np.asarray(apply(poses[:, points.body], points.position))
+
+
+def distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) -> Floats:
+    """(K,) distance of the grasps `one` from `other` (K,), rows of what `hand_points` gives [m]."""
+    parts = [slice(i, i + _PAIRS) for i in range(0, len(one), _PAIRS)]
+    found = [np.linalg.norm(points[one[part]] - points[other[part]], axis=2).mean(axis=1) for part in parts]
+    return np.concatenate([np.zeros(0), *found])
+
+
+def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
+    """(N,) grasps to keep so that no two are nearer than `least` [m]: each that is not near to one kept before it.
+
+    Args:
+        points: (N, P, 3) of `hand_points`.
+        least: least distance; 0 keeps all.
+        given: so many of the first are kept whatever is near them.
+    """
+    kept = np.ones(len(points), bool)
+    if least <= 0 or len(points) < 2:
+        return kept
+    # The mean distance of points is at least the distance of their means.
+    pairs = cKDTree(points.mean(axis=1)).query_pairs(least, output_type="ndarray")
+    near = pairs[distances(points, pairs[:, 0], pairs[:, 1]) < least]
+    near = near[near[:, 1] >= given]
+    for first, second in near[np.lexsort((near[:, 0], near[:, 1]))].tolist():
+        if kept[first]:
+            kept[second] = False
+    return kept
 
 
 def _rotation_vector(quaternion: Floats) -> Floats:

@@ -18,10 +18,12 @@ from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.content import content_of
 from worker.objects.model import ObjectModel
+from worker.quality.approach import approach_cells
 from worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
 from worker.quality.overlap import Overlap
 from worker.quality.penetration import penetration_depth
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
+from worker.quality.taxonomy import grasp_types
 from worker.quality.volume import SharedVolume
 from worker.quality.wrench_space import Norm, measure_spaces, wrenches
 from worker.run import ALONE, Count, Run
@@ -194,4 +196,6 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
     "penetration_depth_mm": lambda chunk: penetration_depth(chunk.found) * 1e3,
     "self_penetration_depth_mm": lambda chunk: chunk.found.self_depth * 1e3,
     "contact_links": lambda chunk: contact_links(chunk.pair.probe.body_distance(chunk.found)),
+    "grasp_type": lambda chunk: grasp_types(chunk.pair.probe, chunk.found),
+    "approach_cell": lambda chunk: approach_cells(chunk.pair.probe.hand, chunk.found.bodies[:, 0, 3:]),
 }

@@ -48,6 +48,16 @@ class Distributions:
 
 
 @dataclass(frozen=True)
+class Kinds:
+    """Of what types grasps are, and from which cells of the sphere the palm comes; grasps that tell neither are left
+    out."""
+
+    types: dict[int, int]
+    """How many are of each `GraspType`."""
+    cells: dict[int, int]
+
+
+@dataclass(frozen=True)
 class Statistics:
     """Reads on all grasps that pass a filter."""
 
@@ -91,15 +101,35 @@ class Statistics:
         The id of a shard is a digest, so those below a bound are a fair sample, and they lie side by side in the index.
         """
         with self.database.reading() as connection:
-            total = _size(connection, where)
-            share = min(1.0, at_most / max(1, total))
-            sampled = [] if share == 1.0 else [grasps.c.shard_id < f"{round(share * 16**8):08x}"]
-            tests = [c.sql(["shard", "job"]) for c in conditions(where)]
-            query = select(*(grasps.c[metric] for metric in metrics)).where(*tests, *sampled)
+            share, tests = _sampled(connection, where, at_most)
+            query = select(*(grasps.c[metric] for metric in metrics)).where(*tests)
             rows = [tuple(row) for row in connection.execute(query)]
         values = np.array(rows, float).reshape(-1, len(metrics))
         found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
         return Distributions(len(values), share, {metric: data for metric, data in found.items() if data is not None})
+
+    def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> Kinds:
+        """Types and directions, from about `at_most` grasps as `distributions` draws them."""
+        columns = grasps.c.grasp_type, grasps.c.approach_cell
+        with self.database.reading() as connection:
+            _, tests = _sampled(connection, where, at_most)
+            query = select(*columns, func.count()).where(*tests).group_by(*columns)
+            rows = [tuple(row) for row in connection.execute(query)]
+        found = Kinds({}, {})
+        for kind, cell, count in rows:
+            for counts, value in ((found.types, kind), (found.cells, cell)):
+                if value is not None:
+                    counts[int(value)] = counts.get(int(value), 0) + int(count)
+        return found
+
+
+def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> tuple[float, list[ColumnElement[bool]]]:
+    """The share of shards that about `at_most` grasps come from, and the filter with the choice of these."""
+    share = min(1.0, at_most / max(1, _size(connection, where)))
+    tests = [c.sql(["shard", "job"]) for c in conditions(where)]
+    if share < 1.0:
+        tests.append(grasps.c.shard_id < f"{round(share * 16**8):08x}")
+    return share, tests
 
 
 def _size(connection: Connection, where: GraspFilter) -> int:

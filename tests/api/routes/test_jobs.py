@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
 from api.client.client import events_of
+from service.model.diversity import GraspType
 from service.model.planning import plan
 from service.pipeline.backends import Parts
 from tests.api.factories import add_job, fail, finish, finish_all
@@ -49,6 +53,21 @@ def test_a_finished_job_says_its_counts_means_and_shards(http: TestClient, parts
     assert (job["state"], job["grasps"], job["valid"], job["progress"]) == ("succeeded", 40, len(valid), 1.0)
     assert job["mean"]["epsilon"] == pytest.approx(sum(grasp.epsilon or 0 for grasp in valid) / len(valid))
     assert {shard["id"] for shard in job["shards"]} == {manifest.shard_id for manifest in manifests}
+
+
+def test_a_finished_job_says_how_different_its_grasps_are(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts, grasps=40)
+    manifests = finish_all(parts, record)
+    found = http.get(f"/v1/jobs/{record.id}").json()["diversity"]
+    valid = [grasp for manifest in manifests for grasp in manifest.grasps if grasp.valid]
+    types = Counter(GraspType(grasp.grasp_type).name.lower() for grasp in valid)
+    cells = Counter(grasp.approach_cell for grasp in valid)
+    assert found["types"] == dict(types) and found["grasps"] == len(valid)
+    assert found["directions_used"] == len(cells) and found["directions"] == 48
+    shares = np.array(list(cells.values())) / len(valid)
+    assert found["direction_entropy_bits"] == pytest.approx(-(shares * np.log2(shares)).sum(), abs=1e-4)
+    page = http.get("/v1/grasps", params={"job": record.id, "type": "power", "valid": True, "limit": 200}).json()
+    assert len(page["items"]) == types["power"] and {one["grasp_type"] for one in page["items"]} == {1}
 
 
 def test_a_half_done_job_says_how_far_each_stage_is(http: TestClient, parts: Parts) -> None:

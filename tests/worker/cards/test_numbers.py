@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.model.diversity import BANDS, SECTORS, evenness
 from service.model.domain import Stage
 from service.model.transforms import quat_from_axis_angle
 from service.readers import Grasps
@@ -15,7 +16,7 @@ from service.store.manifests import load_manifest
 from service.store.shards import read_shard
 from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import SECONDS, STILL_HAND, STILL_JOINT, Array
-from worker.cards.directions import BANDS, SECTORS, cell_counts, elevations, evenness
+from worker.cards.directions import cell_counts, elevations
 from worker.cards.findings import findings
 from worker.cards.joints import JointUse
 from worker.cards.numbers import share
@@ -168,12 +169,12 @@ def test_cells_of_the_sphere_have_equal_areas() -> None:
     counts = cell_counts(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
     assert counts.shape == (BANDS, SECTORS) and counts.sum() == 48_000
     assert np.abs(counts - 1000).max() < 6 * np.sqrt(1000)  # six standard deviations of a count
-    assert evenness(counts) == pytest.approx(1.0, abs=0.01)
+    assert evenness(counts.ravel(), counts.size) == pytest.approx(1.0, abs=0.01)
 
 
 def test_evenness_of_one_direction_is_one_cell() -> None:
     counts = cell_counts(np.tile([0.0, 0.0, 1.0], (10, 1)))
-    assert evenness(counts) == pytest.approx(1 / 48) and evenness(np.zeros((4, 12), np.int64)) == 0
+    assert evenness(counts.ravel(), counts.size) == pytest.approx(1 / 48) and evenness([0] * 48, 48) == 0
 
 
 def test_elevations_are_degrees_over_the_horizontal() -> None:

@@ -1,0 +1,65 @@
+"""How different raw standard grasps are: near pairs, types, directions of approach.
+
+usage: python benchmarks/diversity.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--grasps 64]
+DATA_DIR holds hands/ and objects/. Prints Markdown. Stopped runs go on, grasps of other studies serve (see cells.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from cells import HANDS, Cell, cells
+
+from service.model.diversity import CELLS, GraspType, entropy_bits
+from worker.quality.diversity import distances, hand_points
+from worker.quality.table import measure
+
+NEAR_MM = (5, 10, 20)
+
+
+def line(cell: Cell) -> tuple[str, list[int]]:
+    """A row of the table, and how many pairs are nearer than each of `NEAR_MM`, then all pairs."""
+    grasp = cell.grasps.grasp
+    rows, others = np.triu_indices(len(grasp), 1)
+    apart = 1e3 * distances(hand_points(cell.hand, grasp), rows, others)
+    columns = measure(cell.hand, cell.obj, cell.grasps, thresholds_m=[0.005])
+    types = Counter(GraspType(int(one)).name.lower() for one in columns["quality/grasp_type"])
+    cells_used = np.bincount(columns["quality/approach_cell"], minlength=CELLS).tolist()
+    near = [int((apart < bound).sum()) for bound in NEAR_MM]
+    shares = " | ".join(f"{types[name] / len(grasp):.2f}" for name in ("power", "precision", "lateral"))
+    text = (
+        f"| {cell.hand_name} | {cell.object_name} | {apart.min():.1f} | {' | '.join(map(str, near))} | {shares} "
+        f"| {entropy_bits(types.values()):.2f} | {sum(n > 0 for n in cells_used)} | {entropy_bits(cells_used):.2f} |"
+    )
+    return text, [*near, len(apart)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--grasps", type=int, default=64)
+    args = parser.parse_args()
+    sys.stdout.write(
+        f"| hand | object | nearest, mm | {' | '.join(f'< {n} mm' for n in NEAR_MM)} | power | precision | lateral "
+        "| types, bit | directions | directions, bit |\n|" + " --- |" * 2 + " --: |" * (7 + len(NEAR_MM)) + "\n"
+    )
+    sums = np.zeros(len(NEAR_MM) + 1, int)
+    for hand in args.hands:
+        for cell in cells(args.data, args.work, hand, args.grasps, args.objects):
+            text, counts = line(cell)
+            sys.stdout.write(text + "\n")
+            sys.stdout.flush()
+            sums += counts
+    near = ", ".join(f"{n} mm: {s}" for n, s in zip(NEAR_MM, sums, strict=False))
+    sys.stdout.write(f"\n{sums[-1]} pairs; nearer than {near}.\n")
+
+
+if __name__ == "__main__":
+    main()
