@@ -10,6 +10,7 @@ from service.index.views import AttemptView, GraspView, ShardView, StageProgress
 from service.model.diversity import CELLS
 from service.model.domain import JobRequest, Stage, State
 from service.model.metric_fields import OfferedName, filters, means, with_fields
+from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind
 
 
@@ -109,6 +110,9 @@ class GraspQuery(BaseModel):
     lift_hard: bool | None = Field(None, description="lifted at half the friction")
     pushes_held: bool | None = Field(
         None, description="planned in a scene, and holds against the six pushes without it"
+    )
+    robust_weakest: Literal[WORDS] | None = Field(  # type: ignore[valid-type]
+        None, description="axis of the first model around the nominal one in which it does not hold"
     )
     sort: OfferedName = "epsilon"
     order: Literal["asc", "desc"] = "desc"

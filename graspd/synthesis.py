@@ -30,6 +30,8 @@ def synthesize(
     budget: float = 4.0,
     min_distance: float = MIN_DISTANCE_M,
     referee: Literal["letter", "certificate", "screen", "none"] = "certificate",
+    robust: float = 0.0,
+    robust_models: int = 0,
     method: str = "fast_graspd",
     options: dict[str, Any] | None = None,
     fidelity: str = "standard",
@@ -60,6 +62,8 @@ def synthesize(
         budget: grasps tried for each one wanted, at most.
         min_distance: no two grasps are nearer [m]: mean distance of the same points of the hand, in the object's frame.
         referee: level at which MuJoCo judges; none: nobody, and grasps are sound at best.
+        robust: share of models around the nominal one that a grasp must hold in to count (docs/quality.md).
+        robust_models: how many such models; 0: 8 where a share is wanted, else none.
         method: the planner.
         options: its own options, such as {"steps": 20000}.
         fidelity: draft, standard or fine.
@@ -85,7 +89,8 @@ def synthesize(
     try:
         request = JobOptions(
             grasps=count, want=want, budget=budget, referee=referee, method=method, options=options or {}, seed=seed,
-            friction=friction, min_distance=min_distance, audits=0,
+            friction=friction, min_distance=min_distance, audits=0, robust=robust,
+            robust_models=robust_models,
         )  # fmt: skip
     except ValidationError as error:
         raise InputError(validation_line(error)) from None

@@ -1,15 +1,16 @@
 """Grasps with their quality and verdict: planned in rounds until enough are valid or the budget ends.
 
 A grasp is sound if it passes the geometric gate, and valid if the referee says besides that it holds. Where nobody
-judges, sound ones are counted in their place and none is valid. The dear steps come last: a grasp that the referee
-drops is not measured.
+judges, sound ones are counted in their place and none is valid. Where a share of models is wanted, valid grasps that
+hold in so many count. The dear steps come last: a grasp that the referee drops is not measured, and one that is not
+valid is judged in no other model.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import BATCH_SIZE, JobOptions
-from worker.grasps import GraspSet, joined
+from worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
@@ -32,6 +33,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.lifting import judge_lifts, lift_key
 from worker.quality.referee.protocol import DIRECTIONS
+from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
 from worker.run import ALONE, Run
@@ -48,8 +50,8 @@ SMALLEST_ROUND: Final = 8
 #: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
 _LEAST_RATE: Final = 0.1
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
-#: failed the geometric gate, or it is as good as the same as one that is kept.
-REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "alike")
+#: failed the geometric gate, holds in too few models around the nominal one, or is as good as the same as one kept.
+REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "fragile", "alike")
 #: Shares of a round's progress: planned, judged, measured.
 _PARTS: Final = (0.6, 0.8, 1.0)
 
@@ -77,7 +79,7 @@ class Certified:
 
     def keeping(self, kept: NDArray[np.bool_]) -> Certified:
         """The same without the grasps that are not `kept` (N,): they were too like others."""
-        columns = {path: array if path == _THRESHOLDS else array[kept] for path, array in self.columns.items()}
+        columns = {path: array if path == THRESHOLDS else array[kept] for path, array in self.columns.items()}
         rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + int((~kept).sum())}
         return replace(self, grasps=self.grasps.take(np.flatnonzero(kept)), columns=columns, rejected=rejected)
 
@@ -217,11 +219,13 @@ class _Work:
         # the share of valid ones would look worse than it is.
         places = np.flatnonzero(fates == "kept")
         tried = int(places[count - 1]) + 1 if len(places) > count else len(fates)
-        reasons = [name for name in REJECTIONS if name != "blocked" or self.scenes is not None]
+        absent = {"blocked"} if self.scenes is None else set()
+        absent |= set() if self.request.robust else {"fragile"}
+        reasons = [name for name in REJECTIONS if name not in absent]
         rejected = {name: int(np.count_nonzero(fates[:tried] == name)) for name in reasons}
         kept = np.arange(min(count, len(grasps)))
         grasps = grasps.take(kept)
-        columns = {path: array if path == _THRESHOLDS else array[kept] for path, array in columns.items()}
+        columns = {path: array if path == THRESHOLDS else array[kept] for path, array in columns.items()}
         found = Certified(grasps, columns, tried, rejected, None, len(fates), self.seconds, self._shares(rounds))
         if self.pieces is None:
             return found
@@ -275,7 +279,7 @@ class _Work:
 
     def score(self, planned: GraspSet) -> _Round:
         """Judge and measure grasps, and keep those that are wanted; a hand that is no number is never one of them."""
-        fates = np.where(_finite(planned), "kept", "diverged")
+        fates = np.where(planned.finite, "kept", "diverged")
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "raw"
@@ -291,16 +295,22 @@ class _Work:
         sound = columns["quality/sound"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
         columns["quality/valid"] = (sound & held).astype(np.uint8)
+        if self.request.models:
+            columns |= self._in_models(grasps, held if every else sound & held)
         if not every:
             wanted = sound if self.pieces is None else sound & held
             lost = np.delete(finite, rows)
             fates[lost[fates[lost] == "kept"]] = "dropped"
             fates[finite[rows[~wanted]]] = "gate"
+            if self.request.robust:
+                enough = reaches(columns["quality/robust_share"], self.request.robust)
+                fates[finite[rows[wanted & ~enough]]] = "fragile"
+                wanted &= enough
             alike = self._alike(grasps, wanted)
             fates[finite[rows[alike]]] = "alike"
             wanted &= ~alike
             grasps = grasps.take(np.flatnonzero(wanted))
-            columns = {path: array if path == _THRESHOLDS else array[wanted] for path, array in columns.items()}
+            columns = {path: array if path == THRESHOLDS else array[wanted] for path, array in columns.items()}
         return _Round(grasps, columns, fates, in_scene)
 
     def _alike(self, grasps: GraspSet, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -337,6 +347,18 @@ class _Work:
             "quality/verdict_margin": verdicts.margin,
             **({"quality/judged_by": verdicts.judged_by} if first_terms(self.hand, self._level, self._run) else {}),
         }
+
+    def _in_models(self, grasps: GraspSet, held: NDArray[np.bool_]) -> Arrays:
+        """Share of the models around the nominal one in which those that hold there do, and what they fail first of."""
+        assert self.pieces is not None
+        wish = self.request
+        # Raw grasps are all kept: their shares are told whole.
+        found = robust(
+            self.hand, self.obj, grasps, held=held, models=wish.models, seed=wish.seed, pieces=self.pieces.result(),
+            wanted=wish.robust if wish.want == "valid" else 0, run=self._round_run.quiet(),
+        )  # fmt: skip
+        self.seconds["referee"] += found.seconds
+        return {"quality/robust_share": found.share, "quality/robust_weakest": found.weakest}
 
     def _measured(self, grasps: GraspSet) -> Arrays:
         began = time.perf_counter()
@@ -377,21 +399,3 @@ class _Work:
     def _part(self, number: int) -> Run:
         """The run of one part of the present round."""
         return self._round_run.part((0.0, *_PARTS)[number], _PARTS[number])
-
-
-_THRESHOLDS: Final = "quality/thresholds_m"
-
-
-def _finite(grasps: GraspSet) -> NDArray[np.bool_]:
-    """(N,) whether all numbers of a grasp's postures are finite."""
-    parts = (grasps.grasp, grasps.pregrasp, grasps.squeeze)
-    rows = np.concatenate([array for part in parts for array in (part.hand_pose, part.joint_positions)], axis=1)
-    return np.asarray(np.isfinite(rows).all(axis=1))
-
-
-def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> Arrays:
-    """Base columns of several sets of grasps as one; the thresholds are common to all."""
-    return {
-        path: parts[0][path] if path == _THRESHOLDS else np.concatenate([part[path] for part in parts])
-        for path in parts[0]
-    }

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
+#: The one column of a base shard that is no row for each grasp.
+THRESHOLDS: Final = "quality/thresholds_m"
 #: Columns of grasps in scenes; there are all of them or none.
 _IN_SCENES = ("scene_index", "approach", "approach_joint_positions", "lift")
 
@@ -61,6 +63,13 @@ class GraspSet:
 
     def __len__(self) -> int:
         return len(self.grasp)
+
+    @property
+    def finite(self) -> NDArray[np.bool_]:
+        """(N,) whether all numbers of a grasp's postures are finite."""
+        parts = (self.grasp, self.pregrasp, self.squeeze)
+        rows = np.concatenate([array for part in parts for array in (part.hand_pose, part.joint_positions)], axis=1)
+        return np.asarray(np.isfinite(rows).all(axis=1))
 
     def take(self, rows: NDArray[np.intp] | slice) -> GraspSet:
         """Some of the grasps, in the order of `rows`; what the planner said of the whole set stays."""
@@ -114,6 +123,14 @@ def joined(sets: Sequence[GraspSet]) -> GraspSet:
     opens = [part.coming for part in sets if part.coming is not None]
     coming = np.concatenate(opens) if len(opens) == len(sets) else None
     return GraspSet(grasp, pregrasp, squeeze, loss, seconds, dict(sets[0].info), approach, coming, scene, lift)
+
+
+def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:
+    """Base columns of several sets of grasps as one; the thresholds are common to all."""
+    return {
+        path: parts[0][path] if path == THRESHOLDS else np.concatenate([part[path] for part in parts])
+        for path in parts[0]
+    }
 
 
 def _joined(parts: Sequence[Posture]) -> Posture:

@@ -108,6 +108,7 @@ def grasp_filter(query: GraspQuery) -> GraspFilter:
         neighbours=query.neighbours,
         lift_hard=query.lift_hard,
         pushes_held=query.pushes_held,
+        robust_weakest=query.robust_weakest,
         at_least=bounds["min"],
         at_most=bounds["max"],
     )

@@ -47,6 +47,10 @@ def submit(
         int, typer.Option(help="Valid grasps judged again by the letter; 8 are spread over the job, one of 64.")
     ] = AUDITS,
     robustness: Annotated[int, typer.Option(help="Verdicts under noise for each valid grasp.")] = 0,
+    robust: Annotated[
+        float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.")
+    ] = 0.0,
+    robust_models: Annotated[int, typer.Option(help="Models each valid grasp is judged in; 0: 8 with --robust.")] = 0,
     method: Annotated[str, typer.Option(help="Planner.")] = "fast_graspd",
     option: Annotated[
         list[str] | None, typer.Option(help="An option of the planner, such as steps=20000; several times.")
@@ -92,6 +96,8 @@ def submit(
                 "referee": referee,
                 "audits": audits,
                 "robustness": robustness,
+                "robust": robust,
+                "robust_models": robust_models,
                 "method": method,
                 "options": pairs(option or []),
                 "fidelity": fidelity,

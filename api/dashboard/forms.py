@@ -25,7 +25,7 @@ DEFAULTS: Final[dict[str, Any]] = {
     "hand": "allegro", "object": "mug", "grasps": 32, "fidelity": "standard", "seed": 0, "friction": 1.0,
     "scene": "free", "faces": "drawn", "touch": 0.0, "neighbours": "", "scenes": 0, "views": 0, "stereo": False,
     "width": 320, "height": 240, "want": "valid", "referee": "certificate",
-    "min_distance": 0.005,
+    "min_distance": 0.005, "robust": 0.0,
 }  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from api.routes.paging import next_address
 from service.model.diversity import GraspType
 from service.model.domain import AssetKind
 from service.model.metrics import GRASP_METRICS, Indexed, indexed
+from service.model.robust import MEANINGS
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 #: Sort key, label, unit of the metrics that lists of grasps show.
@@ -24,7 +25,9 @@ COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metri
 #: Metrics of which less is better: a first click sorts them upwards.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
 #: Metrics that stand beside the verdict of a grasp.
-_BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "grasp_type", "approach_cell"})
+_BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
+#: What differs along the axes of models around the nominal one.
+_WEAKEST: Final = {axis.word: words for axis, words in MEANINGS.items()}
 
 router = APIRouter(include_in_schema=False)
 
@@ -55,6 +58,7 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: As
         rows=rows,
         models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
+        weakest=list(_WEAKEST.items()),
         limits={metric.name: metric.limits for metric in indexed(Indexed.OFFERED)},
         sort=query.sort,
         sorts=[(key, label) for key, label, _ in COLUMNS],
@@ -83,6 +87,7 @@ def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shar
         job=shards.job_of(shard_id),
         metrics=_metrics(grasp),
         type=GraspType(int(grasp.grasp_type or 0)),
+        weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
         loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
     )

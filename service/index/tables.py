@@ -147,6 +147,7 @@ grasps: Final = Table(
     Column("neighbours", Integer, nullable=False, server_default="0"),
     Column("lift_hard", Boolean),
     Column("pushes_held", Boolean),
+    Column("robust_weakest", String(16)),
     Column("created", String(32), nullable=False),
     *(Index(f"grasps_{name}", name, "shard_id", "row") for name in (*METRICS, "created")),
     Index("grasps_by_pair", "hand", "object", "epsilon", "shard_id", "row"),

@@ -148,6 +148,9 @@ class GraspView(View):
     pushes_held: bool | None = Field(
         None, description="in a scene: held against the six pushes without it; None: not tested"
     )
+    robust_weakest: str | None = Field(
+        None, description="axis of the first model in which it does not hold; None: held in all, or not judged there"
+    )
     created: str
 
     if TYPE_CHECKING:

@@ -108,6 +108,8 @@ def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.referee != "none":
         found |= {"referee": request.referee, "audits": request.audits_of(batch), "robustness": request.robustness}
+    if request.models:
+        found |= {"robust": [request.models, request.robust]}
     return found
 
 

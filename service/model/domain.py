@@ -16,6 +16,7 @@ from service.model.diversity import MIN_DISTANCE_M
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
 from service.model.labels import Word as Word
+from service.model.robust import MODELS, MOST_MODELS
 from service.model.scene_options import (
     BesideOption,
     NamedNeighbour,
@@ -213,6 +214,15 @@ class JobOptions(Model):
         "spread over the job, one of 64, and take a twentieth of its time; of any other number the first ones",
     )  # fmt: skip
     robustness: int = Field(0, ge=0, le=20, description="verdicts under noise that each valid grasp gets")
+    robust: float = Field(
+        0.0, ge=0, le=1, allow_inf_nan=False, exclude_if=lambda value: value == 0,
+        description="share of models around the nominal one in which a grasp must hold to count; 0: none is wanted. "
+        "Where raw grasps are wanted all are kept, whatever their share",
+    )  # fmt: skip
+    robust_models: int = Field(
+        0, ge=0, le=MOST_MODELS, exclude_if=lambda value: value == 0,
+        description=f"models in which each valid grasp is judged too; 0: {MODELS} where a share is wanted, else none",
+    )  # fmt: skip
     options: dict[
         Annotated[str, Field(max_length=40)],
         Annotated[int, Field(ge=-(2**53), le=2**53)]
@@ -264,6 +274,8 @@ class JobOptions(Model):
             raise ValueError(f"method {self.method} plans around free objects only: with a scene take fast_graspd")
         if self.robustness:
             raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
+        if self.models:
+            raise ValueError("robust grasps hold the six pushes of free grasps in other models: with scene free only")
         return self
 
     @model_validator(mode="after")
@@ -276,7 +288,14 @@ class JobOptions(Model):
     def _noise_needs_a_referee(self) -> Self:
         if self.robustness and self.referee == "none":
             raise ValueError("robustness counts verdicts: choose a referee")
+        if self.models and self.referee == "none":
+            raise ValueError("robust counts verdicts: choose a referee")
         return self
+
+    @property
+    def models(self) -> int:
+        """Models around the nominal one in which each valid grasp is judged; 0: none."""
+        return self.robust_models or (MODELS if self.robust else 0)
 
     @property
     def place(self) -> SceneSpec:

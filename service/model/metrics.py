@@ -121,6 +121,12 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         bounds=(0, 1), digits=2, plot="whole",
     ),
     GraspMetric(
+        "robust_share", "1", "share of the models around the nominal one in which it holds too; where judging ended "
+        "early, what it is at least, or at most below the wanted one; nan: not judged there",
+        title="Models survived", short="Robust", optional=True, indexed=Indexed.OFFERED, bounds=(0, 1), digits=2,
+        plot="whole",
+    ),
+    GraspMetric(
         "clearance_m", "m", "least room of the hand among supports: coming, closing and lifting",
         title="Clearance in its scene", short="Clearance", optional=True, indexed=Indexed.OFFERED,
         bounds=(-1, 1), digits=4,

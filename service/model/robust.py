@@ -42,3 +42,12 @@ MEANINGS: Final[dict[Axis, str]] = {
     Axis.CALIBRATION: "calibration of the hand",
     Axis.ORDER: "order of closing",
 }
+
+
+#: Words of the axes.
+WORDS: Final = tuple(axis.word for axis in MEANINGS)
+
+
+def axis_word(number: int) -> str | None:
+    """The word of an axis as a shard has it; None: none, or one that this version does not know."""
+    return Axis(number).word if number in MEANINGS else None

@@ -16,6 +16,7 @@ from service.model.clock import timestamp
 from service.model.domain import Digest, JobRequest, Stage, TaskMessage
 from service.model.metric_fields import values, with_fields
 from service.model.metrics import indexed
+from service.model.robust import axis_word
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.store import standing
 from service.store.integrity import read_checked
@@ -38,6 +39,9 @@ class GraspSummary(BaseModel):
     verdict_level: str | None = Field(None, description="level of the referee that gave `success`")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half the friction")
     pushes_held: bool | None = Field(None, description="in a scene: held against the six pushes without it")
+    robust_weakest: str | None = Field(
+        None, description="axis of the first model in which it does not hold; None: held in all, or not judged there"
+    )
 
 
 class ShardManifest(BaseModel):
@@ -170,6 +174,7 @@ def summarise(
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
     for name, path in (("lift_hard", "quality/lift_hard"), ("pushes_held", "quality/pushes")):
         columns[name] = [_verdict(int(v)) for v in arrays.get(path, np.full(count, -1))]
+    columns["robust_weakest"] = [axis_word(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))]
     rows = zip(*columns.values(), strict=True)
     return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from service.model.clock import timestamp
 from service.model.errors import DamagedShard, InputError
 from service.model.metrics import GRASP_METRICS
+from service.model.robust import MEANINGS
 from service.model.version import PACKAGE_VERSION
 from service.store.attributes import Attribute, check_attributes
 from service.store.integrity import check_file
@@ -122,6 +123,15 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             optional=True,
         ),
         **_measured(optional=True),
+        "quality/robust_weakest": Column(
+            "N",
+            "u1",
+            "enum",
+            "none",
+            "what differed in the first model around the nominal one in which it does not hold: 0 none, "
+            + ", ".join(f"{axis:d} {words}" for axis, words in MEANINGS.items()),
+            optional=True,
+        ),
         # Grasps that were planned for a scene say which, and how they are reached and lifted there.
         "scene/object_pose": Column(
             "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up", optional=True

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from service.model.diversity import MIN_DISTANCE_M
 from service.model.domain import JobRequest
 from service.model.errors import InputError
+from service.model.robust import Axis
 from worker import certified
 from worker.certified import Certified, certified_grasps, next_round
 from worker.grasps import GraspSet, Posture
@@ -22,6 +23,7 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import Wanted
 from worker.quality.diversity import distances, hand_points
+from worker.quality.referee.robust import Robustness
 
 COUNT = 6
 
@@ -189,3 +191,37 @@ def test_rounds_end_with_enough_grasps_or_with_the_budget_used_up(
         assert size > 0
     assert tried <= budget
     assert valid >= wanted or tried == budget
+
+
+def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: ObjectModel) -> None:
+    found = certified_grasps(hand, block, wish(robust=0.75, robust_models=4, audits=0), count=3)
+    share, weakest = found.columns["quality/robust_share"], found.columns["quality/robust_weakest"]
+    assert len(found.grasps) == 3
+    assert (share >= 0.75).all()
+    assert weakest.dtype == np.uint8 and ((weakest == 0) | (share < 1)).all()
+    assert (found.columns["quality/valid"] == 1).all()
+    assert found.tried == 3 + sum(found.rejected.values())
+    assert "fragile" in found.rejected
+
+
+def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(
+    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nowhere(*args: Any, held: np.ndarray, models: int, wanted: float, **kwargs: Any) -> Robustness:
+        verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
+        return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)
+
+    monkeypatch.setattr(certified, "robust", nowhere)
+    none = certified_grasps(hand, block, wish(robust=0.5, budget=1, audits=0), count=4)
+    assert len(none.grasps) == 0
+    assert none.rejected["fragile"] > 0
+    raw = certified_grasps(hand, block, wish(robust=0.5, want="raw", audits=0), count=4)
+    held = raw.columns["quality/success"] == 1
+    assert (raw.columns["quality/robust_share"][held] == 0).all() and len(raw.grasps) == 4
+    assert (raw.columns["quality/robust_weakest"][held] == Axis.POSE).all()
+    assert raw.columns["quality/valid"].any(), "a grasp that is not robust is valid all the same"
+
+
+def test_without_models_nothing_is_said_of_them(valid: Certified) -> None:
+    assert "quality/robust_share" not in valid.columns
+    assert "fragile" not in valid.rejected

@@ -198,6 +198,8 @@ def _qualities(card: Row) -> str:
             parts.append(f"{_percent(epsilon['zero'])} have ε = 0 (no force closure at this contact threshold)")
         if (depth := found.get("penetration_depth_mm")) and depth["p95"] > 1:
             parts.append(f"5 % penetrate deeper than {depth['p95']:.1f} mm")
+        if (models := found.get("robust_share")) and models["median"] < 1:
+            parts.append(f"half hold in {_percent(models['median'])} or less of the models around the nominal one")
         if (robust := found.get("robustness")) and robust["median"] < 1:
             parts.append(
                 f"half lose {_percent(1 - robust['median'])} of their verdicts or more to 1 mm and 1° of noise"

@@ -135,6 +135,7 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
         "dropped": "dropped by the referee",
         "gate": "failed the gate",
         "diverged": "diverged",
+        "fragile": "held in too few models",
         "alike": "too like another",
     }
     parts = [f"{count:,} {words.get(why, why)}" for why, count in (rejected or {}).items() if count]

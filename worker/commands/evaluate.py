@@ -14,6 +14,7 @@ from rich.table import Table
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.errors import InputError
+from service.model.robust import MEANINGS, MOST_MODELS
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
 from worker.quality.referee.key import Level
@@ -53,6 +54,12 @@ def evaluate_command(
     object: Annotated[
         str | None, typer.Option(help="The object's file; default: what the file says, found by its digest.")
     ] = None,
+    robust: Annotated[
+        int,
+        typer.Option(
+            min=0, max=MOST_MODELS, help="Models around the nominal one in which what holds is judged again, such as 8."
+        ),
+    ] = 0,
     friction: Annotated[
         float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
     ] = None,
@@ -66,6 +73,8 @@ def evaluate_command(
     level = level or ("lift" if protocol == "lift" else "certificate")
     if level not in levels:
         raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
+    if robust and protocol != "dexgraspbench":
+        raise InputError("--robust judges the six pushes in other models: it goes with --protocol dexgraspbench")
     rows: list[dict[str, Any]] = []
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
                TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
@@ -79,6 +88,7 @@ def evaluate_command(
                 level=level,  # type: ignore[arg-type]
                 hard=hard,
                 friction=friction,
+                models=robust,
                 run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
@@ -88,9 +98,22 @@ def evaluate_command(
         emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
     else:
         Console().print(_table(rows, whole))
+        if whole.get("robust_share") is not None:
+            typer.echo(_said_of_models(whole))
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)
+
+
+def _said_of_models(whole: dict[str, Any]) -> str:
+    """How far the verdicts can be trusted, the axis that costs most first."""
+    words = {axis.word: name for axis, name in MEANINGS.items()}
+    axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
+    each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
+    return (
+        f"robust: the {whole['robust_n']} that hold do so in {whole['robust_share']:.2f} of {whole['robust_models']} "
+        f"models around the nominal one; by what differs: {each}"
+    )
 
 
 def _show(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
+from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, load_settings, reporting_errors
+from service.cli import JsonFlag, emit, load_settings, reporting_errors, validation_line
 from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import FIDELITIES, JobOptions
 from service.model.errors import InputError
+from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
 from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
 from service.store.shards import write_shard
@@ -40,6 +42,12 @@ def synth(
     referee: Annotated[
         str, typer.Option(help="letter, certificate, screen; none: nobody judges, grasps are sound, never valid.")
     ] = "certificate",
+    robust: Annotated[
+        float, typer.Option(help="Share of models around the nominal one that a grasp must hold in.", min=0, max=1)
+    ] = 0.0,
+    robust_models: Annotated[
+        int, typer.Option(help=f"Models that each valid grasp is judged in; 0: {MODELS} with --robust.", min=0, max=64)
+    ] = 0,
     method: Annotated[
         str, typer.Option(help=f"planner: {', '.join(PLANNERS)}, or one that another package offers")
     ] = "fast_graspd",
@@ -87,7 +95,7 @@ def synth(
     """
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
-    request = _request(want, budget, referee).model_copy(
+    request = _request(want, budget, referee, robust, robust_models).model_copy(
         update={
             "grasps": grasps, "method": method, "options": parsed_options(option or []), "seed": seed,
             "friction": friction, "min_distance": min_distance, "fidelity": chosen_fidelity(fidelity, contact_solver),
@@ -109,14 +117,19 @@ def synth(
         typer.echo(_said(found))
 
 
-def _request(want: str, budget: float, referee: str) -> JobOptions:
+def _request(want: str, budget: float, referee: str, robust: float, models: int) -> JobOptions:
     """Options of a job with these; InputError for a word that is none."""
     if want not in ("valid", "raw"):
         raise InputError(f"unknown --want {want!r}; choose valid or raw")
     if referee not in (*get_args(Level), "none"):
         raise InputError(f"unknown referee {referee!r}; choose one of {', '.join(get_args(Level))} or none")
     # An audit is a sample that watches over many jobs; a file can be judged by the letter whole.
-    return JobOptions(want=want, budget=budget, referee=referee, audits=0)
+    try:
+        return JobOptions(
+            want=want, budget=budget, referee=referee, audits=0, robust=robust, robust_models=models
+        )  # fmt: skip
+    except ValidationError as error:
+        raise InputError(validation_line(error)) from None
 
 
 @contextmanager
@@ -135,6 +148,15 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
         yield tell
 
 
+def _said_of_models(found: dict[str, Any]) -> str:
+    """How far the verdicts can be trusted, in a line."""
+    share, fragile = found["robust_share"], found["fragile"]
+    if share is None:
+        return f"none held in enough of {found['robust_models']} models around the nominal one ({fragile} held in it)"
+    lost = f"; {fragile} valid ones held in fewer than {found['robust_wanted']:.0%}" if found["robust_wanted"] else ""
+    return f"they hold in {share:.0%} of {found['robust_models']} models around the nominal one{lost}"
+
+
 def _said(found: dict[str, Any]) -> str:
     """The summary as a line; the second one tells what is missing."""
     judged, mean = found["referee"] != "none", found["mean"]
@@ -144,6 +166,8 @@ def _said(found: dict[str, Any]) -> str:
         f"{', judged at level ' + found['referee'] if judged else '; nobody judged them (--referee none)'}, "
         f"{found['grasps_per_second']:.1f} grasps/s"
     ]
+    if "robust_share" in found:
+        lines.append(_said_of_models(found))
     if found["grasps"]:
         lines[0] += (
             f"; mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "

@@ -28,6 +28,8 @@ def base_attributes(
     }
     if request.in_scene:
         said["scene"] = json_attribute(request.place.told())
+    if request.models:
+        said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
     if verdict_key is None:
         return said | {"verdict_level": "none"}
     return said | {"verdict_level": request.referee, "verdict_key": verdict_key}

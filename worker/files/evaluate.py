@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError, MeshError
+from service.model.robust import axis_word
 from worker.files.cases import Case
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
@@ -23,6 +24,7 @@ from worker.quality.referee.key import Level
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import LiftLevel, judge_lifts
 from worker.quality.referee.protocol import Outcome
+from worker.quality.referee.robust import Robustness, robust
 from worker.quality.table import DEFAULT_FRICTION, measure
 from worker.run import ALONE, Run
 from worker.scenes.way import plan_way
@@ -32,6 +34,8 @@ Protocol = Literal["dexgraspbench", "displacement", "lift"]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
 THRESHOLD_M: Final = 0.005
+#: Of the models around the nominal one. No job has this seed: what a job chose grasps by does not confirm them.
+MODELS_SEED: Final = 2**31
 
 
 def evaluate(
@@ -41,6 +45,7 @@ def evaluate(
     level: Level | LiftLevel = "certificate",
     hard: bool = False,
     friction: float | None = None,
+    models: int = 0,
     cache: Path | None = None,
     run: Run = ALONE,
 ) -> dict[str, Any]:
@@ -49,8 +54,9 @@ def evaluate(
     Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
     making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
-    the first principal component. verdicts, where somebody judged: see `told`. With protocol lift also clear_share
-    (free of what stands in the scene, coming, closing and lifting).
+    the first principal component. verdicts, where somebody judged: see `told`. Judged in `models` models around the
+    nominal one: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis.
+    With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting).
 
     Raises:
         InputError: protocol lift on grasps that were planned around a free object, or a level that it does not have.
@@ -72,6 +78,12 @@ def evaluate(
                 case.hand, case.obj, case.grasps, level=cast(Level, level), hard=hard, pieces=pieces, run=run,
             )  # fmt: skip
             row |= _success(case, verdicts, verdicts.seconds)
+            if models:
+                found = robust(
+                    case.hand, case.obj, case.grasps, held=verdicts.success, models=models, hard=hard, pieces=pieces,
+                    seed=MODELS_SEED, run=run,
+                )  # fmt: skip
+                row |= in_models(found, row["verdicts"] or [])
         if protocol == "lift" and case.placed is not None:
             row |= _lifted(case, case.placed, level, hard, pieces, run)
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
@@ -130,6 +142,22 @@ def _lifted(case: Case, placed: Placed, level: str, hard: bool, pieces: ConvexPi
             for row, (one, what, margin, reason, free) in enumerate(rows)
         ],
     }  # fmt: skip
+
+
+def in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Shares of a row; each of its verdicts gets its own and what it fails of first, None where it was not tried."""
+    tried = np.isfinite(found.share)
+    for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
+        known = math.isfinite(share)
+        one |= {"robust_share": _plain(share) if known else None, "robust_weakest": axis_word(int(weakest))}
+    counts = found.by_axis()
+    return {
+        "robust_share": _plain(float(found.share[tried].mean())) if tried.any() else None,
+        "robust_models": found.held.shape[1],
+        "robust_n": int(tried.sum()),
+        "robust_seconds": _plain(found.seconds),
+        "robust_axes": {axis.word: {"share": _plain(held / n), "n": n} for axis, (held, n) in counts.items()},
+    }
 
 
 def told(verdicts: Verdicts) -> list[dict[str, Any]]:
@@ -195,6 +223,8 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         out["clear_share"] = _rate([row for row in rows if row.get("clear_share") is not None], "clear_share", "n")
     out["osr"] = _plain(float(np.mean([row["osr"] for row in judged]))) if judged else None
     out["agreement_published"] = _rate(judged, "agreement_published", "published")
+    if any("robust_share" in row for row in rows):
+        out |= _models([row for row in rows if "robust_share" in row])
     for key in ("sgs", "sgs_without_referee"):
         # Held grasps over the seconds of all rows together.
         timed = [row for row in judged if row[key]]
@@ -204,6 +234,24 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         known = [row[key] for row in rows if row[key] is not None]
         out[key] = _plain(float(np.median(known))) if known else None
     return out
+
+
+def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Shares of several rows as those of all their grasps."""
+    axes: dict[str, list[tuple[float, int]]] = {}
+    for row in rows:
+        for axis, one in row["robust_axes"].items():
+            axes.setdefault(axis, []).append((one["share"], one["n"]))
+    total = {axis: sum(n for _, n in parts) for axis, parts in axes.items()}
+    return {
+        "robust_share": _rate(rows, "robust_share", "robust_n"),
+        "robust_models": rows[0]["robust_models"],
+        "robust_n": sum(row["robust_n"] for row in rows),
+        "robust_axes": {
+            axis: {"share": _plain(sum(share * n for share, n in parts) / total[axis]), "n": total[axis]}
+            for axis, parts in axes.items()
+        },
+    }
 
 
 def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:

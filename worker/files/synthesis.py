@@ -17,12 +17,13 @@ from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
-from worker.certified import Certified, certified_grasps, joined_columns
+from worker.certified import Certified, certified_grasps
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
 from worker.files.base_attributes import base_attributes
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M, beside_attributes
 from worker.files.origin import remembered
+from worker.grasps import joined_columns
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -75,6 +76,12 @@ class Synthesized:
             },
         }
         told |= self._diversity()
+        if request.models:
+            told |= {
+                "robust_models": request.models, "robust_wanted": request.robust,
+                "robust_share": self._mean("robust_share", 4),
+                "fragile": sum(batch.rejected.get("fragile", 0) for batch in self.batches),
+            }  # fmt: skip
         if self.place.kind != "free":
             told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
         return told
@@ -140,9 +147,11 @@ def synthesized(
         cancelled: asked often; True: the work stops.
 
     Raises:
-        InputError: unknown method, option, hand, object or device, or a scene without room.
+        InputError: unknown method, option, hand, object or device, or a scene without room or with other models.
         TaskCancelled: `cancelled` answered True.
     """
+    if request.models and place.kind != "free":
+        raise InputError("robust grasps hold the six pushes of free grasps in other models: with scene free only")
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     wanted = parse_join(str(join))
     options = dict(mesh or {})

@@ -65,6 +65,8 @@ def conditions(where: GraspFilter | None) -> list[Condition]:
         anyone = where.scene == "any"
         compared, kind = (operator.ne, "free") if anyone else (operator.eq, where.scene)
         found.append(Condition("flag", grasps.c.scene_kind, compared, kind))
+    if where.robust_weakest is not None:
+        found.append(Condition("flag", grasps.c.robust_weakest, operator.eq, where.robust_weakest))
     if where.neighbours is not None:
         found.append(Condition("flag", grasps.c.neighbours, operator.gt if where.neighbours else operator.eq, 0))
     found += [Condition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]

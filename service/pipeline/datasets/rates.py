@@ -218,6 +218,7 @@ def recipe_of(options: JobOptions) -> Hashable:
         options.want,
         options.referee,
         options.robustness,
+        (options.models, options.robust),
         options.place.kind,
         len(options.beside),
     )

@@ -11,6 +11,7 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from api.catalog.grasp_files import OUTCOMES, judged_by
+from service.model.robust import MEANINGS, Axis
 from service.pipeline.backends import Parts
 from service.store.shards import Shard, read_shard
 from tests.api.factories import JOINTS, add_job, finish_all
@@ -108,3 +109,31 @@ def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, parts: P
     assert "valid grasps on a table" in " ".join(http.get(f"/jobs/{table.id}").text.split())
     assert "Valid in their scenes" in http.get(f"/jobs/{table.id}").text
     assert "Valid in their scenes" not in http.get(f"/jobs/{free.id}").text
+
+
+def test_robust_grasps_are_found_by_their_share_and_by_what_they_fail_of_first(http: TestClient, parts: Parts) -> None:
+    manifest = finish_all(parts, add_job(parts, robust_models=8))[0]
+    shard = read_shard(parts.store.get(manifest.key))
+    share, weakest = shard["quality/robust_share"], shard["quality/robust_weakest"]
+    row = int(np.flatnonzero((share < 0.9) & (weakest > 0))[0])
+    document = http.get(f"/v1/grasps/{manifest.shard_id}/{row}").json()
+    assert document["robust_share"] == pytest.approx(share[row])
+    assert document["robust_weakest"] == Axis(int(weakest[row])).word
+
+    def found(**where: object) -> set[int]:
+        return {one["row"] for one in http.get("/v1/grasps", params={"limit": 200, **where}).json()["items"]}
+
+    assert found(min_robust_share=0.75) == set(np.flatnonzero(share >= 0.75).tolist())
+    assert found(robust_weakest="friction") == set(np.flatnonzero(weakest == Axis.FRICTION).tolist())
+    assert http.get("/v1/grasps", params={"robust_weakest": "luck"}).status_code == 422
+    page = http.get(f"/grasps/{manifest.shard_id}/{row}").text
+    assert "Models survived" in page and f"first lost to {MEANINGS[Axis(int(weakest[row]))]}" in page
+    listed = http.get("/grasps", params={"min_robust_share": 0.75, "view": "table"}).text
+    assert 'name="min_robust_share"' in listed and "Fails first along" in listed
+
+
+def test_grasps_that_were_judged_in_no_other_model_say_nothing_of_it(http: TestClient, parts: Parts) -> None:
+    manifest = finish_all(parts, add_job(parts))[0]
+    document = http.get(f"/v1/grasps/{manifest.shard_id}/0").json()
+    assert (document["robust_share"], document["robust_weakest"]) == (None, None)
+    assert "Models survived" not in http.get(f"/grasps/{manifest.shard_id}/0").text

@@ -48,6 +48,23 @@ def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path: Path) -> No
     json.dumps(row, allow_nan=False)
 
 
+def test_what_holds_is_judged_in_other_models_when_asked(tmp_path: Path) -> None:
+    row = evaluate(plates_case(), models=3, cache=tmp_path)
+    assert (row["robust_models"], row["robust_n"]) == (3, 2)
+    shares = [one["robust_share"] for one in row["verdicts"]]
+    assert row["robust_share"] == pytest.approx(np.mean(shares[:2]), abs=1e-6)
+    assert shares[2] is None, "it does not hold in the nominal model"
+    axes = row["robust_axes"]
+    assert sum(one["n"] for one in axes.values()) == 6
+    assert sum(one["share"] * one["n"] for one in axes.values()) == pytest.approx(6 * row["robust_share"], abs=1e-4)
+    assert [(one["robust_weakest"] is None) for one in row["verdicts"]] == [share in (None, 1.0) for share in shares]
+    json.dumps(row, allow_nan=False)
+    whole = combine([row, {**row, "robust_n": 4, "robust_share": 0.0}])
+    assert whole["robust_share"] == pytest.approx(row["robust_share"] / 3, abs=1e-6)
+    assert whole["robust_axes"] == {axis: {"share": one["share"], "n": 2 * one["n"]} for axis, one in axes.items()}
+    assert "robust_share" not in evaluate(plates_case(), cache=tmp_path)
+
+
 def test_displacement_protocol_judges_nothing(tmp_path: Path) -> None:
     row = evaluate(plates_case(), protocol="displacement", cache=tmp_path)
     assert row["gsr"] is None

@@ -79,6 +79,11 @@ def needed(wanted: float, models: int) -> int:
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 
+def reaches(share: Floats, wanted: float) -> NDArray[np.bool_]:
+    """(N,) whether shares (N,) are as large as is wanted; one that is not known is not."""
+    return np.asarray(np.nan_to_num(share, nan=-1.0) >= wanted - _EXACT)
+
+
 def robust(
     hand: HandModel,
     obj: ObjectModel,

@@ -5,8 +5,9 @@ A `Variant` says how a model departs from the nominal one, `draw` draws one alon
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +125,14 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
             return Variant(lags=tuple((LATEST * rng.permutation(fingers) / (fingers - 1)).tolist()))
         case _:
             raise ValueError("nothing varies along no axis")
+
+
+def together(variants: Iterable[Variant]) -> Variant:
+    """One variant that departs along the axes of several; where two change the same, the later one counts."""
+    own, changed = asdict(NOMINAL), dict[str, Any]()
+    for one in variants:
+        changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
+    return replace(NOMINAL, **changed)
 
 
 #: Ways in which collision shapes differ.
