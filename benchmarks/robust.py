@@ -117,7 +117,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
         f"Made by `benchmarks/robust.py`. Raw standard grasps on {', '.join(objects)}, "
         f"{done[0]['raw'] // len(objects)} on each; those that the certificate holds in the nominal model ({held}) "
         f"were judged again in models that differ in one thing, {draws} draws of each for every grasp "
-        "(collision shapes and couplings: each kind once). A hundred percent would be a verdict that no such difference moves. Cells: share "
+        "(collision shapes and couplings: each kind once). A hundred percent would be a verdict that no such "
+        "difference moves. Cells: share "
         "that still holds, 95 % interval of Wilson taken as if all verdicts were independent.",
         "",
         f"| what differs | {' | '.join(hands)} |",

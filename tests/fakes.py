@@ -54,11 +54,6 @@ def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
         "quality/sound": np.ones(n),
         "quality/success": valid,
     }
-    if message.request.models:
-        quality |= {
-            "quality/robust_share": np.where(valid == 1, rng.integers(0, 9, n) / 8, np.nan),
-            "quality/robust_weakest": np.where(valid == 1, rng.integers(0, 10, n), 0),
-        }
     if message.request.in_scene:
         assert context.store.exists(names.shard_manifest(Stage.SCENE, message.inputs[0]))
         quality |= {"quality/clearance_m": rng.random(n), "quality/lift_hard": valid, "quality/pushes": 1 - valid}

@@ -349,10 +349,9 @@ class _Work:
         }
 
     def _in_models(self, grasps: GraspSet, held: NDArray[np.bool_]) -> Arrays:
-        """Share of the models around the nominal one in which those that hold there do, and what they fail first of."""
+        """Share of the models in which those that hold do, told whole of raw grasps, and what they fail first of."""
         assert self.pieces is not None
         wish = self.request
-        # Raw grasps are all kept: their shares are told whole.
         found = robust(
             self.hand, self.obj, grasps, held=held, models=wish.models, seed=wish.seed, pieces=self.pieces.result(),
             wanted=wish.robust if wish.want == "valid" else 0, run=self._round_run.quiet(),

@@ -13,6 +13,7 @@ from service.model.digests import job_id
 from service.model.domain import AssetKind, JobRequest, Lane, Stage
 from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.robust import Axis
 from service.model.transforms import pose_to_matrix
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
@@ -145,6 +146,12 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     if request.referee == "none":
         return arrays | {"quality/sound": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}
     arrays["quality/success"] = arrays["quality/valid"].astype(np.int8)
+    if request.models:
+        held = arrays["quality/success"] == 1
+        share = kinds.integers(0, request.models + 1, count) / request.models
+        weakest = kinds.integers(1, len(Axis), count).astype(np.uint8)
+        arrays["quality/robust_share"] = np.where(held, share, np.nan)
+        arrays["quality/robust_weakest"] = np.where(held & (share < 1), weakest, np.uint8(Axis.NONE))
     return arrays
 
 
