@@ -56,6 +56,11 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
         "text", "valid: valid grasps were asked for (sound ones where nobody judges); raw: of any kind", _BASE
     ),
     "tried": RootAttribute("integer", "grasps tried until the last one kept", _BASE),
+    "robust": RootAttribute(
+        "text",
+        "JSON: models around the nominal one in which each valid grasp was judged, and the wanted share; absent: none",
+        _BASE,
+    ),
     "verdict_level": RootAttribute("text", "level of the referee, or `none` where nobody judged", _BASE),
     "verdict_key": RootAttribute(
         "text",
