@@ -10,4 +10,4 @@ PACKAGE_VERSION: Final = "0.1.0"
 TASK_SCHEMA: Final = 2
 
 #: Revision of each stage's algorithm. Part of the digest of a result, so results of two revisions never collide.
-STAGE_REVISIONS: Final = {"synthesize": 11, "scene": 2, "render": 3}
+STAGE_REVISIONS: Final = {"synthesize": 12, "scene": 2, "render": 3}

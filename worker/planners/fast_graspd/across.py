@@ -167,7 +167,7 @@ def across(
     tried = ways[(share * len(ways)).astype(int)]
     best = np.abs(np.einsum("nki,ni->nk", tried, axis)).argmin(axis=1)
     palm = np.tile(hand.palm.approach, (len(pair), 1))
-    turn = _frames(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(_frames(known.axis[posture], palm), -1, -2)
+    turn = frames(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(frames(known.axis[posture], palm), -1, -2)
     away = -np.einsum("nij,nj->ni", turn, palm)
     reach = known.middle[posture] - hand.palm.centre
     # Between holding with the fingertips and with the palm against the object.
@@ -176,7 +176,7 @@ def across(
     return pivot - obj.centre_of_mass, quat_from_matrix(turn), q, away, opening.low[pair]
 
 
-def _frames(first: Floats, second: Floats) -> Floats:
+def frames(first: Floats, second: Floats) -> Floats:
     """(n, 3, 3) rotations whose first column is `first` (n, 3) and whose second lies as near `second` as it can."""
     y = second - np.einsum("ni,ni->n", first, second)[:, None] * first
     helper = np.eye(3)[np.argmin(np.abs(first), axis=1)]

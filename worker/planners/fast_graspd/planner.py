@@ -172,7 +172,7 @@ def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
         some = rows[which.start : which.stop]
         placed, generators = launch.placed(some), batches.generators(some)
         if placed is None:
-            state, depth = starts.clear_starts(coarse, generators)
+            state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
         else:
             state, depth = scene_starts.clear_scene_starts(
                 coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways

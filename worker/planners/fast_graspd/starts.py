@@ -1,4 +1,5 @@
-"""Approach sampling: where the hands start. The palm looks at a random point of the surface, from a little way off;
+"""Approach sampling: where the hands start. Of the starts of a grasp every second one has the palm look at a random
+point of the surface, from a little way off, the others reach across the object between opposed fingers (`reaching`);
 jaws of a gripper stand around two opposite places (`jaw_starts`).
 
 A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
@@ -18,6 +19,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import jaw_starts
 from worker.planners.fast_graspd.jaw_starts import JawStarts
+from worker.planners.fast_graspd.reaching import LOOKS, Reaching
 from worker.simulation.data import Data
 from worker.simulation.model import Model
 from worker.simulation.record import record_placement
@@ -166,7 +168,9 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     Raises:
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
-    state, depth = clear_starts(model, [start_generator(seed, batch, i, k) for i in indices for k in range(each)])
+    state, depth = clear_starts(
+        model, [start_generator(seed, batch, i, k) for i in indices for k in range(each)], each=each
+    )
     if depth.max() > NO_PLACE:
         raise no_place(model)
     return state
@@ -181,17 +185,24 @@ def no_place(model: Model) -> InputError:
     )
 
 
-def clear_starts(model: Model, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
-    """A start of each generator, the least deep of its draws, and how deep it is (n,) [m]; most are clear."""
+def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
+    """A start of each generator, the least deep of its draws, and how deep it is (n,) [m]; most are clear.
+
+    Of the `each` starts of a grasp every second one, the first not among them, reaches across the object where it can.
+    """
     hand, obj = model.hand.model, model.obj.model
-    jaws = JawStarts.of(hand, obj)
+    count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else jaw_starts.RETREATS
-    probe = Probe(model, len(generators) * len(retreats))
+    probe = Probe(model, count * len(retreats))
     pair = _Pair.of(hand, obj)
-    best: HandState | None = None
-    deepest = np.full(len(generators), np.inf)
-    open_ = np.arange(len(generators))
+    best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
+    deepest = np.full(count, np.inf)
+    if jaws is None:
+        _reach(model, generators, np.flatnonzero(np.arange(count) % each % 2 == 1), probe, best, deepest)
+    open_ = np.flatnonzero(deepest > CLEAR)
     for _ in range(DRAWS):
+        if not len(open_):
+            break
         if jaws is None:
             states = _retreated(*draw(pair, [generators[i] for i in open_]))
         else:
@@ -203,17 +214,39 @@ def clear_starts(model: Model, generators: list[np.random.Generator]) -> tuple[H
         found = states[np.arange(len(open_)) * len(retreats) + pick]
         depth = depth[np.arange(len(open_)), pick]
         better = depth < deepest[open_]
-        best = found if best is None else _put(best, open_[better], found[better])
+        _put(best, open_[better], found[better])
         deepest[open_[better]] = depth[better]
         open_ = open_[deepest[open_] > CLEAR]
-        if not len(open_):
-            break
-    assert best is not None
     return best, deepest
 
 
-def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> HandState:
-    """The states with these rows exchanged."""
-    out = HandState(states.pivot.copy(), states.rotation.copy(), states.q.copy())
-    out.pivot[rows], out.rotation[rows], out.q[rows] = others.pivot, others.rotation, others.q
-    return out
+def _reach(
+    model: Model, generators: list[np.random.Generator], rows: NDArray[np.intp], probe: Probe, best: HandState,
+    deepest: Floats,
+) -> None:  # fmt: skip
+    """Put into `best` and `deepest` those of the starts `rows` that reach across the object and are clear."""
+    reaching = Reaching.of(model) if len(rows) else None
+    if reaching is None:
+        return
+    seeds = np.array([generators[i].integers(2**31) for i in rows], np.int32)
+    first = np.zeros(len(rows), np.int32)
+    left = np.arange(len(rows))
+    for _ in range(LOOKS):
+        found, number = reaching.starts(seeds[left], first[left], np.array(RETREATS))
+        some = number >= 0
+        left, found = left[some], found[some]
+        if not len(left):
+            return
+        first[left] = number[some] + 1
+        depth = probe.depths(found)
+        clear = depth <= CLEAR
+        _put(best, rows[left[clear]], found[clear])
+        deepest[rows[left[clear]]] = depth[clear]
+        left = left[~clear]
+        if not len(left):
+            return
+
+
+def _put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
+    """Exchange these rows of the states."""
+    states.pivot[rows], states.rotation[rows], states.q[rows] = others.pivot, others.rotation, others.q

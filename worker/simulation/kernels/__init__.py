@@ -22,6 +22,7 @@ backend.start()
 MODULES: Final = (
     "kinematics",
     "surface",
+    "reaching",
     "contact",
     "pieces",
     "penalties",

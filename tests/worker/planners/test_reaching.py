@@ -1,0 +1,90 @@
+"""Starts that reach across a free object: fingers on both sides of it, clear of it, whatever is drawn beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from service.model.domain import FIDELITIES
+from service.model.transforms import quat_rotate
+from tests.worker.simulation.rigs import object_of
+from worker.hands.kinematics import body_poses
+from worker.hands.load import hand_from_path
+from worker.hands.pads import fingertip_pad
+from worker.planners.fast_graspd.pairs import pair_of
+from worker.planners.fast_graspd.reaching import Reaching
+from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.starts import RETREATS, clear_starts, start_generator
+from worker.simulation.model import Model
+from worker.simulation.state import HandState
+
+#: A box that an Allegro hand spans in one direction only, and half of its width there [m].
+SIDES = (0.1, 0.24, 0.24)
+HALF = SIDES[0] / 2
+
+
+def model_of(sides: tuple[float, float, float]) -> Model:
+    pair = pair_of(hand_from_path("allegro"), object_of(trimesh.creation.box(sides)), FIDELITIES["draft"], "cpu")
+    return pair.model(pair.coarse)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return model_of(SIDES)
+
+
+def starts_of(model: Model, count: int, each: int) -> tuple[HandState, np.ndarray]:
+    return clear_starts(model, [start_generator(3, 0, i, k) for i in range(count) for k in range(each)], each=each)
+
+
+def spans(model: Model, state: HandState) -> np.ndarray:
+    """(n,) whether pads of fingertips are on both sides of the thin direction of the box."""
+    hand = model.hand.model
+    posture = posture_of(hand, model.obj.model, state)
+    pose = body_poses(hand, posture.hand_pose, posture.joint_positions)[:, list(hand.fingertips)]
+    pads = np.array([fingertip_pad(hand, tip).centre for tip in hand.fingertips])
+    x = (quat_rotate(pose[..., 3:], pads) + pose[..., :3])[..., 0] - model.obj.model.centre_of_mass[0]
+    return (x.min(axis=1) < -HALF) & (x.max(axis=1) > HALF)
+
+
+def test_every_second_start_has_fingers_on_both_sides_of_a_wide_box(model: Model) -> None:
+    state, _ = starts_of(model, 24, 4)
+    looking, reaching = spans(model, state).reshape(24, 2, 2).mean(axis=(0, 1))
+    # 0.71 against 0.33: a palm that looks at a random place stands at an edge by chance.
+    assert reaching > looking + 0.2
+
+
+def test_a_start_does_not_depend_on_those_drawn_beside_it(model: Model) -> None:
+    reaching = Reaching.of(model)
+    assert reaching is not None
+    seeds, first = np.array([5, 6, 7], np.int32), np.zeros(3, np.int32)
+    together, numbers = reaching.starts(seeds, first, np.array(RETREATS))
+    for i in range(3):
+        alone, number = reaching.starts(seeds[i : i + 1], first[:1], np.array(RETREATS))
+        assert number[0] == numbers[i]
+        for name in ("pivot", "rotation", "q"):
+            np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[i])
+
+
+def test_draws_go_on_where_the_last_one_ended(model: Model) -> None:
+    reaching = Reaching.of(model)
+    assert reaching is not None
+    seeds, retreats = np.arange(8, dtype=np.int32), np.array(RETREATS)
+    found, number = reaching.starts(seeds, np.zeros(8, np.int32), retreats)
+    again, same = reaching.starts(seeds, number, retreats)
+    later, after = reaching.starts(seeds, number + 1, retreats)
+    np.testing.assert_array_equal(same, number)
+    np.testing.assert_array_equal(again.pivot, found.pivot)
+    more = after >= 0
+    assert more.any()
+    assert (after > number)[more].all()
+    assert not (later.pivot == found.pivot)[more].all(axis=1).any()
+
+
+def test_what_is_too_wide_all_over_is_looked_at_only() -> None:
+    wide = model_of((0.25, 0.25, 0.25))
+    assert Reaching.of(wide) is None
+    looking, _ = starts_of(wide, 2, 2)
+    alone = [start_generator(3, 0, i, k) for i in range(2) for k in range(2)]
+    np.testing.assert_array_equal(looking.pivot, clear_starts(wide, alone)[0].pivot)

@@ -1,0 +1,110 @@
+"""Starts that reach across a free object: between opposed fingers, where it fits.
+
+A hand that looks at a random place of a large box mostly finds it too wide to hold. Here a pair of places that look
+away from each other and are no farther apart than the hand opens is drawn, and the hand is put around it. Most draws
+have a finger or the palm in the object: balls in the hand tell before the simulation looks at one.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.transforms import IDENTITY_POSE, quat_from_matrix, quat_rotate
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.hands.oppositions import Oppositions, oppositions_of
+from worker.hands.surface import sample_surface
+from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
+from worker.simulation.device import to_wxyz, to_xyzw
+from worker.simulation.kernels import reaching as kernels
+from worker.simulation.model import Model
+from worker.simulation.state import HandState
+
+Floats = NDArray[np.float64]
+
+#: Draws of one start, and how often the simulation looks at one that is clear by its balls.
+DRAWS: Final = 512
+LOOKS: Final = 8
+#: A pair far beside the centre of mass is drawn at this share of the chance of one through it.
+FAR: Final = 0.05
+#: Balls in the hand, and their radius [m]: they touch its surface from within; where a link is thinner they stand out.
+BALLS: Final = 96
+BALL_M: Final = 0.005
+#: The grid's distances are off by this [m].
+SLACK_M: Final = 0.001
+
+
+@dataclass(frozen=True)
+class Reaching:
+    """What draws of a hand around an object share."""
+
+    model: Model
+    grips: Any
+
+    @classmethod
+    def of(cls, model: Model) -> Reaching | None:
+        """None where the hand opposes no fingers, or where the object is too wide for it all over."""
+        hand, obj = model.hand.model, model.obj.model
+        known, pairs = oppositions_of(hand), crossings_of(obj)
+        fits = pairs.width + 2 * ROOM_M[0] <= known.widest
+        if not fits.any():
+            return None
+        key = (hand.content, obj.content, model.device)
+        with _lock:
+            if key not in _known:
+                _known[key] = _grips(hand, obj, known, model.device)
+            return cls(model, _known[key])
+
+    def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
+        """Hands (n,) of the first draws from the numbers `first` (n,) on that are clear by their balls, and the numbers
+        (n,) of these draws; -1: there is none. `retreats` as steps away from the object, ascending [m]."""
+        m, count = self.model, len(seeds)
+        with wp.ScopedDevice(m.device):
+            number = wp.empty(count, dtype=wp.int32)
+            pivot, rotation = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=wp.quat)
+            q = wp.zeros((count, m.dofs), dtype=wp.float32)
+            wp.launch(
+                kernels.reach, count,
+                inputs=[m.obj.surface, self.grips, wp.array(seeds, dtype=wp.int32), wp.array(first, dtype=wp.int32),
+                        DRAWS, wp.vec2(*ALIKE_M), wp.vec2(*ROOM_M), wp.array(retreats, dtype=wp.float32)],
+                outputs=[number, pivot, rotation, q],
+            )  # fmt: skip
+        found = HandState(pivot.numpy().astype(float), to_wxyz(rotation.numpy().astype(float)), q.numpy().astype(float))
+        return found, number.numpy()
+
+
+_known: LRUCache[tuple[str, str, str], Any] = LRUCache(8)
+_lock = threading.Lock()
+
+
+def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str) -> Any:
+    pairs, out = crossings_of(obj), kernels.Grips()
+    kept = np.flatnonzero(pairs.width + 2 * ROOM_M[0] <= known.widest)
+    middle = pairs.middle[kept] - obj.centre_of_mass
+    chance = np.exp(-((np.linalg.norm(middle, axis=1) / BESIDE_M) ** 2)) + FAR
+    points = sample_surface(hand, BALLS)
+    pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, points.body]
+    balls = quat_rotate(pose[..., 3:], points.position - BALL_M * points.normal) + pose[..., :3] - hand.palm.centre
+    own = quat_from_matrix(frames(known.axis, np.tile(hand.palm.approach, (len(known), 1))))
+    with wp.ScopedDevice(device):
+        out.middle, out.axis = wp.array(middle, dtype=wp.vec3), wp.array(pairs.axis[kept], dtype=wp.vec3)
+        out.width = wp.array(pairs.width[kept], dtype=wp.float32)
+        out.sums = wp.array(np.cumsum(chance) / chance.sum(), dtype=wp.float32)
+        out.posture = wp.array(known.q, dtype=wp.float32)
+        out.between = wp.array(known.middle - hand.palm.centre, dtype=wp.vec3)
+        out.frame = wp.array(to_xyzw(own), dtype=wp.quat)
+        out.opened = wp.array(known.width, dtype=wp.float32)
+        out.balls = wp.array(balls, dtype=wp.vec3)
+        out.radius = BALL_M - SLACK_M
+        out.palm = wp.vec3(*hand.palm.approach)
+        out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
+        out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)
+    return out

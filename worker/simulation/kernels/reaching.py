@@ -1,0 +1,149 @@
+"""Hands drawn around an object, between opposed fingers, until one is clear of it as balls in a grid of distances tell.
+
+One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number: they are the same
+whatever is drawn beside it.
+"""
+
+import warp as wp
+
+from worker.simulation.kernels.surface import Surface, cube_around, cube_distance
+
+wp.set_module_options({"enable_backward": False})
+
+#: Random directions of which the one that lies most across the pair is taken.
+WAYS = wp.constant(4)
+
+
+@wp.struct
+class Grips:
+    """P pairs of places of an object, about its centre of mass, and K opposed postures of a hand, about its palm."""
+
+    middle: wp.array(dtype=wp.vec3)  # (P,)
+    axis: wp.array(dtype=wp.vec3)  # (P,) unit
+    width: wp.array(dtype=wp.float32)  # (P,)
+    sums: wp.array(dtype=wp.float32)  # (P,) cumulative chance, the last is 1
+    posture: wp.array2d(dtype=wp.float32)  # (K, D)
+    between: wp.array(dtype=wp.vec3)  # (K,) middle of the pads
+    frame: wp.array(dtype=wp.quat)  # (K,) x: line of the pads, y: the palm's approach as near as can be
+    opened: wp.array(dtype=wp.float32)  # (K,) width between the pads, ascending
+    balls: wp.array2d(dtype=wp.vec3)  # (K, S) centres of balls in the hand
+    radius: wp.float32
+    palm: wp.vec3  # unit, where the palm looks
+    noise: wp.array(dtype=wp.float32)  # (D,) standard deviation of dofs
+    lower: wp.array(dtype=wp.float32)
+    upper: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Draw:
+    """Where a drawn hand is."""
+
+    found: wp.bool
+    posture: wp.int32
+    pivot: wp.vec3
+    rotation: wp.quat
+
+
+@wp.func
+def first_above(sorted_in: wp.array(dtype=wp.float32), value: wp.float32):
+    """Index of the first number that is not below `value`; the length if there is none."""
+    low = wp.int32(0)
+    high = wp.int32(sorted_in.shape[0])
+    while low < high:
+        middle = (low + high) / 2
+        if sorted_in[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def clear_of(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, rotation: wp.quat):
+    """Whether no ball of a posed hand is nearer to the surface than its radius."""
+    for s in range(grips.balls.shape[1]):
+        place = pivot + wp.quat_rotate(rotation, grips.balls[posture, s])
+        if cube_distance(cube_around(surface, place)) < grips.radius:
+            return False
+    return True
+
+
+@wp.func
+def drawn(
+    surface: Surface, grips: Grips, alike: wp.vec2, room: wp.vec2, retreats: wp.array(dtype=wp.float32),
+    state: wp.uint32,
+):  # fmt: skip
+    """A hand around a pair of places, at the nearest distance at which it is clear."""
+    out = Draw()
+    pair = wp.min(first_above(grips.sums, wp.randf(state)), grips.sums.shape[0] - 1)
+    line = grips.axis[pair]
+    if wp.randf(state) < 0.5:
+        line = -line
+    width = grips.width[pair] + 2.0 * (room[0] + (room[1] - room[0]) * wp.randf(state))
+    low = first_above(grips.opened, width - alike[0])
+    high = wp.max(first_above(grips.opened, width + alike[1]), low + 1)
+    out.posture = wp.min(low + int(wp.randf(state) * float(high - low)), grips.opened.shape[0] - 1)
+    deep = wp.sqrt(wp.randf(state))
+    way = wp.vec3(0.0)
+    least = float(2.0)
+    for _k in range(WAYS):
+        tried = wp.normalize(wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state)))
+        if wp.abs(wp.dot(tried, line)) < least:
+            least = wp.abs(wp.dot(tried, line))
+            way = tried
+    out.found = False
+    if least > 0.999:
+        return out
+    y = -wp.normalize(way - wp.dot(way, line) * line)
+    turn = wp.quat_from_matrix(wp.matrix_from_cols(line, y, wp.cross(line, y)))
+    out.rotation = wp.normalize(turn * wp.quat_inverse(grips.frame[out.posture]))
+    away = -wp.quat_rotate(out.rotation, grips.palm)
+    reach = grips.between[out.posture]
+    # From holding with the fingertips to the palm against the object.
+    ahead = wp.max(wp.dot(reach, grips.palm), 0.0) * deep
+    pivot = grips.middle[pair] - wp.quat_rotate(out.rotation, reach) - ahead * away
+    for r in range(retreats.shape[0]):
+        out.pivot = pivot + retreats[r] * away
+        if clear_of(surface, grips, out.posture, out.pivot, out.rotation):
+            out.found = True
+            return out
+    return out
+
+
+@wp.kernel
+def reach(
+    # Model:
+    surface_in: Surface,
+    grips_in: Grips,
+    # In:
+    seed_in: wp.array(dtype=wp.int32),
+    first_in: wp.array(dtype=wp.int32),
+    draws_in: wp.int32,
+    alike_in: wp.vec2,
+    room_in: wp.vec2,
+    retreat_in: wp.array(dtype=wp.float32),
+    # Out:
+    number_out: wp.array(dtype=wp.int32),
+    pivot_out: wp.array(dtype=wp.vec3),
+    rotation_out: wp.array(dtype=wp.quat),
+    q_out: wp.array2d(dtype=wp.float32),
+):
+    """The first draw of each start from number `first` on that is clear, and its number; -1: none of `draws` is.
+
+    Launch over B.
+    """
+    b = wp.tid()
+    number_out[b] = -1
+    for k in range(first_in[b], draws_in):
+        state = wp.rand_init(seed_in[b], k)
+        found = drawn(surface_in, grips_in, alike_in, room_in, retreat_in, state)
+        if found.found:
+            number_out[b] = k
+            pivot_out[b] = found.pivot
+            rotation_out[b] = found.rotation
+            # Another sequence than the draw's, whose state stays with it.
+            noise = wp.rand_init(seed_in[b] + 1, draws_in + k)
+            for d in range(q_out.shape[1]):
+                q = grips_in.posture[found.posture, d] + grips_in.noise[d] * wp.randn(noise)
+                q_out[b, d] = wp.clamp(q, grips_in.lower[d], grips_in.upper[d])
+            return
