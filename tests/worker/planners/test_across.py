@@ -8,15 +8,22 @@ import numpy as np
 import pytest
 
 from service.model.domain import resolve_fidelity
-from service.model.transforms import quat_rotate
+from service.model.transforms import apply, quat_from_matrix, quat_rotate
 from tests.worker.simulation.rigs import ball
+from worker.grasps import Posture
+from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
+from worker.hands.pads import pads_of
 from worker.objects.prepare import object_from_path
-from worker.planners.fast_graspd.across import ACROSS, LOW_M, Openings, across, crossings_of
+from worker.planners.fast_graspd.across import ACROSS, NEAR_M, Openings, across, crossings_of, promising
+from worker.planners.fast_graspd.outlines import outlines_of
 from worker.planners.fast_graspd.pairs import pair_of
+from worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways
+from worker.planners.fast_graspd.selection import posture_of
+from worker.planners.fast_graspd.starts import CLEAR, start_generator
 from worker.planners.fast_graspd.withdrawal import hindrance
-from worker.simulation.obstacles import DeviceObstacles
+from worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Scenes, Surroundings
 
@@ -71,17 +78,17 @@ def test_hands_hold_the_middle_between_their_fingers_and_come_from_a_free_way(bl
     opening, known = Openings.of(oppositions_of(barrett), block, lying(block)), oppositions_of(barrett)
     uniform = rng.random((40, 6))
     uniform[:, 5] = 0.0
-    pivot, rotation, q, away, _ = across(
-        barrett, block, opening, uniform, np.zeros((40, barrett.dofs)), np.array([[0.0, 0, 1]])
-    )
+    found = across(barrett, block, opening, uniform, np.array([[0.0, 0, 1]]))
     # Without noise the dofs are those of one of the known postures, whose middle lies in that of a pair.
-    posture = np.array([np.abs(known.q - row).sum(axis=1).argmin() for row in q])
-    middle = pivot + block.centre_of_mass + quat_rotate(rotation, known.middle[posture] - barrett.palm.centre)
+    assert np.array_equal(found.q(barrett, np.zeros((40, barrett.dofs))), known.q[found.posture])
+    rotation = quat_from_matrix(found.turn)
+    middle = found.pivot + block.centre_of_mass
+    middle = middle + quat_rotate(rotation, known.middle[found.posture] - barrett.palm.centre)
     gap = np.linalg.norm(middle[:, None] - opening.pairs.middle[None], axis=-1).min(axis=1)
     assert gap == pytest.approx(0.0, abs=1e-9)
-    level = np.abs(quat_rotate(rotation, known.axis[posture])[:, 2]) < 0.5
+    level = np.abs(quat_rotate(rotation, known.axis[found.posture])[:, 2]) < 0.5
     # Across a level line a hand can come as the way says, up to how squarely its palm looks.
-    assert (away[level, 2] > 0.3).all()
+    assert (found.away[level, 2] > 0.3).all()
 
 
 def test_a_hand_around_an_edge_is_hindered_and_one_before_it_is_not(block, barrett) -> None:
@@ -116,15 +123,77 @@ def test_a_hand_below_a_board_is_hindered_where_it_cannot_rise(block, barrett, r
     assert (hindrance(model, state, placed)[0] > 0.1) == hindered
 
 
-def test_what_lies_low_is_told_only_where_fingertips_may_touch(block, barrett) -> None:
-    known, flat = oppositions_of(barrett), block.vertices * [1, 1, 0.2]
-    thin = replace(block, vertices=flat, centre_of_mass=block.centre_of_mass * [1, 1, 0.2], digest="7" * 64)
-    scene = lying(thin)
-    assert not Openings.of(known, thin, scene).low.any()
-    (table,) = scene.obstacles
-    opening = Openings.of(known, thin, replace(scene, obstacles=(replace(table, tips_m=0.0),)))
-    height = opening.pairs.middle[:, 2] - flat[:, 2].min()
-    assert np.array_equal(opening.low, height < LOW_M) and opening.low.any()
-    uniform, ways = np.random.default_rng(0).random((40, 6)), np.array([[0.0, 0, 1]])
-    *_, low = across(barrett, thin, opening, uniform, np.zeros((40, barrett.dofs)), ways)
-    assert np.array_equal(low, opening.low[np.searchsorted(opening.sums, uniform[:, 0])])
+def test_how_far_a_pair_is_beside_the_pads_of_a_hand_that_was_moved(block, barrett) -> None:
+    opening = Openings.of(oppositions_of(barrett), block, lying(block))
+    uniform, ways = np.random.default_rng(0).random((30, 6)), np.array([[0.0, 0, 1]])
+    found = across(barrett, block, opening, uniform, ways)
+    assert found.deep.min() >= 0.0 and found.deep.max() > 0.02
+    # Back by as much as it is deep, or less: what lies between palm and pads lies between the fingers.
+    for share in (0.0, 0.5, 1.0):
+        assert found.beside(share * found.deep[:, None] * found.away) == pytest.approx(0.0, abs=1e-12)
+    assert found.beside((found.deep + 0.03)[:, None] * found.away) == pytest.approx(0.03)
+    aside = np.cross(found.away, [1.0, 0, 0])
+    aside *= 0.02 / np.linalg.norm(aside, axis=1, keepdims=True)
+    assert found.beside(aside) == pytest.approx(0.02)
+    several = found.beside(np.stack([aside, 2 * aside], axis=1))
+    assert several == pytest.approx(np.tile([0.02, 0.04], (30, 1)))
+
+
+@pytest.mark.parametrize("tips_m", [None, 0.0])
+def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
+    opening = Openings.of(oppositions_of(barrett), block, lying(block))
+    uniform, ways = np.random.default_rng(0).random((60, 6)), np.array([[0.0, 0, 1], [0.6, 0, 0.8]])
+    table = replace(lying(block).obstacles[0], tips_m=tips_m)
+    scene = Surroundings((table,), UP)
+    found = across(barrett, block, opening, uniform, ways)
+    centre = found.pivot + block.centre_of_mass
+    told = outlines_of(barrett).lacks(found.posture, found.turn, centre, scene, room=0.006)
+    root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
+    q = found.q(barrett, np.zeros((60, barrett.dofs)))
+    posture = Posture(np.concatenate([root, quat_from_matrix(found.turn)], axis=1), barrett.expand(q))
+    room = body_room(barrett, posture, [Surroundings((replace(table, tips_m=None),), UP)])
+    tip = np.isin(np.arange(barrett.bodies), barrett.fingertips)
+    wanted = np.where(tip & (tips_m is not None), 0.0, MARGIN_M) + 0.006
+    lack = np.maximum(0.0, (wanted - room).max(axis=1))
+    # Points of the hand itself: never more than it lacks. 26 degrees beside a direction in which a point is outermost,
+    # a tenth of the hand's 15 cm may stand out farther.
+    assert (told <= lack + 1e-9).all() and (lack > 0.02).any()
+    assert (lack - told).max() < 0.015 and (lack - told).mean() < 0.002
+
+
+def test_draws_that_need_not_rise_come_first_in_their_order(block, barrett) -> None:
+    scene = lying(block)
+    opening = Openings.of(oppositions_of(barrett), block, scene)
+    uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_ways(scene, block)
+    order, off = promising(barrett, block, opening, uniform, ways, scene, room=0.006, keep=40)
+    assert np.array_equal(np.sort(order, axis=1), np.tile(np.arange(40), (5, 1)))
+    near = off <= NEAR_M
+    assert near.any() and not near.all()
+    for places, offs, alike in zip(order, off, near, strict=True):
+        assert (np.diff(places[alike]) > 0).all()
+        assert (np.diff(offs[~alike]) >= 0).all() and alike[: alike.sum()].all()
+    few, least = promising(barrett, block, opening, uniform[3:4], ways, scene, room=0.006, keep=7)
+    assert np.array_equal(few[0], order[3, :7]) and np.array_equal(least[0], off[3, :7])
+
+
+def test_what_lies_flat_on_a_table_is_between_the_fingers_of_hands_that_set_out(block, barrett) -> None:
+    scale = np.array([1.0, 0.6, 0.4])
+    thin = replace(block, vertices=block.vertices * scale, centre_of_mass=block.centre_of_mass * scale, digest="7" * 64)
+    thin = replace(thin, hull_vertices=block.hull_vertices * scale)
+    (table,) = lying(thin).obstacles
+    placed = Scenes((replace(table, tips_m=0.0),), on_its_table(thin).object_pose).placed(np.zeros(4, int))
+    pair = pair_of(barrett, thin, resolve_fidelity("draft"), "cpu")
+    model = pair.model(pair.coarse, DeviceObstacles.create(barrett, placed.scenes, thin.centre_of_mass, "cpu"))
+    ways = [free_ways(placed.scenes[0], thin)]
+    generators = [start_generator(0, 0, i, k) for i in range(4) for k in range(REACHING)]
+    state, depth = clear_scene_starts(model, generators, each=REACHING, placed=placed, ways=ways)
+    assert (depth <= CLEAR).mean() > 0.9
+    posture = posture_of(barrett, thin, state)
+    bodies = body_poses(barrett, posture.hand_pose, posture.joint_positions)
+    pads = np.stack([apply(bodies[:, p.body], p.centre) for p in pads_of(barrett)], axis=1)
+    # Barrett's third finger stands against the other two.
+    first, others = pads[:, 2], pads[:, :2].mean(axis=1)
+    line = first[:, None] + np.linspace(0, 1, 41)[:, None] * (others - first)[:, None]
+    low, high = thin.vertices.min(axis=0), thin.vertices.max(axis=0)
+    between = ((line > low - 0.01) & (line < high + 0.01)).all(axis=-1).any(axis=1)
+    assert between.mean() > 0.7

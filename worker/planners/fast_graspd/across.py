@@ -14,10 +14,10 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.transforms import quat_from_matrix
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
 from worker.objects.model import ObjectModel
+from worker.planners.fast_graspd.outlines import outlines_of
 from worker.simulation.obstacles import MARGIN_M
 from worker.simulation.surroundings import Surroundings
 
@@ -36,9 +36,10 @@ BESIDE_M: Final = 0.03
 FAR: Final = 0.02
 STEEP: Final = 0.5
 SELDOM: Final = 0.1
-#: A pair whose middle is nearer to a support than this lies low: pads that look at it would have their ends in the
-#: support, for fingertips reach 15 to 25 mm beyond the middle of their pads [m].
-LOW_M: Final = 0.02
+#: A hand whose pads are so near to either side of its pair reaches across it well enough [m].
+NEAR_M: Final = 0.008
+#: Hands whose draws are compared at once: more only take memory.
+AT_ONCE: Final = 256
 #: Noise of the posture as a share of each joint's range, ways that are compared, and differences of width that postures
 #: are taken from [m].
 NOISE: Final = 0.03
@@ -110,8 +111,6 @@ class Openings:
     pairs: Crossings
     sums: Floats
     """(P,) cumulative chance; empty: there is nothing."""
-    low: NDArray[np.bool_]
-    """(P,) whether a pair lies low over a support that fingertips may touch."""
     within_reach: bool
     """Whether a pair lies nearly level, clear of the obstacles, and is no wider than the hand opens: the geometric
     condition for a grasp between opposed fingers from above or from the side."""
@@ -121,25 +120,50 @@ class Openings:
         pairs = crossings_of(obj)
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
         if not fits.any():
-            return cls(pairs, np.zeros(0), np.zeros(len(pairs), bool), False)
+            return cls(pairs, np.zeros(0), False)
         aside = pairs.middle - obj.centre_of_mass
         aside = aside - (aside @ scene.up)[:, None] * scene.up
         chance = np.exp(-((np.linalg.norm(aside, axis=1) / BESIDE_M) ** 2)) + FAR
-        room, low = np.full(len(pairs), np.inf), np.zeros(len(pairs), bool)
+        room = np.full(len(pairs), np.inf)
         for obstacle in scene.obstacles:
-            if obstacle.tips_m is not None:
-                low |= obstacle.distance(pairs.middle) < LOW_M
             for end in pairs.ends():
                 room = np.minimum(room, obstacle.distance(end))
         easy = room >= MARGIN_M
         level = np.abs(pairs.axis @ scene.up) < STEEP
         chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
-        return cls(pairs, np.cumsum(chance) / chance.sum(), low, bool((fits & easy & level).any()))
+        return cls(pairs, np.cumsum(chance) / chance.sum(), bool((fits & easy & level).any()))
 
 
-def across(
-    hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, normal: Floats, ways: Floats
-) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
+@dataclass(frozen=True)
+class Reaches:
+    """n hands that reach across the object."""
+
+    posture: NDArray[np.intp]
+    """(n,) which of the hand's opposed postures."""
+    pivot: Floats
+    """(n, 3) palm centres from the object's centre of mass [m]."""
+    turn: Floats
+    """(n, 3, 3) rotations."""
+    away: Floats
+    """(n, 3) directions of retreat."""
+    deep: Floats
+    """(n,) how far beyond the pair the pads are, for the palm to be nearer to the object [m]."""
+
+    def q(self, hand: HandModel, normal: Floats) -> Floats:
+        """Dofs (n, D) with the noise `normal` (n, D), normally distributed."""
+        known = oppositions_of(hand).q[self.posture]
+        return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
+
+    def beside(self, moved: Floats) -> Floats:
+        """(n, ...) how far the pair lies beside or before the pads of hands that were moved by (n, ..., 3) [m]; what is
+        nearer to the palm lies between fingers as well."""
+        away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
+        off = moved - self.deep.reshape((*away.shape[:-1], 1)) * away
+        along = np.einsum("n...i,ni->n...", off, self.away)
+        return np.linalg.norm(off - np.minimum(along, 0.0)[..., None] * away, axis=-1)
+
+
+def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> Reaches:
     """Hands that reach across the object.
 
     Args:
@@ -147,12 +171,7 @@ def across(
         obj: the object.
         opening: pairs to take hold of, at least one.
         uniform: (n, 6) random numbers.
-        normal: (n, D) normally distributed ones.
         ways: (K, 3) free directions away from the object.
-
-    Returns:
-        Palm centres (n, 3) from the centre of mass [m], rotations (n, 4), dofs (n, D), directions of retreat (n, 3),
-        whether the pair lies low (n,).
     """
     known = oppositions_of(hand)
     pair = np.minimum(np.searchsorted(opening.sums, uniform[:, 0]), len(opening.sums) - 1)
@@ -161,7 +180,6 @@ def across(
     low = np.searchsorted(known.width, width - ALIKE_M[0])
     high = np.maximum(np.searchsorted(known.width, width + ALIKE_M[1]), low + 1)
     posture = np.minimum(low + (uniform[:, 3] * (high - low)).astype(int), len(known) - 1)
-    q = np.clip(known.q[posture] + NOISE * hand.span * normal, hand.lower, hand.upper)
     # Of a few free ways the one that lies most across the line.
     share = (uniform[:, 4:5] + np.arange(WAYS) * 0.6180339887) % 1.0
     tried = ways[(share * len(ways)).astype(int)]
@@ -173,7 +191,34 @@ def across(
     # Between holding with the fingertips and with the palm against the object.
     deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
-    return pivot - obj.centre_of_mass, quat_from_matrix(turn), q, away, opening.low[pair]
+    return Reaches(posture, pivot - obj.centre_of_mass, turn, away, deep)
+
+
+def promising(
+    hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats, scene: Surroundings, *,
+    room: float, keep: int,
+) -> tuple[NDArray[np.intp], Floats]:  # fmt: skip
+    """Of C draws of each of n hands those that need to rise least to be clear of obstacles, (n, keep), and how far the
+    pair is then from between their pads (n, keep) [m]. Those that are near enough keep their order.
+
+    Args:
+        hand: the hand.
+        obj: the object.
+        opening: pairs to take hold of, at least one.
+        uniform: (n, C, 6) random numbers.
+        ways: (K, 3) free directions away from the object.
+        scene: the obstacles.
+        room: to be kept from them besides the margin [m].
+        keep: at most C.
+    """
+    count, draws, _ = uniform.shape
+    outlines, off = outlines_of(hand), np.zeros((count, draws))
+    for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
+        found = across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
+        lack = outlines.lacks(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)
+        off[rows] = found.beside(lack[:, None] * scene.up).reshape(-1, draws)
+    order = np.argsort(np.maximum(off, NEAR_M), axis=1, kind="stable")[:, :keep]
+    return order, np.take_along_axis(off, order, axis=1)
 
 
 def frames(first: Floats, second: Floats) -> Floats:

@@ -18,7 +18,8 @@ from service.model.transforms import quat_from_axis_angle, quat_from_matrix, qua
 from worker.hands.model import HandModel
 from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
-from worker.planners.fast_graspd.across import Openings, across
+from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
+from worker.planners.fast_graspd.outlines import spread_directions
 from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
@@ -38,10 +39,12 @@ DRAWN: Final = 8
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
-#: Of `EVERY` starts of a grasp so many reach across the object; each as often as so many draws.
+#: Of `EVERY` starts of a grasp so many reach across the object: each in as many draws, the most promising ones of so
+#: many candidates.
 EVERY: Final = 8
 REACHING: Final = 7
-REACHES: Final = 16
+REACHES: Final = 8
+CANDIDATES: Final = 48
 #: Uniform numbers of one draw: face, two for the point, roll, gap, share and goal of a turn.
 _UNIFORM: Final = 7
 
@@ -70,7 +73,7 @@ def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
     Raises:
         InputError: there is none.
     """
-    ways = _sphere(DIRECTIONS)
+    ways = spread_directions(DIRECTIONS)
     out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
     points = obj.centre_of_mass + path[..., None] * ways[:, None]
@@ -94,7 +97,8 @@ def no_place(model: Model) -> InputError:
 def clear_scene_starts(
     model: Model, generators: list[np.random.Generator], *, each: int, placed: Placed, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
-    """A start of each generator, `each` per grasp, the least deep of its draws, and how deep it is (n,) [m].
+    """A start of each generator, `each` per grasp, and how deep it is (n,) [m]: the first of its draws that is clear,
+    or else the least deep; of those that reach across the object the clear one between whose pads it lies best.
 
     Some find a place in a narrow scene and some do not: these end blocked, and the others are what there is.
 
@@ -117,25 +121,34 @@ def clear_scene_starts(
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
-    depth = np.full(count, np.inf)
+    depth, beside = np.full(count, np.inf), np.where(reaching, np.inf, 0.0)
+    order, least_beside = around.order(uniform, scene, reaching, placed)
     for number in range(DRAWS):
-        rows = np.flatnonzero(depth > CLEAR)
+        wanted = depth > CLEAR
+        if number < REACHES:
+            wanted |= reaching & (beside > NEAR_M) & (least_beside[:, number] < beside)
+        rows = np.flatnonzero(wanted)
         if not len(rows):
             break
         if number == normal.shape[1]:
             # Most starts need a few draws: the numbers of later ones are drawn when they are needed.
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
-        states, low = around.draws(uniform[rows, number], normal[rows, number], scene[rows], reach)
-        _raise(states, np.flatnonzero(low), placed, scene[rows], probe)
-        found = _depths(probe, states, scene[rows])
+        numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
+        drawn = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
+        off = _raise(drawn, np.flatnonzero(reach), placed, scene[rows], probe)
+        worth = off < beside[rows, None]
+        worth[~reach | (depth[rows] > CLEAR)] = True
+        found = _depths(probe, drawn.states, scene[rows], worth)
         # The nearest clear distance, or else the least deep.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
-        least = found[np.arange(len(rows)), pick]
-        better = least < depth[rows]
-        taken = states[(np.arange(len(rows)) * len(RETREATS) + pick)[better]]
+        at = np.arange(len(rows)), pick
+        least = found[at]
+        better = np.where(least <= CLEAR, (depth[rows] > CLEAR) | (off[at] < beside[rows]), least < depth[rows])
+        taken = drawn.states[(at[0] * len(RETREATS) + pick)[better]]
         depth[rows[better]] = least[better]
+        beside[rows[better]] = np.where(least <= CLEAR, off[at], beside[rows])[better]
         best.pivot[rows[better]], best.rotation[rows[better]], best.q[rows[better]] = (
             taken.pivot,
             taken.rotation,
@@ -152,36 +165,51 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
     return out
 
 
-def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp]) -> Floats:
-    """(n, len(RETREATS)) depths [m] of hands in scenes (n,), from the farthest distance inwards for as long as it is
-    clear; inf nearer than that.
+def _depths(probe: Probe, states: HandState, scene: NDArray[np.intp], worth: NDArray[np.bool_]) -> Floats:
+    """(n, len(RETREATS)) depths [m] of hands in scenes (n,), from the farthest distance that is `worth` it
+    (n, len(RETREATS)) inwards for as long as it is clear; inf elsewhere.
 
     Most draws fail for what no retreat mends, and hardly any can be clear nearer than where it is not.
     """
-    found, left = np.full((len(scene), len(RETREATS)), np.inf), np.arange(len(scene))
+    found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
-        probe.data.set_scenes(scene[left])
-        found[left, k] = probe.depths(states[left * len(RETREATS) + k])
-        left = left[found[left, k] <= CLEAR]
-        if not len(left):
-            break
+        left = np.flatnonzero(open_ & worth[:, k])
+        if len(left):
+            probe.data.set_scenes(scene[left])
+            found[left, k] = probe.depths(states[left * len(RETREATS) + k])
+            open_[left] = found[left, k] <= CLEAR
     return found
 
 
-def _raise(states: HandState, rows: NDArray[np.intp], placed: Placed, scene: NDArray[np.intp], probe: Probe) -> None:
-    """Lift draws `rows` at all their distances, scenes (n,), by what the nearest lacks of its room from obstacles.
+def _raise(drawn: _Drawn, rows: NDArray[np.intp], placed: Placed, scene: NDArray[np.intp], probe: Probe) -> Floats:
+    """Lift draws `rows` at all their distances, scenes (n,), by what the nearest lacks of its room from obstacles; how
+    far their pairs are then from between their pads (n, len(RETREATS)) [m], 0 of others.
 
     Steps of retreat are too coarse for what lies low: fingers would end above it, not beside it.
     """
+    off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
-        return
-    nearest = states[rows * len(RETREATS)]
+        return off
+    states, repeat, up = drawn.states, len(RETREATS), np.array([s.up for s in placed.scenes])[scene]
     probe.data.set_scenes(scene[rows])
-    probe.depths(nearest)
-    lack = probe.data.depths.obstacles.numpy()[: len(rows), None].astype(float)
-    up = np.array([placed.scenes[s].up for s in scene[rows]])
-    every = (rows[:, None] * len(RETREATS) + np.arange(len(RETREATS))).ravel()
-    states.pivot[every] += np.repeat(lack * up, len(RETREATS), axis=0)
+    probe.depths(states[rows * repeat])
+    lifted = np.zeros((len(scene), 3))
+    lifted[rows] = probe.data.depths.obstacles.numpy()[: len(rows), None].astype(float) * up[rows]
+    every = (rows[:, None] * repeat + np.arange(repeat)).ravel()
+    states.pivot[every] += np.repeat(lifted[rows], repeat, axis=0)
+    for at, reaches in drawn.reaching:
+        off[at] = reaches.beside(lifted[at][:, None] + np.array(RETREATS)[:, None] * reaches.away[:, None])
+    return off
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Draws of n starts."""
+
+    states: HandState
+    """(n * len(RETREATS)) hands, each at each distance."""
+    reaching: list[tuple[NDArray[np.intp], Reaches]]
+    """Those that reach across the object, and which of the n they are."""
 
 
 @dataclass(frozen=True)
@@ -196,30 +224,41 @@ class _Around:
     openings: Mapping[int, Openings]
     """Of each scene."""
 
-    def draws(
-        self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
-    ) -> tuple[HandState, NDArray[np.bool_]]:
-        """Candidates (n * len(RETREATS) hands), each at each distance, from random numbers (n, 7) and (n, 2 + D), in
-        scenes (n,), and which of the n take hold of what lies low; `reach` (n,): across the object."""
+    def order(
+        self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: Placed
+    ) -> tuple[NDArray[np.intp], Floats]:
+        """See `promising`: (n, REACHES) draws of hands that reach across the object; inf of others."""
+        order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
+        for s in np.unique(scene[reaching]):
+            rows = np.flatnonzero(reaching & (scene == s))
+            order[rows], least[rows] = promising(
+                self.hand, self.obj, self.openings[s], uniform[rows, :CANDIDATES, :6], self.ways[s], placed.scenes[s],
+                room=ROOM, keep=REACHES,
+            )  # fmt: skip
+        return order, least
+
+    def draws(self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]) -> _Drawn:
+        """Candidates, each at each distance, from random numbers (n, 7) and (n, 2 + D), in scenes (n,); `reach` (n,):
+        across the object."""
         n, dofs = len(uniform), self.hand.dofs
-        found = [np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))]
-        low = np.zeros(n, bool)
+        pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
+        reaching = []
         for s in np.unique(scene):
-            for rows in (np.flatnonzero((scene == s) & reach), np.flatnonzero((scene == s) & ~reach)):
-                if not len(rows):
-                    continue
-                if reach[rows[0]]:
-                    given = uniform[rows, :6], normal[rows, 2:], self.ways[s]
-                    *parts, low[rows] = across(self.hand, self.obj, self.openings[s], *given)
-                else:
-                    parts = list(self._towards(uniform[rows], normal[rows], self.ways[s]))
-                for whole, part in zip(found, parts, strict=True):
-                    whole[rows] = part
-        pivot, rotation, q, away = found
+            rows = np.flatnonzero((scene == s) & reach)
+            if len(rows):
+                one = across(self.hand, self.obj, self.openings[s], uniform[rows, :6], self.ways[s])
+                pivot[rows], rotation[rows], away[rows] = one.pivot, quat_from_matrix(one.turn), one.away
+                q[rows] = one.q(self.hand, normal[rows, 2:])
+                reaching.append((rows, one))
+            rows = np.flatnonzero((scene == s) & ~reach)
+            if len(rows):
+                pivot[rows], rotation[rows], q[rows], away[rows] = self._towards(
+                    uniform[rows], normal[rows], self.ways[s]
+                )
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
         repeat = len(RETREATS)
         states = HandState(pivot.reshape(-1, 3), np.repeat(rotation, repeat, axis=0), np.repeat(q, repeat, axis=0))
-        return states, low
+        return _Drawn(states, reaching)
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Hands that look at random points of the surface, as `across` gives them, without a pair."""
@@ -266,11 +305,3 @@ def _frames(z: Floats) -> Floats:
     x = np.cross(helper, z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
-
-
-def _sphere(count: int) -> Floats:
-    """(count, 3) unit vectors spread evenly: a golden spiral."""
-    k = np.arange(count)
-    z = 1 - (2 * k + 1) / count
-    turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])

@@ -44,7 +44,7 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
     tell before it is seated, so more hands set out and more go on, a shorter way each."""
     return fidelity.model_copy(
         update={
-            "starts": min(5 * fidelity.starts, 64),
+            "starts": min(3 * fidelity.starts, 64),
             "finalists": min(2 * fidelity.finalists, 64),
             "coarse_iterations": _share(fidelity.coarse_iterations, 0.5),
             "fine_iterations": _share(fidelity.fine_iterations, 0.375),

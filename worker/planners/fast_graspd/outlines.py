@@ -1,0 +1,87 @@
+"""How far hands must rise until they are clear of what stands around, told by a few points of their outline: cheap
+enough for many more hands than are looked at exactly."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model.transforms import IDENTITY_POSE, apply
+from worker.hands.kinematics import body_poses
+from worker.hands.model import HandModel
+from worker.hands.oppositions import oppositions_of
+from worker.simulation.obstacles import MARGIN_M
+from worker.simulation.surroundings import Surroundings
+
+Floats = NDArray[np.float64]
+
+#: Directions in which a hand's outermost points are taken, of its fingertips and of the rest of it.
+DIRECTIONS: Final = 20
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Outermost points of a hand in each of its K opposed postures, from the palm's centre."""
+
+    points: Floats
+    """(K, P, 3) [m]"""
+    tips: NDArray[np.bool_]
+    """(P,) those of fingertips."""
+
+    def lacks(
+        self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Surroundings, *, room: float
+    ) -> Floats:
+        """(n,) what hands lack of the distance from obstacles that they are to keep, and of `room` besides [m]; 0 or
+        more.
+
+        Args:
+            posture: (n,) which of the K.
+            turn: (n, 3, 3) rotations.
+            centre: (n, 3) centres of the palms, object frame [m].
+            scene: the obstacles.
+            room: [m]
+        """
+        place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
+        lack = np.zeros(len(posture))
+        for obstacle in scene.obstacles:
+            wanted = np.where(self.tips, MARGIN_M if obstacle.tips_m is None else obstacle.tips_m, MARGIN_M) + room
+            lack = np.maximum(lack, (wanted - obstacle.distance(place)).max(axis=1))
+        return lack
+
+
+_known: LRUCache[str, Outlines] = LRUCache(16)
+_lock = threading.Lock()
+
+
+def outlines_of(hand: HandModel) -> Outlines:
+    """The outlines of a hand's opposed postures, from memory where they are known."""
+    with _lock:
+        if hand.content not in _known:
+            _known[hand.content] = _outlines(hand, oppositions_of(hand).q)
+        return _known[hand.content]
+
+
+def _outlines(hand: HandModel, q: Floats) -> Outlines:
+    bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
+    points, tips = [], []
+    for tip in (True, False):
+        solid = [apply(bodies[:, p.body, None], p.vertices) for p in hand.pieces if (p.body in hand.fingertips) == tip]
+        if solid:
+            corners = np.concatenate(solid, axis=1)
+            far = (corners @ spread_directions(DIRECTIONS).T).argmax(axis=1)
+            points.append(np.take_along_axis(corners, far[..., None], axis=1))
+            tips.append(np.full(DIRECTIONS, tip))
+    return Outlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips))
+
+
+def spread_directions(count: int) -> Floats:
+    """(count, 3) unit vectors spread evenly: a golden spiral."""
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
