@@ -17,6 +17,8 @@ from service.model.errors import InputError
 from service.model.robust import MEANINGS, MOST_MODELS
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
+from worker.hands.load import hand_from_path
+from worker.hands.same_hand import TOLERANCE_M, same_hand
 from worker.quality.referee.key import Level
 from worker.quality.referee.lifting import LiftLevel
 from worker.run import Run
@@ -63,6 +65,15 @@ def evaluate_command(
     friction: Annotated[
         float | None, typer.Option(min=0.01, max=3.0, help="Coulomb coefficient of ε; default: the file's.")
     ] = None,
+    judge_hand: Annotated[
+        str | None, typer.Option(help="Another model of the same hand, URDF or MJCF, that judges the grasps as well.")
+    ] = None,
+    joint_map: Annotated[
+        str | None, typer.Option(help="OURS=THEIRS,...: joints of the same meaning, where their names do not tell.")
+    ] = None,
+    judge_tolerance: Annotated[
+        float, typer.Option(min=0.0, help="Fingertips of the two models that differ by more are refused [mm].")
+    ] = 1e3 * TOLERANCE_M,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
@@ -75,6 +86,12 @@ def evaluate_command(
         raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
     if robust and protocol != "dexgraspbench":
         raise InputError("--robust judges the six pushes in other models: it goes with --protocol dexgraspbench")
+    if judge_hand is None and joint_map:
+        raise InputError("--joint-map says which joints of --judge-hand are ours; name that hand")
+    if judge_hand is not None and protocol != "dexgraspbench":
+        raise InputError(f"--judge-hand judges by protocol dexgraspbench, not by {protocol}")
+    other = None if judge_hand is None else hand_from_path(judge_hand, drag=True)
+    twins = _joint_map(joint_map)
     rows: list[dict[str, Any]] = []
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
                TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
@@ -89,6 +106,9 @@ def evaluate_command(
                 hard=hard,
                 friction=friction,
                 models=robust,
+                judge_hand=None
+                if other is None
+                else same_hand(case.hand, other, twins, tolerance_m=judge_tolerance / 1e3),
                 run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
@@ -100,6 +120,8 @@ def evaluate_command(
         Console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
             typer.echo(_said_of_models(whole))
+        if "foreign_held" in whole:
+            typer.echo(_foreign(whole, other.name if other else ""))
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)
@@ -114,6 +136,16 @@ def _said_of_models(whole: dict[str, Any]) -> str:
         f"robust: the {whole['robust_n']} that hold do so in {whole['robust_share']:.2f} of {whole['robust_models']} "
         f"models around the nominal one; by what differs: {each}"
     )
+
+
+def _joint_map(text: str | None) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for pair in (text or "").split(",") if text else []:
+        ours, equals, theirs = (part.strip() for part in pair.partition("="))
+        if not (ours and equals and theirs) or ours in found:
+            raise InputError(f"--joint-map {pair!r} must be OURS=THEIRS, once for each joint")
+        found[ours] = theirs
+    return found
 
 
 def _show(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
@@ -141,6 +173,16 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
         table.add_section()
         table.add_row("all", *(_cell(whole[key], digits) for key, _, digits in _COLUMNS))
     return table
+
+
+def _foreign(whole: dict[str, Any], name: str) -> str:
+    held = whole["foreign_held"]
+    share = _cell(whole["foreign_share"], 2)
+    return (
+        f"judged with {name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
+        f"of {held['both'] + held['nominal']} that hold nominally {held['both']} hold there ({share}); "
+        f"agreement {_cell(whole['agreement'], 2)}"
+    )
 
 
 def _cell(value: float | None, digits: int) -> str:

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from service.model.errors import InputError, MeshError
 from service.model.robust import axis_word
 from worker.files.cases import Case
+from worker.hands.same_hand import SameHand
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.foreign import foreign_verdicts, share_counts
 from worker.quality.referee.judge import Verdicts, judge
 from worker.quality.referee.key import Level
 from worker.quality.referee.lift import LiftOutcome
@@ -46,6 +48,7 @@ def evaluate(
     hard: bool = False,
     friction: float | None = None,
     models: int = 0,
+    judge_hand: SameHand | None = None,
     cache: Path | None = None,
     run: Run = ALONE,
 ) -> dict[str, Any]:
@@ -56,7 +59,9 @@ def evaluate(
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
     the first principal component. verdicts, where somebody judged: see `told`. Judged in `models` models around the
     nominal one: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis.
-    With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting).
+    With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
+    model of the hand as `judge_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
+    reason_foreign.
 
     Raises:
         InputError: protocol lift on grasps that were planned around a free object, or a level that it does not have.
@@ -84,6 +89,11 @@ def evaluate(
                     seed=MODELS_SEED, run=run,
                 )  # fmt: skip
                 row |= in_models(found, row["verdicts"] or [])
+            if judge_hand is not None:
+                both = foreign_verdicts(judge_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
+                row |= both.facts()
+                for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
+                    one |= {"held_foreign": bool(held), "reason_foreign": reason}
         if protocol == "lift" and case.placed is not None:
             row |= _lifted(case, case.placed, level, hard, pieces, run)
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
@@ -225,6 +235,10 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     out["agreement_published"] = _rate(judged, "agreement_published", "published")
     if any("robust_share" in row for row in rows):
         out |= _models([row for row in rows if "robust_share" in row])
+    counted = [row["foreign_held"] for row in rows if "foreign_held" in row]
+    if counted:
+        out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
+        out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
     for key in ("sgs", "sgs_without_referee"):
         # Held grasps over the seconds of all rows together.
         timed = [row for row in judged if row[key]]

@@ -53,9 +53,17 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     if (jaws := jaws_of(hand)) is not None:
         facts["opening_m"] = round(jaws.opening, 6)
         message += f"; opens {1e3 * jaws.opening:.0f} mm"
-    notes = [*robot.notes, *_left_out(robot, hand, settings)]
+    notes = [*robot.notes, *_tendons(hand), *_left_out(robot, hand, settings)]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
+
+
+def _tendons(hand: HandModel) -> list[str]:
+    """What a user must know of drives that pull several joints."""
+    pairs = [" and ".join(hand.dof_names[d] for d in tendon.dofs) for tendon in hand.tendons]
+    return (
+        [f"{', '.join(pairs)} on one tendon each" if len(pairs) > 1 else f"{pairs[0]} on one tendon"] if pairs else []
+    )
 
 
 def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:

@@ -20,12 +20,13 @@ from service.store.hand_main import hand_name, main_of
 from worker.hands.collisions import resting_neighbours
 from worker.hands.drive import with_drive
 from worker.hands.guess import complete
-from worker.hands.model import ConvexPiece, Floats, HandModel, PalmFrame
+from worker.hands.model import ConvexPiece, Drag, Floats, HandModel, PalmFrame
 from worker.hands.options import DEFAULT_EFFORT, DEFAULT_STIFFNESS, HandOptions, parse_options
 from worker.hands.primitives import volume
 from worker.hands.read import read_robot
 from worker.hands.robot import Robot, chain_to
 from worker.hands.shapes import Hulls, make_pieces
+from worker.hands.tendons import tendons_of
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
 
@@ -34,7 +35,7 @@ DENSITY = 1000.0
 
 
 def load_hand(
-    files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None
+    files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None, drag: bool = False
 ) -> HandModel:
     """The hand that `files` describe.
 
@@ -43,6 +44,7 @@ def load_hand(
         name: name of the hand.
         digest: digest of its files.
         options: keys that go over those in the files.
+        drag: whether its joints have the armature and the dry friction that the files state.
 
     Raises:
         HandError: the files describe no usable hand; the message names what is wrong and the mend.
@@ -50,7 +52,8 @@ def load_hand(
     settings = parse_options(files, options)
     main = main_file(files, settings)
     robot = read_robot(files, main, settings.xacro)
-    return assemble(robot, settings, files, main, name=name, digest=digest)
+    hand = assemble(robot, settings, files, main, name=name, digest=digest)
+    return replace(hand, drag=_drag(robot, hand)) if drag else hand
 
 
 def assemble(
@@ -65,6 +68,13 @@ def assemble(
     return replace(hand, neighbours=resting_neighbours(hand))
 
 
+def _drag(robot: Robot, hand: HandModel) -> Drag:
+    armature, dry = np.zeros((2, hand.bodies))
+    for name, body in zip(hand.joint_names, hand.joint_body, strict=True):
+        armature[body], dry[body] = robot.joints[name].armature, robot.joints[name].dry_friction
+    return Drag(armature, dry)
+
+
 def body_model(
     robot: Robot, tree: Tree, options: HandOptions, files: Mapping[str, bytes], main: str, *, name: str, digest: str
 ) -> HandModel:
@@ -74,7 +84,7 @@ def body_model(
         HandError: nothing of it can touch, or a mesh or a number cannot be used.
     """
     base = str(PurePosixPath(main).parent).removeprefix(".")
-    pieces = _pieces(robot, tree, files, base)
+    pieces = _pieces(robot, tree, files, base, options.shapes == "visual")
     if not pieces:
         raise HandError("no link of the hand has collision geometry, so nothing can touch; drop less")
     moving = [tree.drives[joint.name] if joint else None for joint in tree.joint]
@@ -109,6 +119,7 @@ def body_model(
         arm=chain_to(robot, tree.body_names[0]),
         visuals=Visuals(_placed_visuals(robot, tree), files, base),
         frames=dict(tree.links),
+        tendons=tendons_of(robot, options.tendons, tree.dof_names),
     )
 
 
@@ -120,10 +131,14 @@ def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
         raise HandError(str(error)) from None
 
 
-def _pieces(robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str) -> tuple[ConvexPiece, ...]:
+def _pieces(
+    robot: Robot, tree: Tree, files: Mapping[str, bytes], base: str, as_it_looks: bool
+) -> tuple[ConvexPiece, ...]:
+    """Of the collision elements; or, as it looks, of a link's visual ones, where it has both."""
     pieces, hulls = [], Hulls()
     for link, (body, pose) in tree.links.items():
-        for shape in robot.links[link].shapes:
+        shapes, seen = robot.links[link].shapes, robot.links[link].visuals
+        for shape in seen if as_it_looks and shapes and seen else shapes:
             placed = compose(pose, shape.pose)
             pieces += make_pieces(shape, body=body, pose=placed, link=link, files=files, base=base, hulls=hulls)
     return tuple(pieces)
@@ -190,8 +205,8 @@ def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats
     return np.maximum(masses, 1e-3)
 
 
-def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None) -> HandModel:
-    """A hand for the command line: name of a built-in, a URDF, its folder, or a ZIP of that.
+def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *, drag: bool = False) -> HandModel:
+    """A hand for the command line: name of a built-in, a URDF, its folder, or a ZIP of that; `drag`: see `load_hand`.
 
     Raises:
         NotFoundError: neither a file nor a built-in hand.
@@ -203,6 +218,7 @@ def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None) -
         name=name,
         digest=digest_variant(digest_files(AssetKind.HAND, files), options),
         options={**stated, **(options or {})},
+        drag=drag,
     )
 
 

@@ -50,7 +50,7 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
         reader.links.append(Link("world", (), None))
         for body in roots:
             reader.body(body, "world", _pose(model.body_pos[body], model.body_quat[body]))
-    return build_robot(reader.name, reader.links, reader.joints, reader.notes, main, "MJCF")
+    return build_robot(reader.name, reader.links, reader.joints, reader.notes, main, "MJCF", reader.tendons)
 
 
 def _compile(text: str, assets: dict[str, bytes], main: str) -> Any:
@@ -79,8 +79,11 @@ class _Reader:
         self._bare = not self.model.ngeom or not any(
             self.model.geom_contype[g] or self.model.geom_conaffinity[g] for g in range(self.model.ngeom)
         )
-        self._mimics, notes = couplings(self.model, self.joint_name)
-        self._servos = servos(self.model, self._mimics)
+        self._mimics, notes, tendons = couplings(self.model, self.joint_name)
+        self._servos = servos(self.model, self._mimics, {joint for pulls in tendons.values() for joint in pulls})
+        self.tendons = {
+            name: {self.joint_name(joint): pull for joint, pull in pulls.items()} for name, pulls in tendons.items()
+        }
         self._commanded = commanded(self.model)
         self.notes += notes
 
@@ -163,7 +166,8 @@ class _Reader:
         kind_name = "prismatic" if slides else "revolute" if limited else "continuous"
         return Joint(
             name, kind_name, parent, child, origin, axis, lower, upper, servo.effort, follows,
-            stiffness=servo.stiffness,
+            stiffness=servo.stiffness, armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
+            dry_friction=float(model.dof_frictionloss[model.jnt_dofadr[joint]]),
         )  # fmt: skip
 
     def _link(self, body: int, name: str) -> Link:

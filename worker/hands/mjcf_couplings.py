@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -13,10 +14,12 @@ from worker.hands.mjcf_servos import driven, joints_on_tendon
 from worker.hands.robot import Mimic
 
 _RANGE_POINTS: Final = 41
+#: Coefficients of the joints that a tendon pulls, by the name of its drive.
+Tendons = dict[str, dict[int, float]]
 
 
-def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic | float], list[str]]:
-    """What each dependent joint follows, or the value at which an equality holds it; and notes for the user.
+def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic | float], list[str], Tendons]:
+    """What each dependent joint follows, or the value at which an equality holds it; notes for the user; and tendons.
 
     Args:
         model: the compiled model.
@@ -40,10 +43,10 @@ def couplings(model: Any, name: Callable[[int], str]) -> tuple[dict[int, Mimic |
             _note(notes, _couple_tendons(model, equality, ends[0][0], ends[1][0], found, name))
         elif kind == int(mujoco.mjtEq.mjEQ_JOINT):
             _note(notes, _couple(model, first, second, np.asarray(model.eq_data[equality, :5]), found, name))
-    notes += _couple_by_tendons(model, found, name)
-    notes += follow_loops(model, found, name)
+    more, tendons = _couple_by_tendons(model, found, name)
+    notes += more + follow_loops(model, found, name)
     _hold_followers(model, found, name)
-    return found, notes
+    return found, notes, tendons
 
 
 def _hold_followers(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> None:
@@ -118,21 +121,43 @@ def _couple_on_tendon(
     return f"{name(joint)!r} follows {name(driver)!r} by a line within {error:.2g}" if error > 1e-6 else ""
 
 
-def _couple_by_tendons(model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]) -> list[str]:
-    """Joints that share one actuated tendon bend in the ratio of its pull on them, unless something else moves them."""
+def _couple_by_tendons(
+    model: Any, found: dict[int, Mimic | float], name: Callable[[int], str]
+) -> tuple[list[str], Tendons]:
+    """Joints that share one actuated tendon, unless something else moves them: notes, and tendons.
+
+    Joints of one finger, each on the one before, share it as what they touch says. Joints side by side, the jaws of a
+    gripper, bend in the ratio of its pull on them: free to share it they would let the object run from side to side.
+    """
     alone = {
         pulled[0][0] for actuator in range(model.nu) if len(pulled := driven(model, actuator)) == 1
     }  # joints with an actuator of their own
-    notes = []
+    notes, tendons = [], {}
     for actuator in range(model.nu):
         free = [(j, c) for j, c in driven(model, actuator) if j not in found and j not in alone and abs(c) > 1e-9]
         if len(free) < 2:
+            continue
+        if _in_a_row(model, [joint for joint, _ in free]):
+            tendons[str(model.actuator(actuator).name) or f"tendon_{actuator}"] = dict(free)
             continue
         (driver, pull), *others = free
         for joint, coefficient in others:
             found[joint] = Mimic(name(driver), coefficient / pull, 0.0)
         notes.append(f"{', '.join(name(joint) for joint, _ in others)} taken to follow {name(driver)} on their tendon")
-    return notes
+    return notes, tendons
+
+
+def _in_a_row(model: Any, joints: list[int]) -> bool:
+    """Whether each joint moves the next, or the next moves it, all the way."""
+    chains = []
+    for joint in joints:
+        chain, body = [], int(model.jnt_bodyid[joint])
+        while body:
+            chain.append(body)
+            body = int(model.body_parentid[body])
+        chains.append(frozenset(chain))
+    chains.sort(key=len)
+    return all(a <= b for a, b in itertools.pairwise(chains))
 
 
 def _range(model: Any, joint: int) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,12 +22,13 @@ class Servo:
     """[N m/rad or N/m]"""
 
 
-def servos(model: Any, mimics: Mapping[int, Mimic | float]) -> dict[int, Servo]:
+def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int] = ()) -> dict[int, Servo]:
     """Servo of each joint that an actuator drives.
 
     An actuator of gear g on a length l pulls with g F dl/dq at joint q, and a position servo of gain k holds it with
     k (g dl/dq)^2: on a joint dl/dq is 1; on a fixed tendon it is the joint's coefficient, and the joints that follow
-    this one add theirs, times how fast they follow.
+    this one add theirs, times how fast they follow. Of n joints that `shared` says share a tendon each is as stiff as n
+    of them in a row must be for the tendon's gain.
     """
     found: dict[int, Servo] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
@@ -41,6 +42,7 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float]) -> dict[int, Servo]:
         for joint, rate in rates.items():
             arm = abs(gear * rate)
             force, gain = _force(model, actuator), _gain(model, actuator)
+            gain *= len(rates) if joint in shared else 1
             before = found.get(joint, Servo())
             found[joint] = Servo(before.effort + arm * force, before.stiffness + arm**2 * gain)
     for joint, servo in list(found.items()):

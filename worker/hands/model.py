@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from worker.hands.features import HandFeatures
 from worker.hands.robot import Ints, Joint
+from worker.hands.tendons import Tendon
 from worker.hands.visuals import NO_VISUALS, Visuals
-from worker.objects.content import content_of
+from worker.objects.content import TOLD_IF_SET, content_of
 
 Floats = NDArray[np.float64]
 
@@ -76,6 +77,16 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True)
+class Drag:
+    """What a joint's mechanism adds to its motion, for each body (L,); 0 where nothing is stated."""
+
+    armature: Floats
+    """Inertia of the drive [kg m^2 or kg]."""
+    dry_friction: Floats
+    """[N m or N]"""
+
+
+@dataclass(frozen=True)
 class HandModel:
     """Kinematic tree of L bodies with D independent degrees of freedom (dofs) that drive J moving joints.
 
@@ -130,6 +141,10 @@ class HandModel:
     """What the hand looks like."""
     frames: Mapping[str, tuple[int, Floats]] = field(default_factory=dict)
     """Each link: its body, and its pose (7,) in the body's frame."""
+    tendons: tuple[Tendon, ...] = field(default=(), metadata=TOLD_IF_SET)
+    """Drives of several dofs, none on two; the other dofs have a drive each."""
+    drag: Drag | None = field(default=None, metadata=TOLD_IF_SET)
+    """None: the referee's joints have none, as the protocol says."""
 
     @cached_property
     def content(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -62,6 +62,12 @@ class HandOptions(_Options):
     drop: tuple[str, ...] = Field((), description="links to leave out, with all that hangs on them")
     fix: dict[str, Finite] = Field(default_factory=dict, description="joints frozen at a value [rad or m]")
     couplings: dict[str, Coupling] = Field(default_factory=dict, description="couplings that the URDF lacks")
+    tendons: dict[str, dict[str, Finite]] | None = Field(
+        None, description="drives that pull several joints, and the coefficient of each joint; {}: none"
+    )
+    shapes: Literal["collision", "visual"] = Field(
+        "collision", description="what of a link touches: its collision elements, or what it looks like"
+    )
     palm: Annotated[PalmOptions | None, BeforeValidator(_palm)] = None
     approach: Vector | None = Field(None, description="direction out of the palm, palm link frame")
     preshape: dict[str, Finite] = Field(default_factory=dict, description="joint values in which the hand approaches")

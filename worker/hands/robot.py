@@ -5,7 +5,7 @@ Every value was checked by the reader, so that nothing behind it has to.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import HandError, LimitError
 from service.model.transforms import Floats
+from worker.objects.content import TOLD_IF_SET
 
 Ints = NDArray[np.int32]
 
@@ -80,6 +81,10 @@ class Joint:
     """Limit [rad/s or m/s]; 0: not stated."""
     stiffness: float = 0.0
     """Position gain of the joint's servo [N m/rad or N/m]; 0: not stated."""
+    armature: float = field(default=0.0, metadata=TOLD_IF_SET)
+    """Inertia that the drive adds [kg m^2 or kg]; 0: not stated."""
+    dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)
+    """[N m or N]; 0: not stated."""
 
 
 @dataclass(frozen=True)
@@ -93,10 +98,18 @@ class Robot:
     notes: tuple[str, ...] = field(default=())
     """Oddities that were taken but should be told to the user."""
     format: str = "URDF"
+    tendons: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Drives that pull several joints: the coefficient of each joint."""
 
 
 def build_robot(
-    name: str, links: Iterable[Link], joints: Iterable[Joint], notes: Iterable[str], filename: str, fmt: str = "URDF"
+    name: str,
+    links: Iterable[Link],
+    joints: Iterable[Joint],
+    notes: Iterable[str],
+    filename: str,
+    fmt: str = "URDF",
+    tendons: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Robot:
     """A robot of links and joints whose own values were checked.
 
@@ -123,7 +136,7 @@ def build_robot(
     if not any(link.shapes for link in link_of.values()):
         add = "add <collision> elements" if fmt == "URDF" else "give geoms a contype and conaffinity"
         raise HandError(f"{filename}: no link has collision geometry, so nothing can touch; {add}")
-    return Robot(name, link_of, joint_of, root, tuple(notes), fmt)
+    return Robot(name, link_of, joint_of, root, tuple(notes), fmt, tendons or {})
 
 
 def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:

@@ -13,6 +13,7 @@ from worker.hands.model import Floats, JointType
 from worker.hands.options import HandOptions
 from worker.hands.robot import UNLIMITED_M, Joint, Mimic, Robot, chain_to
 from worker.hands.roots import pick_root
+from worker.hands.tendons import check_tendons
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,9 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
             degree of freedom no room.
     """
     _check_names(robot, options)
-    mimics = {name: joint.mimic for name, joint in robot.joints.items()}
+    # A joint on a tendon follows nothing: it is free within its limits.
+    pulled = {joint for pulls in (options.tendons or {}).values() for joint in pulls}
+    mimics = {name: None if name in pulled else joint.mimic for name, joint in robot.joints.items()}
     mimics |= {name: Mimic(c.of, c.multiplier, c.offset) for name, c in options.couplings.items()}
     root = pick_root(robot, options)
     kept = _kept_joints(robot, root, set(options.drop))
@@ -87,6 +90,7 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
                 raise HandError(f"asset.json names the {kind} {name!r}, which the URDF does not have")
             if kind == "joint" and robot.joints[name].type == "fixed":
                 raise HandError(f"asset.json names the joint {name!r}, which cannot move")
+    check_tendons(robot, options.tendons or {})
 
 
 def joints_above(robot: Robot, link: str) -> tuple[str, ...]:

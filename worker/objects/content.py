@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 #: How a model is called says nothing of what it is.
 _NAMES: Final = frozenset({"name", "digest"})
+#: Metadata of a field that says nothing while it has its default.
+TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 
 
 def content_of(model: Any) -> str:
@@ -20,10 +23,16 @@ def content_of(model: Any) -> str:
         TypeError: a field that holds neither numbers, texts, arrays, tuples and sets of these, nor a dataclass.
     """
     whole = hashlib.sha256()
-    for part in _parts({f.name: getattr(model, f.name) for f in fields(model) if f.name not in _NAMES}):
+    for part in _parts({name: value for name, value in _told(model).items() if name not in _NAMES}):
         whole.update(len(part).to_bytes(8, "little"))
         whole.update(part)
     return whole.hexdigest()[:32]
+
+
+def _told(model: Any) -> dict[str, Any]:
+    """Fields of a dataclass that say something."""
+    values = {f: getattr(model, f.name) for f in fields(model)}
+    return {f.name: value for f, value in values.items() if not (f.metadata.get("told_if_set") and value == f.default)}
 
 
 def _parts(value: Any) -> Iterator[bytes]:
@@ -41,7 +50,7 @@ def _parts(value: Any) -> Iterator[bytes]:
     elif is_dataclass(value) and isinstance(told := getattr(value, "content", None), str):
         yield told.encode()
     elif is_dataclass(value) and not isinstance(value, type):
-        yield from _parts({f.name: getattr(value, f.name) for f in fields(value)})
+        yield from _parts(_told(value))
     elif isinstance(value, (str, int, float, np.generic)) or value is None:
         yield f"{type(value).__name__}{value!r}".encode()
     else:

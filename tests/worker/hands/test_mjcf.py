@@ -107,12 +107,11 @@ def test_what_is_no_hand_is_left_out() -> None:
     assert not {"ball", "world"} & set(hand.body_names)
 
 
-def test_an_equality_and_a_tendon_couple_joints() -> None:
+def test_an_equality_couples_joints() -> None:
     hand = load()
-    assert set(hand.dof_names) == {"left_spread", "left_bend", "right_slide"}
-    values = dict(zip(hand.dof_names, (0.2, 0.6, 0.01), strict=False))
+    assert set(hand.dof_names) == {"left_spread", "left_bend", "left_curl", "right_slide"}
+    values = dict(zip(hand.dof_names, (0.2, 0.6, 0.5, 0.01), strict=True))
     q = dict(zip(hand.joint_names, hand.expand(np.array([values[dof] for dof in hand.dof_names])), strict=True))
-    assert q["left_curl"] == pytest.approx(0.5 * values["left_bend"])
     # q1 - q1_0 = 0.1 - 0.5 (q2 - q2_0), both at rest at 0.
     assert q["right_curl"] == pytest.approx(0.1 - 0.5 * values["left_spread"])
 
@@ -143,9 +142,10 @@ def test_angles_that_would_be_no_motion_in_degrees_are_radians() -> None:
 def test_servos_give_force_limits_and_gains() -> None:
     hand = load()
     at = {name: number for number, name in enumerate(hand.dof_names)}
-    # The tendon's length is bend + 0.5 curl, and curl is half of bend: 1.25 a radian of bend.
-    assert hand.effort[at["left_bend"]] == pytest.approx(2 * 1.25)
-    assert hand.stiffness[at["left_bend"]] == pytest.approx(4 * 1.25**2)
+    # A tendon of length bend + 0.5 curl pulls curl half as hard; two joints in a row give way twice as far as one.
+    for joint, pull in (("left_bend", 1.0), ("left_curl", 0.5)):
+        assert hand.effort[at[joint]] == pytest.approx(2 * pull)
+        assert hand.stiffness[at[joint]] == pytest.approx(2 * 4 * pull**2)
     assert hand.effort[at["right_slide"]] == pytest.approx(15 * 2)
     assert hand.stiffness[at["right_slide"]] == pytest.approx(300 * 2**2)
     assert hand.effort[at["left_spread"]] == pytest.approx(0.3)

@@ -259,8 +259,8 @@ def test_shadow_root_link_without_shape_is_no_obstacle(shared_data: Path) -> Non
 def test_the_check_says_which_joints_are_left_out_and_how_to_keep_them(shared_data: Path) -> None:
     files = bare_files(shared_data, "shadow")
     note = "WRJ2, WRJ1 above the palm left out, poses are those of 'palm' (--root world)"
-    assert check_hand(files, "shadow")["facts"]["notes"] == [note]
-    assert check_hand(files, "shadow", {"root": "world"})["facts"]["notes"] == []
+    assert note in check_hand(files, "shadow")["facts"]["notes"]
+    assert not any("left out" in one for one in check_hand(files, "shadow", {"root": "world"})["facts"]["notes"])
 
 
 def test_on_its_forearm_a_palm_faces_where_its_fingers_close_and_the_wrist_closes_nothing(shared_data: Path) -> None:

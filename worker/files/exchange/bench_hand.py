@@ -95,6 +95,8 @@ def _model(hand: HandModel) -> Element:
         bodies.append(body)
         _add_solids(body, assets, hand, b)
     _add_exclusions(SubElement(top, "contact"), hand, names)
+    if hand.tendons:
+        _add_tendons(SubElement(top, "tendon"), hand)
     _add_drives(SubElement(top, "equality"), SubElement(top, "actuator"), hand)
     return top
 
@@ -147,8 +149,18 @@ def _add_exclusions(contact: Element, hand: HandModel, names: tuple[str, ...]) -
 
 
 def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
-    """A position actuator on the first joint of each degree of freedom; the others are coupled to that joint."""
+    """A position actuator on the first joint of each degree of freedom; the others are coupled to that joint. Dofs on a
+    tendon have one on it."""
+    pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
     for d, name in enumerate(hand.dof_names):
+        if (tendon := pulled.get(d)) is not None:
+            if d == min(tendon.dofs):
+                limit = tendon.limit(hand.effort)
+                SubElement(
+                    actuators, "position", name=name, tendon=tendon.name, kp=_text([tendon.gain(hand.stiffness)]),
+                    forcerange=_text([-limit, limit]),
+                )  # fmt: skip
+            continue
         lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
         m = float(hand.multiplier[lead])
         limit = float(hand.effort[d]) / abs(m)
@@ -161,6 +173,13 @@ def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
             start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
             pair = {"joint1": _joint_of(hand, b), "joint2": _joint_of(hand, lead)}
             SubElement(equality, "joint", {**pair, "polycoef": _text([start, ratio, 0, 0, 0]), **_COUPLING})
+
+
+def _add_tendons(tendons: Element, hand: HandModel) -> None:
+    for tendon in hand.tendons:
+        fixed = SubElement(tendons, "fixed", name=tendon.name)
+        for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
+            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_text([pull]))
 
 
 def _text(values: Any) -> str:

@@ -85,6 +85,9 @@ def verdict_key(
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
             # Of grippers alone: the keys of hands stay what they are.
             **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
+            # Of hands that have them alone, likewise.
+            **({"tendons": [[*t.dofs, *t.coefficients] for t in hand.tendons]} if hand.tendons else {}),
+            **({"drag": [hand.drag.armature.tolist(), hand.drag.dry_friction.tolist()]} if hand.drag else {}),
             **({"first_judge": list(first_judge)} if first_judge else {}),
         }
     )

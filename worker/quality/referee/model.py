@@ -15,8 +15,10 @@ from worker.engines.mujoco_warnings import ARENA
 from worker.grasps import Posture
 from worker.hands.jaws import jaws_of
 from worker.hands.model import ConvexPiece, HandModel, JointType
+from worker.hands.tendons import actuators
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.drives import add_tendon, equality_data, leading_bodies, leading_joints
 from worker.simulation.surroundings import CLEAR_M, Neighbour, Obstacle
 
 Floats = NDArray[np.float64]
@@ -93,8 +95,10 @@ class Scene:
     joint_qpos: NDArray[np.intp]
     """(J,) in `HandModel.joint_names` order."""
     dof_gain: Floats
-    """(D,) control of a dof's actuator: its leading joint = gain q + shift."""
+    """(D,) value of each dof's leading joint = gain q + shift."""
     dof_shift: Floats
+    pulls: Floats | None
+    """(A, D) controls of the actuators from these values; None: they are the values."""
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     support_geoms: NDArray[np.bool_]
@@ -119,7 +123,12 @@ class Scene:
         """Target posture of actuators and root."""
         data.mocap_pos[0] = hand_pose[:3]
         data.mocap_quat[0] = hand_pose[3:]
-        data.ctrl[:] = self.hand.reduce(joints) * self.dof_gain + self.dof_shift
+        data.ctrl[:] = self.controls(joints)
+
+    def controls(self, joints: Floats) -> Floats:
+        """(..., A) targets of the actuators for joint positions (..., J)."""
+        values: Floats = self.hand.reduce(joints) * self.dof_gain + self.dof_shift
+        return values if self.pulls is None else values @ self.pulls.T
 
 
 def build(
@@ -133,7 +142,7 @@ def build(
     """Compile the scene of a hand and an object, with the supports that it stands on or between and what stands beside
     it, if any."""
     model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
-    gain, shift = _leading(hand)
+    gain, shift = leading_joints(hand)
     body_of_geom = model.geom_bodyid
     object_body = model.body("object").id
     beside = tuple(_free_body(model, f"neighbour{k}", one.obj) for k, one in enumerate(neighbours))
@@ -150,6 +159,7 @@ def build(
         joint_qpos=np.array([int(model.joint(f"joint{b}").qposadr[0]) for b in hand.joint_body], np.intp),
         dof_gain=gain,
         dof_shift=shift,
+        pulls=actuators(hand.tendons, hand.dofs) if hand.tendons else None,
         centre=obj.centre_of_mass,
         support_geoms=np.asarray(support),
         neighbours=beside,
@@ -208,18 +218,6 @@ def several_contacts(hand: HandModel) -> int:
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 
-def _leading(hand: HandModel) -> tuple[Floats, Floats]:
-    """Multiplier and offset of the first body that each dof drives."""
-    first = _leading_bodies(hand)
-    return hand.multiplier[first], hand.offset[first]
-
-
-def _leading_bodies(hand: HandModel) -> NDArray[np.intp]:
-    """(D,) the body whose joint carries each dof's actuator: of the first joint it drives, as `HandModel.reduce`."""
-    drives = hand.dof[hand.joint_body]
-    return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
-
-
 def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> None:
     if root == "weld":
         spec.worldbody.add_body(name="mocap", mocap=True)
@@ -227,7 +225,7 @@ def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> N
         base.add_freejoint(name="root")
         spec.add_equality(
             type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap", name2="body0",
-            solimp=[0.9, 0.95, 0.001, 0.5, 2.0], data=_equality_data(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1),
+            solimp=[0.9, 0.95, 0.001, 0.5, 2.0], data=equality_data(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1),
         )  # fmt: skip
     else:
         base = spec.worldbody.add_body(name="body0", mocap=True)
@@ -254,7 +252,19 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
         range=ends,
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         damping=[DAMPING_TIME * float(hand.stiffness[d]), 0, 0],
+        **_mechanism(hand, b, d),
     )
+
+
+def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
+    """What the protocol's joints do not have. A tendon drives a joint against its limit for good, so that has to stop
+    it: as stiff as a coupling."""
+    found: dict[str, Any] = {}
+    if hand.drag is not None:
+        found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
+    if any(d in tendon.dofs for tendon in hand.tendons):
+        found |= {"solref_limit": COUPLING_SOLREF, "solimp_limit": COUPLING_SOLIMP}
+    return found
 
 
 def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction: list[float]) -> None:
@@ -308,8 +318,13 @@ def _mesh(spec: Any, geom: Any, vertices: Floats, name: str) -> None:
 
 
 def _add_actuators(spec: Any, hand: HandModel) -> None:
-    leading = _leading_bodies(hand)
+    leading = leading_bodies(hand)
+    pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
     for d, lead in enumerate(leading):
+        if (tendon := pulled.get(d)) is not None:
+            if d == min(tendon.dofs):
+                add_tendon(spec, hand, tendon, f"dof{d}", leading)
+            continue
         # The actuator sits on the joint: a dof's gain and limit are the joint's through its multiplier.
         m = float(hand.multiplier[lead])
         actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -327,16 +342,10 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
                 objtype=mujoco.mjtObj.mjOBJ_JOINT,
                 name1=f"joint{b}",
                 name2=f"joint{lead}",
-                data=_equality_data(start, ratio),
+                data=equality_data(start, ratio),
                 solref=COUPLING_SOLREF,
                 solimp=COUPLING_SOLIMP,
             )
-
-
-def _equality_data(*values: float) -> Floats:
-    data = np.zeros(mujoco.mjNEQDATA)
-    data[: len(values)] = values
-    return data
 
 
 def _excluded(hand: HandModel) -> set[tuple[int, int]]:

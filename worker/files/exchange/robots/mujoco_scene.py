@@ -113,7 +113,7 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
     qpos[scene.root_qpos : scene.root_qpos + 7] = pose
     at = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
     qpos[scene.object_qpos : scene.object_qpos + 7] = compose(at, np.array([*scene.centre, 1, 0, 0, 0]))
-    control = found.hand.reduce(command.joint_positions[row]) * scene.dof_gain + scene.dof_shift
+    control = scene.controls(command.joint_positions[row])
     return {
         "qpos": element_text(qpos),
         "ctrl": element_text(control),

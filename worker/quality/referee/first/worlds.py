@@ -154,7 +154,7 @@ class WorldPool:
             "start": starts,
             "position": poses[..., :3],
             "turn": poses[..., 3:],
-            "control": scene.hand.reduce(joints) * scene.dof_gain + scene.dof_shift,
+            "control": scene.controls(joints),
         }
         for name, value in values.items():
             array = getattr(self._asked, name)

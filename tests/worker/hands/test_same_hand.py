@@ -1,0 +1,79 @@
+"""Two models of one hand: joints by name, bases by fit, fingertips as the judge."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.model.errors import InputError
+from service.model.transforms import compose, invert, quat_from_axis_angle
+from tests.worker.hands.test_mjcf import package_file
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.hands.same_hand import same_hand
+
+HAND = hand_from_path("shadow")
+#: Where the other model's root link is, as seen from ours.
+BASE = np.concatenate([[0.013, -0.02, 0.034], quat_from_axis_angle(np.array([0.6, 0.0, 0.8]), np.array(2.0))])
+
+
+def other_base(hand: HandModel) -> HandModel:
+    """The same hand with another frame on its root: what hangs on it, and its shapes, are told in that frame."""
+    moved = invert(BASE)
+    origin = hand.origin.copy()
+    hangs = np.flatnonzero(hand.parent == 0)
+    origin[hangs] = compose(moved, origin[hangs])
+    return dataclasses.replace(hand, name="other", origin=origin)
+
+
+def named(hand: HandModel, names: list[str]) -> HandModel:
+    return dataclasses.replace(hand, joint_names=tuple(names))
+
+
+def test_the_other_base_is_found() -> None:
+    found = same_hand(HAND, other_base(HAND))
+    # Double precision, and a least-squares fit that ends at steps of 1e-15.
+    assert found.base[:3] == pytest.approx(BASE[:3], abs=1e-8)
+    assert abs(float(found.base[3:] @ BASE[3:])) == pytest.approx(1.0, abs=1e-12)
+    assert found.fingertips_m < 1e-8
+
+
+def test_names_count_without_what_all_begin_with_and_without_case() -> None:
+    other = named(HAND, [f"robot0:{name.lower()}" for name in HAND.joint_names])
+    assert same_hand(HAND, other).joints.tolist() == list(range(len(HAND.joint_names)))
+
+
+def test_order_does_not_count() -> None:
+    order = np.arange(len(HAND.joint_names))[::-1]
+    names, body = [HAND.joint_names[k] for k in order], HAND.joint_body[order]
+    other = dataclasses.replace(named(HAND, names), joint_body=body)
+    assert same_hand(HAND, other).joints.tolist() == order.tolist()
+
+
+def test_a_joint_of_another_name_is_named_and_can_be_said() -> None:
+    names = ["bend" if name == "FFJ3" else name for name in HAND.joint_names]
+    with pytest.raises(InputError, match=r"shadow has FFJ3; shadow has bend; .*--joint-map OURS=THEIRS"):
+        same_hand(HAND, named(HAND, names))
+    assert same_hand(HAND, named(HAND, names), {"FFJ3": "bend"}).fingertips_m < 1e-8
+    with pytest.raises(InputError, match="joint 'curl', which shadow does not have"):
+        same_hand(HAND, named(HAND, names), {"FFJ3": "curl"})
+
+
+def test_another_hand_of_the_same_joints_is_refused_with_its_farthest_fingertip() -> None:
+    axis = HAND.axis.copy()
+    bend = HAND.joint_body[HAND.joint_names.index("MFJ3")]
+    axis[bend] *= -1
+    with pytest.raises(InputError, match=r"fingertip 'MF_distal' is up to \d+\.\d+ mm .* 1 mm are allowed") as error:
+        same_hand(HAND, dataclasses.replace(HAND, name="mirrored", axis=axis))
+    assert "\n" not in str(error.value)
+
+
+def test_the_urdf_of_shadow_and_robopianists_mjcf_are_one_hand(shared_data: Path) -> None:
+    other = hand_from_path(package_file("robopianist", "models/hands/third_party/shadow_hand/right_hand.xml"))
+    found = same_hand(hand_from_path(shared_data / "hands/shadow/shadow_hand_right.urdf"), other)
+    # Published lengths: the little finger's metacarpal is 65.89 mm long here and 65.79 mm there, all else agrees.
+    assert found.fingertips_m < 1.2e-4
+    assert np.linalg.norm(found.base[:3]) < 1e-4

@@ -1,0 +1,111 @@
+"""Tendons: one drive that pulls several joints. It is told their sum; how they share it is up to what they touch."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import HandError
+from worker.hands.robot import Robot
+
+Floats = NDArray[np.float64]
+
+#: Coefficients smaller than this pull nothing.
+LEAST_PULL: Final = 1e-6
+#: The outer joints of a Shadow finger: J1 hangs on J2, and one tendon pulls both. Its URDFs cannot say so.
+_SHADOW: Final = re.compile(r"(?P<prefix>.*?)(?P<finger>FF|MF|RF|LF)J1")
+_SHADOW_FINGERS: Final = frozenset({"FF", "MF", "RF"})
+
+
+@dataclass(frozen=True)
+class Tendon:
+    """A drive of several dofs: its length is the sum of coefficient times joint value.
+
+    At a pull F each joint gets the torque c F, whatever its value: the drive moves the sum alone.
+    """
+
+    name: str
+    dofs: tuple[int, ...]
+    coefficients: tuple[float, ...]
+
+    def gain(self, stiffness: Floats) -> float:
+        """Gain of the drive [N m/rad of length] from those of the dofs (D,), as of springs in a row: 1 / sum(c^2 / k).
+
+        Then what commands c F of each joint by q + c F / k commands the pull F of the tendon.
+        """
+        parts = zip(self.dofs, self.coefficients, strict=True)
+        return 1.0 / sum(c * c / float(stiffness[d]) for d, c in parts)
+
+    def limit(self, effort: Floats) -> float:
+        """Largest pull that exceeds no dof's limit (D,)."""
+        return min(float(effort[d]) / abs(c) for d, c in zip(self.dofs, self.coefficients, strict=True))
+
+
+def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
+    """(A, D) length of each drive from the dofs' values: the dofs in their order, a tendon where its first dof is."""
+    rows: list[Floats] = []
+    pulled = {d: tendon for tendon in tendons for d in tendon.dofs}
+    for d in range(dofs):
+        tendon = pulled.get(d)
+        if tendon is not None and d != min(tendon.dofs):
+            continue
+        row = np.zeros(dofs)
+        if tendon is None:
+            row[d] = 1.0
+        else:
+            row[list(tendon.dofs)] = tendon.coefficients
+        rows.append(row)
+    return np.array(rows).reshape(-1, dofs)
+
+
+def tendons_of(
+    robot: Robot, stated: Mapping[str, Mapping[str, float]] | None, dof_names: tuple[str, ...]
+) -> tuple[Tendon, ...]:
+    """Tendons of a hand: those stated, else the description's, else those that its kind of hand is known to have.
+
+    Of each count the joints that are degrees of freedom of the hand; fewer than two make no tendon.
+    """
+    said = stated if stated is not None else robot.tendons or known_tendons(robot)
+    found = []
+    for name, pulls in said.items():
+        kept = {joint: float(c) for joint, c in pulls.items() if joint in dof_names and abs(c) > LEAST_PULL}
+        if len(kept) > 1:
+            found.append(Tendon(name, tuple(dof_names.index(joint) for joint in kept), tuple(kept.values())))
+    return tuple(found)
+
+
+def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
+    """Those of a Shadow hand, told by the names and the order of its joints: J1 + J2 of each finger but the thumb."""
+    found: dict[str, dict[str, float]] = {}
+    fingers = set()
+    for name, joint in robot.joints.items():
+        outer = _SHADOW.fullmatch(name)
+        if outer is None or joint.type != "revolute" or joint.mimic is not None:
+            continue
+        inner = robot.joints.get(f"{name[:-1]}2")
+        if inner is not None and inner.type == "revolute" and inner.mimic is None and inner.child == joint.parent:
+            found[f"{name[:-1]}0"] = {inner.name: 1.0, name: 1.0}
+            fingers.add(outer["finger"])
+    # MJCF says what its tendons are.
+    return found if fingers >= _SHADOW_FINGERS and robot.format == "URDF" else {}
+
+
+def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> None:
+    """Raises:
+    HandError: a stated tendon names what is no joint, pulls fewer than two, or shares one with another tendon.
+    """
+    seen: set[str] = set()
+    for name, pulls in stated.items():
+        for joint in pulls:
+            if joint not in robot.joints or robot.joints[joint].type == "fixed":
+                raise HandError(f"asset.json: tendon {name!r} pulls {joint!r}, which is no moving joint of the hand")
+            if joint in seen:
+                raise HandError(f"asset.json: joint {joint!r} is on two tendons; one drive can move it")
+            seen.add(joint)
+        if sum(abs(c) > LEAST_PULL for c in pulls.values()) < 2:
+            raise HandError(f"asset.json: tendon {name!r} pulls fewer than two joints; leave it out")
