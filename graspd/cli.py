@@ -56,6 +56,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("bench", "worker.commands.bench", "Studies", "Grasps per second, and where the time goes."),
     ("view", "worker.commands.view", "Without a server", "Grasps of a file in 3D in the browser, one at a time."),
     ("pictures", "worker.commands.render", "Without a server", "The best grasps of a file on one sheet."),
+    ("grasps", "worker.commands.curate", "Without a server", "Grasps of files and datasets, chosen by their numbers."),
     ("export", "worker.commands.exchange", "Without a server", "Grasps and pictures in the formats of others."),
     ("import", "worker.commands.exchange", "Without a server", "Grasps of others, judged and measured like ours."),
     ("stability", "worker.commands.stability", "Studies", "Where integrators and the planner fail."),
@@ -67,6 +68,8 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("hands", "check", "worker.commands.hands", "Say whether a hand can be used, and what was guessed about it."),
     ("objects", "check", "worker.commands.objects", "Say whether a mesh can be used, and what was repaired."),
+    ("datasets", "balance", "worker.commands.curate", "A part in which no kind of grasps is more frequent."),
+    ("datasets", "diff", "worker.commands.curate", "What two datasets do not have in common."),
     ("datasets", "card", "worker.commands.card", "Write a dataset's card: contents, quality, biases, plots."),
 )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
+
+#: JSON files beside shards that hold no grasps.
+BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ def expand(path: Path) -> list[Path]:
     """
     if not path.is_dir() or any(path.rglob("*.npy")):
         return [path]
-    found = sorted(file for suffix in ("*.h5", "*.json") for file in path.rglob(suffix))
+    # Beside shards lie JSON files that tell of them: snapshot.json, subset.json, card.json.
+    found = sorted([*path.rglob("*.h5"), *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
     if not found:
         raise InputError(f"{path} has no shards (.h5), reference grasps (.json) or DexGraspBench files (.npy)")
     return found

@@ -1,0 +1,74 @@
+"""The language that chooses grasps by their numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.model.errors import InputError
+from service.readers.where import LONGEST, parse
+
+COLUMNS: dict[str, Any] = {
+    "quality/thresholds_m": np.array([0.002, 0.005]),
+    "quality/epsilon": np.array([[0.9, 0.1], [0.0, 0.4], [0.9, np.nan], [0.0, 0.3]]),
+    "quality/penetration_depth_mm": np.array([0.5, 1.5, 0.5, 2.5]),
+    "quality/valid": np.array([1, 1, 1, 0], np.uint8),
+    "quality/success": np.array([1, 1, 1, 0], np.int8),
+    "quality/lift_outcome": np.array([1, 5, 1, 1], np.uint8),
+    "quality/grasp_type": np.array([1, 2, 3, 0], np.int32),
+}
+SAID = {"hand": "allegro", "object": "006_mustard_bottle"}
+
+
+@pytest.mark.parametrize(
+    ("text", "rows"),
+    [
+        ("epsilon > 0.3", [1]),  # the value at 5 mm, not the one at 2 mm
+        ("epsilon>=.3", [1, 3]),
+        ("not epsilon > 0.3", [0, 2, 3]),
+        ("epsilon = 3e-1 or epsilon != 0.1 and valid", [1, 3]),
+        ("(epsilon = 0.3 or epsilon != 0.1) and valid", [1]),
+        ("valid and lift", [0, 2]),
+        ("lift and not held", [3]),
+        ("type = power or type = 'lateral'", [0, 2]),
+        ("type != power", [1, 2, 3]),
+        ("hand = allegro and object = 006_mustard_bottle and penetration_depth_mm < 1", [0, 2]),
+        ("object = '006_mustard_bottle'", [0, 1, 2, 3]),
+        ("hand != allegro", []),
+        ("clearance_m > -1", []),  # a shard that lacks a metric fails every comparison with it
+        ("pushes or lift_hard", []),
+    ],
+)
+def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
+    assert np.flatnonzero(parse(text)(COLUMNS, SAID)).tolist() == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "ends where a name"),
+        ("epsilon", "is to be compared"),
+        ("epsilon >", "ends where a value"),
+        ("epsilon > big", "compared with a number"),
+        ("epsilon > 1 valid", "left over"),
+        ("valid > 0", "true or not"),
+        ("(valid", "not closed"),
+        ("and valid", "where a name is expected"),
+        ("beauty > 1", "there is no 'beauty'; the names are epsilon"),
+        ("type = pinch", "no type 'pinch'"),
+        ("hand < allegro", "a word"),
+        ("epsilon > 1; import os", "cannot be read"),
+        ("__import__('os').system('true')", "cannot be read"),
+        ("__import__ > 1", "there is no '__import__'"),
+        ("epsilon > 0x10", "cannot be read|left over|compared with"),
+        ("(" * 200 + "valid" + ")" * 200, "nested"),
+        ("not " * 200 + "valid", "nested"),
+        ("valid and " * LONGEST, "characters long"),
+    ],
+)
+def test_what_is_no_expression_is_refused_in_a_line(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words) as refused:
+        parse(text)
+    assert "\n" not in str(refused.value)

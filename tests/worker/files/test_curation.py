@@ -1,0 +1,124 @@
+"""Parts of datasets: chosen by an expression, balanced, and compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from service.model.errors import InputError
+from service.readers import Grasps, open_shards
+from service.store.shards import read_shard, write_shard
+from worker.commands.curate import app
+from worker.files.balance import Balance, faces
+from worker.files.cases import expand
+
+COUNT = 40
+
+
+def columns(seed: int) -> dict[str, Any]:
+    """40 valid grasps, three in four of type power."""
+    rng = np.random.default_rng(seed)
+    pose = np.concatenate([rng.normal(0, 0.1, (COUNT, 3)), np.tile([1.0, 0, 0, 0], (COUNT, 1))], axis=1)
+    found: dict[str, Any] = {"quality/thresholds_m": np.array([0.005])}
+    for posture in ("grasp", "pregrasp", "squeeze"):
+        found |= {f"{posture}/hand_pose": pose, f"{posture}/joint_positions": rng.random((COUNT, 2))}
+    found |= {f"quality/{name}": rng.random((COUNT, 1)) for name in ("epsilon", "wrench_volume", "contact_area_cm2")}
+    found |= {
+        f"quality/{name}": rng.random(COUNT)
+        for name in (
+            "intersection_volume_cm3", "penetration_depth_mm", "self_penetration_depth_mm", "stability_loss",
+        )
+    }  # fmt: skip
+    return found | {
+        "quality/contact_links": np.full(COUNT, 3, np.int32),
+        "quality/valid": np.ones(COUNT, np.uint8),
+        "quality/success": np.ones(COUNT, np.int8),
+        "quality/grasp_type": np.where(np.arange(COUNT) % 4 < 3, 1, 2).astype(np.int32),
+        "quality/approach_cell": rng.integers(0, 2, COUNT).astype(np.int32),
+    }
+
+
+def shard(path: Path, number: int, obj: str = "mug", batch: int = 0, **changes: Any) -> Path:
+    said = {"hand": "allegro", "object": obj, "batch": batch, "shard_id": f"{number:032x}", "seed": 0, **changes}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(write_shard("base", columns(number), said))
+    return path
+
+
+def run(*words: str | Path) -> Any:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    shard(tmp_path / "all" / "a.h5", 1)
+    shard(tmp_path / "all" / "b.h5", 2, batch=1)
+    shard(tmp_path / "all" / "c.h5", 3, obj="drill")
+    (tmp_path / "all" / "snapshot.json").write_text("{}")
+    return tmp_path / "all"
+
+
+def test_a_subset_holds_what_the_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "subset"
+    told = json.loads(run("grasps", "where", "type = precision and epsilon >= 0.2", "--from", folder, "-o", out,
+                          "--json").stdout)  # fmt: skip
+    every = Grasps(open_shards(folder), ["quality/epsilon", "grasp/hand_pose"])
+    chosen = Grasps(open_shards(out), ["quality/epsilon", "grasp/hand_pose", "quality/grasp_type"])
+    poses = {sample["grasp/hand_pose"].tobytes() for sample in every}
+    assert 0 < len(chosen) == told["kept"] < told["looked_at"] == 3 * COUNT
+    for sample in chosen:
+        assert sample["grasp/hand_pose"].tobytes() in poses and sample["quality/grasp_type"] == 2
+    names = {file.name for file in expand(out)}
+    assert names <= {"base-00000.h5", "base-00001.h5"}, "what tells of the subset is no file of grasps"
+
+
+def test_a_subset_of_nothing_and_one_over_a_folder_that_is_there_are_refused(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "none"
+    nothing = run("grasps", "where", "epsilon > 1e6", "--from", folder, "-o", out)
+    assert nothing.exit_code == 2 and "none of 120 grasps" in nothing.stderr and not out.exists()
+    again = run("grasps", "where", "valid", "--from", folder, "-o", folder)
+    assert again.exit_code == 2 and "is there already" in again.stderr
+
+
+def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "even"
+    assert run("balance", folder, "--by", "type", "-o", out).exit_code == 0
+    for obj, each in (("mug", 2 * COUNT), ("drill", COUNT)):
+        types = Grasps(open_shards(out).only(objects=[obj])).arrays("quality/grasp_type")["quality/grasp_type"]
+        power, precision = int((types == 1).sum()), int((types == 2).sum())
+        # Kinds have 3/4 and 1/4 of each: the median of the two is half.
+        assert (power, precision) == (each // 2, each // 4)
+    kept = [read_shard(file) for file in sorted(out.rglob("*.h5"))]
+    again = tmp_path / "again"
+    run("balance", folder, "--by", "type", "-o", again)
+    for one, other in zip(kept, sorted(again.rglob("*.h5")), strict=True):
+        assert np.array_equal(one["grasp/hand_pose"], read_shard(other)["grasp/hand_pose"])
+
+
+def test_faces_are_told_by_what_lies_below() -> None:
+    tilted = [np.sin(0.1), 0.0, -np.cos(0.1)]
+    assert faces(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [0, 1, 0, -1, 2]
+
+
+@pytest.mark.parametrize("by", ["beauty", ""])
+def test_a_kind_that_there_is_not_is_refused(by: str) -> None:
+    with pytest.raises(InputError, match="type, direction, face"):
+        Balance([by] if by else [])
+
+
+def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shard(other / "a.h5", 1)
+    shard(other / "c.h5", 3, obj="drill", seed=9)
+    shard(other / "d.h5", 4, obj="block")
+    found = json.loads(run("diff", folder, other, "--json").stdout)
+    assert found["shards"] == {"first": 3, "second": 3, "common": 2} and found["same_cells"] == 1
+    cells = {one["object"]: (one["first"], one["second"], one["common"]) for one in found["cells"]}
+    assert cells == {"mug": (2 * COUNT, COUNT, COUNT), "block": (0, COUNT, 0)}
+    assert found["settings"] == {"seed": {"first": ["0"], "second": ["0", "9"]}}
+    assert "the same grasps in 2 cells" in run("diff", folder, folder).stdout

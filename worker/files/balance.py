@@ -1,0 +1,104 @@
+"""Grasps of a dataset shared out evenly to kinds: types, directions of approach, faces that the object lies on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.transforms import quat_conjugate, quat_rotate
+from service.store import standing
+from service.store.shards import Shard
+from worker.files.of_shard import hand_of_shard
+from worker.grasps import Posture
+from worker.quality.diversity import distinct, hand_points
+
+#: What grasps can be shared out by.
+KINDS: Final = ("type", "direction", "face")
+_COLUMNS: Final = {"type": "quality/grasp_type", "direction": "quality/approach_cell"}
+#: Two scenes have the object on one face where their down, in its frame, differ by less than this [cosine of 20 deg].
+_SAME_FACE: Final = float(np.cos(np.radians(20)))
+
+
+@dataclass(frozen=True)
+class Balance:
+    """How to choose; a chooser of `worker.files.subsets`, called with the shards of one hand on one object."""
+
+    by: Sequence[str]
+    at_most: int = 0
+    """Of each kind; 0: as many as the median kind has."""
+    min_distance: float = 0.0
+    """No two of those chosen are nearer [m], see `worker.quality.diversity`; 0: any."""
+    seed: int = 0
+    hand: str | None = None
+    """The hand's file, where the shards do not lead to it; only distances need it."""
+
+    def __post_init__(self) -> None:
+        if unknown := [one for one in self.by if one not in KINDS]:
+            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose of {', '.join(KINDS)}")
+        if not self.by:
+            raise InputError(f"say what to balance by: {', '.join(KINDS)}")
+
+    def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
+        """Masks of the chosen grasps: valid ones, drawn at random by the seed, none of a kind more often than allowed.
+
+        Raises:
+            InputError: a shard does not tell the kind.
+        """
+        kinds = self._kinds(shards)
+        wanted = np.concatenate([standing.valid(shard.arrays) for shard in shards])
+        if self.min_distance > 0 and wanted.any():
+            wanted[np.flatnonzero(wanted)[~self._apart(shards, wanted)]] = False
+        _, kind = np.unique(kinds, axis=0, return_inverse=True)
+        counts = np.bincount(kind.ravel()[wanted])
+        limit = self.at_most or int(np.median(counts[counts > 0])) if wanted.any() else 0
+        order = np.random.default_rng(self.seed).permutation(len(kinds))
+        chosen = np.zeros(len(kinds), bool)
+        for number in range(len(counts)):
+            mine = order[(kind.ravel()[order] == number) & wanted[order]]
+            chosen[mine[:limit]] = True
+        return np.split(chosen, np.cumsum([len(shard["quality/valid"]) for shard in shards])[:-1])
+
+    def _kinds(self, shards: list[Shard]) -> NDArray[np.int64]:
+        """(N, len(by)) what kind each grasp is of."""
+        columns = []
+        for name in self.by:
+            if name == "face":
+                columns.append(faces(np.concatenate([_down(shard) for shard in shards])))
+                continue
+            if old := [shard for shard in shards if _COLUMNS[name] not in shard.arrays]:
+                raise InputError(f"{old[0].path} does not tell the {name} of its grasps: an older graspd made it")
+            columns.append(np.concatenate([np.asarray(shard[_COLUMNS[name]], np.int64) for shard in shards]))
+        return np.stack(columns, axis=1)
+
+    def _apart(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        hand = hand_of_shard(shards[0], self.hand)
+        parts = [Posture.from_columns(shard.arrays) for shard in shards]
+        pose = np.concatenate([part.hand_pose for part in parts])[wanted]
+        joints = np.concatenate([part.joint_positions for part in parts])[wanted]
+        return distinct(hand_points(hand, Posture(pose, joints)), self.min_distance)
+
+
+def _down(shard: Shard) -> NDArray[np.float64]:
+    """(N, 3) what is down in the scene of each grasp, in the object's frame; zero: it floats."""
+    if "grasp/scene_index" not in shard.arrays:
+        return np.zeros((len(shard["quality/valid"]), 3))
+    poses = np.asarray(shard["scene/object_pose"], float)
+    down = quat_rotate(quat_conjugate(poses[:, 3:]), np.array([0.0, 0, -1.0]))
+    return np.asarray(down[np.asarray(shard["grasp/scene_index"], np.intp)])
+
+
+def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) number of the face that lies below, for what is down (N, 3): the first seen within 20 degrees."""
+    seen = np.zeros((0, 3))
+    found = np.full(len(down), -1, np.int64)
+    for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):
+        near = np.flatnonzero(seen @ down[row] > _SAME_FACE)
+        if not len(near):
+            seen, near = np.concatenate([seen, down[row][None]]), np.array([len(seen)])
+        found[row] = near[0]
+    return found

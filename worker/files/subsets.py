@@ -1,0 +1,113 @@
+"""Parts of a dataset as base shards of their own: some of the grasps, with all that is known of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.cli import load_settings
+from service.model.digests import digest_json
+from service.model.errors import InputError
+from service.readers import Shards, open_shards
+from service.store.shards import SCHEMAS, Shard, read_shard, write_shard
+from service.store.store import open_store
+
+#: From the base shards of one hand on one object to the mask (N,) of each.
+Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
+#: Attributes that `write_shard` sets itself.
+_SET: Final = ("schema",)
+
+
+@dataclass(frozen=True)
+class Subset:
+    """What was written."""
+
+    looked_at: int
+    kept: int
+    files: list[Path]
+    passed_over: int
+    """Scene and views shards, whose rows name grasps by number and are not carried over."""
+
+
+def shards_of(source: str, snapshot: str | None = None) -> Shards:
+    """The shards of a file or folder, or of a dataset of this machine's store by its name.
+
+    Raises:
+        NotFoundError: there is no such thing.
+    """
+    if "/" in source or source in (".", "..") or Path(source).exists():
+        return open_shards(Path(source))
+    return open_shards(open_store(load_settings().resolved_store_url), dataset=source, snapshot=snapshot)
+
+
+def base_shards(shards: Shards) -> Iterator[list[Shard]]:
+    """The base shards of each hand and object, a list each."""
+    pair, together = ("", ""), list[Shard]()
+    for file in shards.of("base"):
+        if (file.hand, file.object) != pair and together:
+            yield together
+            together = []
+        pair = (file.hand, file.object)
+        together.append(read_shard(shards.path(file), kind="base"))
+    if together:
+        yield together
+
+
+def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:
+    """Base shards of the chosen grasps, `HAND/OBJECT/base-BATCH.h5`, and `subset.json`: how they were chosen.
+
+    A shard of which nothing is chosen is left out. What each grasp says, its scene too, is as it was.
+
+    Raises:
+        InputError: the folder holds files already, or cannot be made; or nothing is chosen.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is there already; choose a folder that is not")
+    looked_at = kept = 0
+    ready: list[tuple[Path, bytes]] = []
+    for together in base_shards(shards):
+        for shard, mask in zip(together, choose(together), strict=True):
+            looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
+            if mask.any():
+                path = out / _place(shard)
+                ready.append((_free(path, {one for one, _ in ready}), _bytes(shard, mask)))
+    if not ready:
+        raise InputError(f"none of {looked_at} grasps is chosen")
+    for path, data in ready:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    files = [path for path, _ in ready]
+    told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path.relative_to(out)) for path in files]}
+    (out / "subset.json").write_text(json.dumps(told, indent=1) + "\n")
+    return Subset(looked_at, kept, files, len(shards) - len(shards.of("base")))
+
+
+def _place(shard: Shard) -> Path:
+    said = shard.attributes
+    names = [str(said.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]
+    return Path(*names) / f"base-{int(said.get('batch', 0)):05}.h5"  # type: ignore[arg-type]
+
+
+def _free(path: Path, taken: set[Path]) -> Path:
+    """The path, or one beside it: two jobs may have a batch of one number."""
+    found, number = path, 1
+    while found in taken:
+        found, number = path.with_stem(f"{path.stem}-{number}"), number + 1
+    return found
+
+
+def _bytes(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
+    schema = SCHEMAS["base"]
+    arrays = {
+        path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
+    }
+    attributes = {name: value for name, value in shard.attributes.items() if name not in _SET}
+    if "shard_id" in attributes:
+        attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
+    return write_shard("base", arrays, attributes)
