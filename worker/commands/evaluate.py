@@ -134,7 +134,7 @@ def _said_of_models(whole: dict[str, Any]) -> str:
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
     return (
         f"robust: the {whole['robust_n']} that hold do so in {whole['robust_share']:.2f} of {whole['robust_models']} "
-        f"models around the nominal one; by what differs: {each}"
+        f"models around the nominal one\nby what differs: {each}"
     )
 
 

@@ -152,9 +152,11 @@ def _said_of_models(found: dict[str, Any]) -> str:
     """How far the verdicts can be trusted, in a line."""
     share, fragile = found["robust_share"], found["fragile"]
     if share is None:
-        return f"none held in enough of {found['robust_models']} models around the nominal one ({fragile} held in it)"
-    lost = f"; {fragile} valid ones held in fewer than {found['robust_wanted']:.0%}" if found["robust_wanted"] else ""
-    return f"they hold in {share:.0%} of {found['robust_models']} models around the nominal one{lost}"
+        return f"none is robust; {fragile} hold in the nominal model, and in too few of {found['robust_models']} others"
+    models = f"of {found['robust_models']} models around the nominal one"
+    if not (wanted := found["robust_wanted"]) or found["want"] != "valid":
+        return f"they hold in {share:.0%} {models}"
+    return f"each holds in {wanted:.0%} {models} or more; {fragile} valid ones did not"
 
 
 def _said(found: dict[str, Any]) -> str:
