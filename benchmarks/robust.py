@@ -25,7 +25,7 @@ from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions
 from worker.quality.referee.refit import fits_of
 from worker.quality.referee.robust import reaches, robust
-from worker.quality.referee.variant import SHAPES, Variant, axes_of, draw, together
+from worker.quality.referee.variant import SHAPES, Variant, axes_of, couplings_of, draw, together
 from worker.quality.referee.varied import Models
 from worker.run import Run
 
@@ -45,9 +45,11 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
         if fit == "own" or fit in fits_of(hand):
             name = WORDS[fit] or f"{1e3 * grown:+.0f} mm"
             found[f"{MEANINGS[Axis.SHAPES]}: {name}"] = [lambda _, f=fit, g=grown: Variant(fit=f, grown_m=g)]  # type: ignore[misc]
+    for coupling in couplings_of(hand):
+        found[f"{MEANINGS[Axis.COUPLINGS]}: {coupling}"] = [lambda _, c=coupling: Variant(coupling=c)]  # type: ignore[misc]
     for axis in axes_of(hand):
-        if axis is not Axis.SHAPES:
-            found[MEANINGS[axis]] = [lambda rng, a=axis: draw(a, hand, rng)] * (1 if axis is Axis.COUPLINGS else draws)  # type: ignore[misc]
+        if axis not in (Axis.SHAPES, Axis.COUPLINGS):
+            found[MEANINGS[axis]] = [lambda rng, a=axis: draw(a, hand, rng)] * draws  # type: ignore[misc]
     found[ALL] = [lambda rng: together(draw(axis, hand, rng) for axis in axes_of(hand))] * draws
     return found
 

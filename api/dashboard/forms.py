@@ -108,8 +108,9 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
 def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
-        # A rule over several fields has no place of its own; those that a form can break are about scenes.
-        name = str(entry["loc"][0]) if entry["loc"] else "scenes"
+        # A rule over several fields has no place of its own; those that a form can break are about scenes and robust.
+        whole = "robust" if "robust" in entry["msg"] else "scenes"
+        name = str(entry["loc"][0]) if entry["loc"] else whole
         errors.setdefault(name, entry["msg"].removeprefix("Value error, "))
     return errors
 

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.model.robust import Axis
 from worker.hands.model import HandModel
+from worker.quality.referee.recoupled import Coupling
 from worker.quality.referee.refit import Fit, fits_of
 
 Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
-Coupling = Literal["own", "compliant"]
 
 #: How far each axis goes. Shapes stand out or back by this [m].
 GROWTH_M: Final = 1e-3
@@ -53,7 +53,7 @@ class Variant:
     gain: float = 1.0
     """Position gain over the model's own; limits of torque stay."""
     coupling: Coupling = "own"
-    """compliant: what couples joints gives way under load."""
+    """compliant: what couples joints gives way under load; separate, ratio: tendons read otherwise, see `recoupled`."""
     friction: float = 1.0
     """Sliding and torsional friction over the model's own."""
     mass: float = 1.0
@@ -75,14 +75,15 @@ NOMINAL: Final = Variant()
 
 def axes_of(hand: HandModel) -> tuple[Axis, ...]:
     """Axes along which a model of this hand can differ: without coupled joints there is nothing to vary in them."""
-    missing = set() if coupled(hand) else {Axis.COUPLINGS}
+    missing = set() if couplings_of(hand) else {Axis.COUPLINGS}
     missing |= {Axis.ORDER} if len(hand.fingertips) < 2 else set()
     return tuple(axis for axis in Axis if axis is not Axis.NONE and axis not in missing)
 
 
-def coupled(hand: HandModel) -> bool:
-    """Whether a dof drives several joints."""
-    return len(hand.joint_body) > hand.dofs
+def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
+    """Readings of a hand's couplings that are not its own: of dofs that drive several joints, and of tendons."""
+    rigid: tuple[Coupling, ...] = ("compliant",) if len(hand.joint_body) > hand.dofs else ()
+    return (*rigid, "separate", "ratio") if hand.tendons else rigid
 
 
 def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
@@ -109,7 +110,8 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
                 armature=ARMATURE * armature, dry_friction=DRY_FRICTION * dry, damping=_factor(rng), gain=_factor(rng)
             )
         case Axis.COUPLINGS:
-            return Variant(coupling="compliant")
+            found = couplings_of(hand)
+            return Variant(coupling=found[int(rng.integers(len(found)))])
         case Axis.FRICTION:
             return Variant(friction=float(rng.uniform(*FRICTIONS)))
         case Axis.MASS:

@@ -20,6 +20,7 @@ from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.model import MujocoOptions, Scene, blend, build
 from worker.quality.referee.protocol import STAGES, Test, Trial
+from worker.quality.referee.recoupled import Coupling, nearest, recoupled
 from worker.quality.referee.refit import Fit, refitted
 from worker.quality.referee.variant import Variant
 
@@ -30,14 +31,18 @@ COMPLIANT_SOLREF: Final = (0.02, 1.0)
 COMPLIANT_SOLIMP: Final = (0.9, 0.95, 1e-3, 0.5, 2.0)
 
 
+#: What of a variant is compiled: shapes, by how much they stand out, drives.
+_Build = tuple[Fit, float, Coupling]
+
+
 class Models:
     """The models around a nominal one, of one hand and object; threads share it."""
 
     def __init__(self, hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions) -> None:
         self.hand, self.obj = hand, obj
         self._pieces, self._physics = pieces, physics
-        self._scenes: dict[tuple[Fit, float], Scene] = {("own", 0.0): scene_of(hand, obj, pieces, physics)}
-        self._hands: dict[tuple[Fit, float], HandModel] = {("own", 0.0): hand}
+        self._scenes: dict[_Build, Scene] = {("own", 0.0, "own"): scene_of(hand, obj, pieces, physics)}
+        self._hands: dict[_Build, HandModel] = {("own", 0.0, "own"): hand}
         self._lock = threading.Lock()
         self._fingers = _fingers(hand)
 
@@ -45,20 +50,24 @@ class Models:
         """The verdict on one grasp, at the level of the certificate, in a variant; the nominal one has the verdict of
         `judge` bit for bit."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
-        return test.certificate(seen(self.obj, grasps, row, variant), 0)
+        one = seen(self.obj, grasps, row, variant)
+        if test.scene.hand.dofs < self.hand.dofs:
+            for part in (one.grasp, one.pregrasp, one.squeeze):
+                part.joint_positions = nearest(test.scene.hand, part.joint_positions)
+        return test.certificate(one, 0)
 
     def scene(self, variant: Variant) -> Scene:
         """The compiled model of a variant; its places are those of `place` and `command`."""
-        shapes = (variant.fit, variant.grown_m)
+        built: _Build = (variant.fit, variant.grown_m, "own" if variant.coupling == "compliant" else variant.coupling)
         with self._lock:
-            if shapes not in self._scenes:
-                self._hands[shapes] = refitted(self.hand, *shapes)
-                self._scenes[shapes] = build(self._hands[shapes], self.obj, self._pieces, self._physics)
-            scene = self._scenes[shapes]
+            if built not in self._scenes:
+                self._hands[built] = recoupled(refitted(self.hand, *built[:2]), built[2])
+                self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics)
+            scene = self._scenes[built]
         if any(variant.centre_m):
             # The body's frame stands in the centre of mass.
             obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
-            scene = build(self._hands[shapes], obj, self._pieces, self._physics)
+            scene = build(self._hands[built], obj, self._pieces, self._physics)
         return _with_numbers(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
@@ -102,7 +111,7 @@ class VariantTest(Test):
 def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     """The scene with the numbers of a variant, in a copy of its model; itself where there is none to change."""
     plain = Variant(fit=variant.fit, grown_m=variant.grown_m, centre_m=variant.centre_m, lags=variant.lags,
-                    object_shift_m=variant.object_shift_m, object_turn=variant.object_turn,
+                    coupling=variant.coupling if variant.coupling != "compliant" else "own", object_shift_m=variant.object_shift_m, object_turn=variant.object_turn,
                     hand_shift_m=variant.hand_shift_m)  # fmt: skip
     if variant == plain:
         return scene
