@@ -279,7 +279,8 @@ def test_a_compliant_coupling_gives_way_under_load() -> None:
 @pytest.mark.parametrize("axis", [axis for axis in Axis if axis is not Axis.NONE])
 def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
     rng = np.random.default_rng(5)
-    drawn = [draw(axis, PADS, rng) for _ in range(60)]
+    hand = one_drive() if axis is Axis.COUPLINGS else PADS
+    drawn = [draw(axis, hand, rng) for _ in range(60)]
     for one in drawn:
         assert 0.5 <= min(one.gain, one.damping, one.mass) <= max(one.gain, one.damping, one.mass) <= 2
         assert 0.4 - 1e-9 <= 0.6 * one.friction <= 0.8 + 1e-9

@@ -98,7 +98,7 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
     the logarithm of theirs.
 
     Raises:
-        ValueError: the axis is none.
+        ValueError: the axis is none, or the hand has no couplings.
     """
     match axis:
         case Axis.SHAPES:

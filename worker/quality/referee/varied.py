@@ -110,9 +110,9 @@ class VariantTest(Test):
 
 def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     """The scene with the numbers of a variant, in a copy of its model; itself where there is none to change."""
-    plain = Variant(fit=variant.fit, grown_m=variant.grown_m, centre_m=variant.centre_m, lags=variant.lags,
-                    coupling=variant.coupling if variant.coupling != "compliant" else "own", object_shift_m=variant.object_shift_m, object_turn=variant.object_turn,
-                    hand_shift_m=variant.hand_shift_m)  # fmt: skip
+    compiled = "own" if variant.coupling == "compliant" else variant.coupling
+    plain = replace(variant, armature=None, dry_friction=None, damping=1.0, gain=1.0, friction=1.0, mass=1.0,
+                    coupling=compiled)  # fmt: skip
     if variant == plain:
         return scene
     model = copy.copy(scene.model)
