@@ -19,7 +19,7 @@ class StageStatus(StageProgress):
 
     state: State
     progress: float = Field(ge=0, le=1, description="share done; running batches count by their own progress")
-    message: str = Field("", description="what a running batch does now")
+    message: str = Field("", description="what a running batch does now, or why one waits")
     rate_per_s: float | None = Field(None, description="batches per second over the present workers")
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
 

@@ -27,6 +27,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.domain import Lane, Stage, TaskMessage
 from service.model.version import PACKAGE_VERSION
+from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s
 from service.queue.reports import REPORTS
@@ -38,7 +39,6 @@ from service.queue.rq_queue import (
     cancel_key,
     encoded,
     open_queue,
-    queue_name,
     worker_key,
 )
 from service.settings import Settings

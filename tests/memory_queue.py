@@ -47,7 +47,8 @@ class MemoryQueue:
     def ping(self) -> float:
         return 0.0
 
-    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
+    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
+        # Its workers are those of a test, which take what they want.
         known = {(m.task_id, m.attempt) for waiting in self._lanes.values() for m in waiting}
         if not again:
             known |= {(held.message.task_id, held.message.attempt) for held in self._held.values()}
@@ -66,6 +67,9 @@ class MemoryQueue:
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         return {(lane, s): sum(m.stage is s for m in waiting) for lane, waiting in self._lanes.items() for s in Stage}
+
+    def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+        pass
 
     def leases(self) -> list[Lease]:
         return [

@@ -22,6 +22,8 @@ from service.pipeline.backends import Parts
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200
+#: Waiting tasks among which one is sought that says why it waits.
+_LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _KEPT_LOSSES: Final = 256
 _LOSS_BATCHES: Final = 8
@@ -183,4 +185,8 @@ class Jobs:
         )
 
     def _running(self, job_id: str) -> list[TaskView]:
-        return self._parts.index.jobs.tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
+        """Running tasks, then the first of those that say why they wait."""
+        tasks = self._parts.index.jobs.tasks
+        running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
+        waiting = tasks(job=job_id, state=State.QUEUED, limit=_LOOKED_AT).items
+        return [*running, *(task for task in waiting if task.message)]

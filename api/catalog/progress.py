@@ -43,9 +43,13 @@ class Paces:
         return (share - start) / (now - since)
 
 
-def stage_statuses(job: JobView, running: Sequence[TaskView], paces: Paces) -> list[StageStatus]:
-    """The stages of a job in their order, each with its state and, where it can be told, its rate and end."""
-    return [_status(stage, [task for task in running if task.stage is stage.stage], paces) for stage in job.stages]
+def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: Paces) -> list[StageStatus]:
+    """The stages of a job in their order, each with its state and, where it can be told, its rate and end.
+
+    Args:
+        tasks: those that run, and of those that wait any that say why.
+    """
+    return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
 
 
 def progress_of_job(job: JobView) -> float:
@@ -64,15 +68,16 @@ def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
     return sum(stage.eta_s or 0.0 for stage in remaining)
 
 
-def _status(stage: StageProgress, running: list[TaskView], paces: Paces) -> StageStatus:
+def _status(stage: StageProgress, tasks: list[TaskView], paces: Paces) -> StageStatus:
     state = stage_state(stage)
+    running = [task for task in tasks if task.state is State.RUNNING]
     rate = None if state.is_final else _rate(stage, running, paces)
     left = max(0.0, stage.tasks - stage.done)
     return StageStatus(
         **stage.model_dump(),
         state=state,
         progress=min(1.0, stage.done / stage.tasks) if stage.tasks else 0.0,
-        message=next((task.message for task in running if task.message), ""),
+        message=next((task.message for task in tasks if task.message), ""),
         rate_per_s=rate,
         eta_s=left / rate if rate else None,
     )

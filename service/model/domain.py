@@ -412,7 +412,8 @@ class TaskMessage(Model):
     """What travels through the queue: enough for a worker with the store alone to do the task."""
 
     # `schema` is a field name in the message, an attribute of BaseModel in Python: hence the alias.
-    schema_: int = Field(alias="schema")
+    schema_: int = Field(alias="schema", description="oldest schema that can say this")
+    newest_schema: int = Field(0, ge=0, description="newest schema whose meaning the writer knew; 0: the same")
     task_id: Word
     job_id: Word
     stage: Stage
@@ -440,6 +441,7 @@ class IngestMessage(Model):
     """A task that checks an uploaded hand or object in a child process."""
 
     schema_: int = Field(alias="schema")
+    newest_schema: int = Field(0, ge=0)
     task_id: Word
     stage: Literal[Stage.INGEST] = Stage.INGEST
     kind: AssetKind

@@ -6,7 +6,7 @@ A job is cut into batches of `BATCH_SIZE` grasps; each batch is a chain of stage
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,7 +23,7 @@ from service.model.domain import (
     TaskMessage,
 )
 from service.model.records import JobRecord
-from service.model.version import TASK_SCHEMA
+from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, TASK_SCHEMA
 
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
@@ -103,7 +103,8 @@ def plan(job: JobRecord) -> Iterator[PlannedTask]:
 def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
     """What a worker is told."""
     return TaskMessage(
-        schema_=TASK_SCHEMA,
+        schema_=needed_schema(job.request),
+        newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,
         stage=task.stage,
@@ -121,6 +122,17 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
     )
 
 
+def needed_schema(request: JobRequest, since: Mapping[str, int] = SCHEMA_OF_FIELD) -> int:
+    """The oldest schema in which a request can be said: that of the newest field that it uses.
+
+    Args:
+        since: fields by the schema that first had them.
+    """
+    fields = JobRequest.model_fields
+    used = (schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default())
+    return max(used, default=OLDEST_TASK_SCHEMA)
+
+
 def backoff(first_s: float, failures: int) -> float:
     """Wait before the next attempt [s]: doubles with each failure, up to `MAX_BACKOFF_S`."""
     return min(MAX_BACKOFF_S, first_s * 2.0 ** max(0, failures - 1))
@@ -134,7 +146,8 @@ def ingest_id(kind: AssetKind, digest: str) -> str:
 def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max_attempt: int) -> IngestMessage:
     """What a worker is told to check."""
     return IngestMessage(
-        schema_=TASK_SCHEMA,
+        schema_=OLDEST_TASK_SCHEMA,
+        newest_schema=TASK_SCHEMA,
         task_id=ingest_id(kind, digest),
         kind=kind,
         name=name,

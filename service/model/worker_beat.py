@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from pydantic import Field
 
+from service.model.ability import UNTOLD_REVISIONS, UNTOLD_SCHEMAS, Ability
 from service.model.domain import Stage, Word
 
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
@@ -32,3 +33,14 @@ class WorkerBeat:
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
     """Why it is in quarantine."""
+    schemas: tuple[Count, Count] | None = None
+    """Oldest and newest task message that it reads; None: it does not say."""
+    revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
+    """Revision that it makes of each stage."""
+
+    @property
+    def ability(self) -> Ability:
+        """What it can do."""
+        if self.schemas is None:
+            return Ability(UNTOLD_SCHEMAS, UNTOLD_REVISIONS, looks_apart=False)
+        return Ability(self.schemas, self.revisions)

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections import defaultdict
 from collections.abc import Sequence
+from typing import Final
 
 from service.index.queries.feed import ReadyTask
 from service.index.views import JobView
 from service.logs import bound
 from service.model import names
+from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.digests import job_id
-from service.model.domain import AssetKind, JobRequest, Lane, Origin, State
+from service.model.domain import AssetKind, JobRequest, Lane, Origin, State, TaskMessage
 from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
 from service.model.planning import lane_of, message_of
 from service.model.records import JobRecord
 from service.pipeline import fidelity_choice
 from service.pipeline.backends import Parts
+from service.pipeline.routes import MIXED, Routes
 from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours
 from service.queue.port import Event, EventKind
@@ -24,6 +29,8 @@ from service.store.deletions import refuse_pending
 from service.store.records import add_job_event, job_events, put_record, read_record
 
 log = logging.getLogger(__name__)
+#: Wait before it is looked again whether a worker can do what was held back [s].
+HELD_S: Final = 10.0
 
 
 def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tuple[JobView, bool]:
@@ -147,33 +154,45 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
     return _told(parts, job_id)
 
 
-def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, again: bool = False) -> int:
-    """Put tasks into the queue and mark them in the index.
+def queue_tasks(
+    parts: Parts, ready: Sequence[ReadyTask], *, again: bool = False, routes: Routes | None = None
+) -> set[str]:
+    """Put tasks into the queue and mark them in the index; what no worker can do waits, and its job says why.
 
     The mark comes first: a task marked but not queued is found missing and queued by the keeper; one queued but not
     marked might run twice.
+
+    Args:
+        routes: who is there; by default nobody is known, and workers of this version are expected.
+
+    Returns:
+        why tasks are held back.
     """
-    added = 0
-    if ready:
-        parts.index.live.set_queued([task.task.id for task in ready])
-    for lane in Lane:
-        messages = [
-            message_of(
-                task.job,
-                task.task,
-                attempt=task.last_attempt + 1,
-                max_attempt=task.retried_upto + parts.settings.task_attempts,
-            )
-            for task in ready
-            if task.lane is lane
-        ]
-        added += parts.queue.enqueue(messages, lane, again=again) if messages else 0
-    return added
+    routes = routes or Routes()
+    to_queue: dict[tuple[Lane, bool], list[TaskMessage]] = defaultdict(list)
+    held: dict[str, list[str]] = defaultdict(list)
+    for task in ready:
+        attempts = {"attempt": task.last_attempt + 1, "max_attempt": task.retried_upto + parts.settings.task_attempts}
+        message = message_of(task.job, task.task, **attempts)
+        place = routes.place(need_of(message))
+        if place.held:
+            held[place.held].append(task.task.id)
+        else:
+            to_queue[task.lane, place.apart].append(message)
+    for why, tasks in held.items():
+        parts.index.live.set_waiting(tasks, not_before=time.time() + HELD_S, message=why)
+    if to_queue:
+        parts.index.live.set_queued([message.task_id for messages in to_queue.values() for message in messages])
+    for (lane, apart), messages in sorted(to_queue.items()):
+        parts.queue.enqueue(messages, lane, again=again, apart=apart)
+    return set(held)
 
 
 def _start(parts: Parts, job_id: str) -> None:
     """Queue as much of a job as the queue's window holds; the keeper feeds the rest, and all of it if Redis is away."""
     try:
+        if parts.queue.announced(MIXED):
+            return
         room = parts.settings.queue_window - sum(parts.queue.depths().values())
         if room > 0:
             queue_tasks(parts, parts.index.feed.ready_of_job(job_id, limit=room))

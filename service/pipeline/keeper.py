@@ -13,6 +13,7 @@ from typing import Final
 from service.heartbeat_file import HeartbeatFile
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
+from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.domain import Lane
 from service.model.errors import DamagedError, StoreUnavailable, UnavailableError
@@ -21,10 +22,11 @@ from service.model.turns import Turns
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.indexer import Indexer
-from service.pipeline.job_actions import queue_tasks
+from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
+from service.pipeline.routes import MIXED, Routes
 from service.pipeline.scrubber import Scrubber
 from service.pipeline.sweeper import Sweeper
 from service.queue.port import Event, EventKind
@@ -58,6 +60,9 @@ class Keeper:
         self._has_plans = False
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
+        self._routes = Routes()
+        self._held: set[str] = set()
+        """Why tasks were held back when the queue was last filled."""
         self._news = False
         """Whether anything came in since the queue was filled."""
         self._started = False
@@ -124,6 +129,12 @@ class Keeper:
         with _noted(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
         now = self._clock()
+        if self._counting.is_due:
+            with _noted(away):
+                self._parts.queue.tidy()
+            with _noted(away):
+                self._indexer.flush()
+                self._counting.run(self._look_after_workers)
         if self._looking.is_due:
             with _noted(away):
                 self._looking.run(self._look_after_queue)
@@ -143,12 +154,6 @@ class Keeper:
             with _noted(away):
                 is_left = self._sweeper.advance() or self._sweeper.collect()
                 self._sweep_again = now if is_left else now + _SWEEP_EVERY_S
-        if self._counting.is_due:
-            with _noted(away):
-                self._parts.queue.tidy()
-            with _noted(away):
-                self._indexer.flush()
-                self._counting.run(self._look_after_workers)
         if away:
             raise away[0]
 
@@ -157,6 +162,10 @@ class Keeper:
         # One that ended as it should says so, but its registration is gone a moment before that is read.
         present = self._parts.queue.workers()
         self._workers = len(present)
+        self._routes = Routes(present)
+        if self._routes.is_mixed:
+            self._parts.queue.announce(MIXED, 5 * self._parts.settings.keeper_interval_s + 5)
+        self._parts.queue.clear_untaken(present)
         self._parts.index.live.set_workers(
             present,
             lost_before=timestamp(self._parts.settings.lease_s),
@@ -225,15 +234,20 @@ class Keeper:
         now = time.time()
         # Every worker finds a task waiting when it ends one.
         window = max(self._parts.settings.queue_window, 2 * self._workers)
+        held: set[str] = set()
         for lane in Lane:
             room = window - sum(n for (of, _), n in depths.items() if of is lane)
             ready = self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
             if present is None:
-                queue_tasks(self._parts, ready)
+                held |= queue_tasks(self._parts, ready, routes=self._routes)
                 continue
             # After a rebuild the index does not know what is in the queue already.
             self._parts.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
-            queue_tasks(self._parts, [task for task in ready if task.task.id not in present], again=True)
+            left = [task for task in ready if task.task.id not in present]
+            held |= queue_tasks(self._parts, left, again=True, routes=self._routes)
+        for why in sorted(held - self._held):
+            log.warning("tasks are %s", why)
+        self._held = held
         self._feed_checks(present, now)
 
     def _feed_checks(self, present: set[str] | None, now: float) -> None:
@@ -250,7 +264,12 @@ class Keeper:
                     attempt=check.last_attempt + 1,
                     max_attempt=self._parts.settings.task_attempts,
                 )
-                self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=present is not None)
+                place = self._routes.place(need_of(message))
+                if place.held:
+                    self._parts.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
+                else:
+                    again = present is not None
+                    self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=again, apart=place.apart)
 
 
 @contextmanager

@@ -111,11 +111,12 @@ class Holder:
 class Tasks(Protocol):
     """Tasks to workers, and who holds which."""
 
-    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
+    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
         """Append tasks to a lane. A task (by id and attempt) that already waits or runs is not queued twice.
 
         Args:
             again: the caller has seen that the queue lost these tasks; what it still remembers of them is replaced.
+            apart: only some workers of the stage can do them, and only those see them.
 
         Returns:
             number of tasks added.
@@ -129,6 +130,9 @@ class Tasks(Protocol):
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         """Number of waiting tasks of each lane and stage."""
+
+    def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+        """Forget tasks that wait apart for workers of a kind that is gone. The keeper then finds them missing."""
 
     def leases(self) -> list[Lease]:
         """Tasks held by workers, living or dead. Reading changes nothing."""

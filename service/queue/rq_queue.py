@@ -7,14 +7,15 @@ result storage are not used: each of them loses or repeats work in ways the keep
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import product
 from typing import Any, Final
 
 from redis import Redis
 from redis.exceptions import RedisError, ResponseError
 
+from service.model.ability import need_of
 from service.model.domain import Lane, Stage
 from service.model.errors import QueueUnavailable
 from service.model.worker_beat import WorkerBeat
@@ -24,7 +25,8 @@ from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob
 from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
-from service.queue.port import Event, Holder, Lease, Message, Report, lane_order
+from service.queue.lists import LISTS, known_lists, place_of, queue_name, without_takers
+from service.queue.port import Event, Holder, Lease, Message, Report
 from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
 from service.settings import Settings
 
@@ -47,8 +49,6 @@ redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
 return 1
 """
 _RESIGN: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"
-#: Later stages first: a batch that was begun is finished before the next begins.
-_STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 
 
 class RqQueue:
@@ -65,8 +65,9 @@ class RqQueue:
             self.connection.ping()
         return time.perf_counter() - start
 
-    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False) -> int:
-        jobs = [(queue_name(lane, m.stage), rq_id(m.task_id, m.attempt), m) for m in messages]
+    def enqueue(self, messages: Sequence[Message], lane: Lane, *, again: bool = False, apart: bool = False) -> int:
+        lists = [queue_name(lane, m.stage, need_of(m) if apart else None) for m in messages]
+        jobs = [(name, rq_id(m.task_id, m.attempt), m) for name, m in zip(lists, messages, strict=True)]
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
             stale += [AllowedJob.key_for(job) for _, job, _ in jobs]
@@ -79,7 +80,7 @@ class RqQueue:
             for task in wanted:
                 pipe.set(cancel_key(task), "1", ex=_CANCEL_TTL_S)
             pipe.execute()
-            for key in _queue_keys():
+            for key in self._list_keys():
                 for job in self.connection.lrange(key, 0, -1):
                     if entries.task_of(entries.text(job))[0] in wanted:
                         pipe.lrem(key, 0, job)
@@ -88,21 +89,37 @@ class RqQueue:
 
     def waiting(self) -> set[str]:
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
-            for key in _queue_keys():
+            for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            places = list(product(Lane, Stage))
-            for lane, stage in places:
-                pipe.llen(f"rq:queue:{queue_name(lane, stage)}")
-            return dict(zip(places, pipe.execute(), strict=True))
+            lists = known_lists(self.connection)
+            for name in lists:
+                pipe.llen(f"rq:queue:{name}")
+            depths: Counter[tuple[Lane, Stage]] = Counter()
+            for name, length in zip(lists, pipe.execute(), strict=True):
+                depths[place_of(name)] += length
+            return dict(depths)
+
+    def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+        abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for name in without_takers(known_lists(self.connection), abilities):
+                key = f"rq:queue:{name}"
+                for job in self.connection.lrange(key, 0, -1):
+                    pipe.delete(_JOB + job)
+                pipe.delete(key)
+                # Where one of them is still held, its lease is read under the list's name.
+                if not self.connection.exists(f"rq:wip:{name}"):
+                    pipe.srem(LISTS, key)
+            pipe.execute()
 
     def leases(self) -> list[Lease]:
         # RQ's own readers clean up as they read, which moves lost tasks aside and runs callbacks; so the keys are read.
-        keys = [f"rq:wip:{queue_name(lane, stage)}" for lane, stage in product(Lane, Stage)]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            keys = [f"rq:wip:{name}" for name in known_lists(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
@@ -209,7 +226,12 @@ class RqQueue:
     def now(self, *, lease_s: float) -> QueueNow:
         with _mapped():
             return read_queue(
-                self.connection, workers_key=WORKERS, worker_key=_WORKER, lease_s=lease_s, read_beat=entries.beat
+                self.connection,
+                {name: place_of(name) for name in known_lists(self.connection)},
+                workers_key=WORKERS,
+                worker_key=_WORKER,
+                lease_s=lease_s,
+                read_beat=entries.beat,
             )
 
     def count(self, amounts: Mapping[str, float]) -> None:
@@ -225,9 +247,10 @@ class RqQueue:
 
     def tidy(self) -> None:
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
-        lists = [queue_name(lane, stage) for lane, stage in product(Lane, Stage)]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            entries.sweep(self.connection, _kinds(), EVENTS)
+            entries.sweep(self.connection, _KINDS, EVENTS)
+            lists = known_lists(self.connection)
+            entries.sweep(self.connection, _kinds(lists), EVENTS)
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
@@ -245,6 +268,9 @@ class RqQueue:
     def close(self) -> None:
         self.connection.close()
 
+    def _list_keys(self) -> list[str]:
+        return [f"rq:queue:{name}" for name in known_lists(self.connection)]
+
     @staticmethod
     def _events(reply: Any) -> list[tuple[str, Event]]:
         read = ((event_id, entries.event(fields.get(b"e"))) for event_id, fields in _entries_of(reply) if fields)
@@ -254,16 +280,6 @@ class RqQueue:
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
     """The queue that the settings name; it need not answer yet."""
     return RqQueue(connect(redis_url(settings), patience=patience))
-
-
-def queue_name(lane: Lane, stage: Stage) -> str:
-    """Name of the RQ queue of a lane and stage."""
-    return f"{lane.value}-{stage.value}"
-
-
-def queue_names(stages: Collection[Stage], taken: int = 0) -> list[str]:
-    """Queues of a worker that serves these stages, in the order in which it takes its next task after `taken`."""
-    return [queue_name(lane, stage) for lane in lane_order(taken) for stage in _STAGE_ORDER if stage in stages]
 
 
 def rq_id(task_id: str, attempt: int) -> str:
@@ -298,22 +314,19 @@ def encoded(event: Event) -> dict[str, str]:
     return {"e": event.model_dump_json(exclude_defaults=True)}
 
 
-def _queue_keys() -> list[str]:
-    return [f"rq:queue:{queue_name(lane, stage)}" for lane, stage in product(Lane, Stage)]
+#: Names of a fixed number, each with its type in Redis.
+_KINDS: Final = (
+    (EVENTS, "stream"),
+    (WORKERS, "set"),
+    (METRICS, "hash"),
+    (REPORTS, "hash"),
+    ("rq:workers", "set"),
+    (LISTS, "set"),
+)
 
 
-def _kinds() -> Iterator[tuple[str, str]]:
-    """Names of a fixed number, each with its type in Redis."""
-    yield from (
-        (EVENTS, "stream"),
-        (WORKERS, "set"),
-        (METRICS, "hash"),
-        (REPORTS, "hash"),
-        ("rq:workers", "set"),
-        ("rq:queues", "set"),
-    )
-    for lane, stage in product(Lane, Stage):
-        name = queue_name(lane, stage)
+def _kinds(lists: Sequence[str]) -> Iterator[tuple[str, str]]:
+    for name in lists:
         yield f"rq:queue:{name}", "list"
         yield from ((f"rq:{registry}:{name}", "zset") for registry in ("wip", "failed"))
         yield f"rq:workers:{name}", "set"

@@ -16,7 +16,7 @@ import yaml
 import graspd.cli
 from service.model.domain import Lane, Stage
 from service.model.version import PACKAGE_VERSION
-from service.queue.rq_queue import queue_name
+from service.queue.lists import queue_name
 from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import keda

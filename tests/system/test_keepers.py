@@ -2,85 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import re
 import signal
-import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from service.model.domain import State
 from service.pipeline import job_actions
-from service.pipeline.backends import Parts
-from service.queue.address import redis_url
-from service.queue.rq_queue import RqQueue
-from service.run.embedded import server_command
-from service.settings import Settings
-from tests.conftest import REPOSITORY
-from tests.fakes import add_assets, request
-from tests.service.conftest import wait_for_redis
-
-LEASE_S = 2.0
-
-
-class House:
-    """Redis, keepers and a worker as processes, each with a log."""
-
-    def __init__(self, folder: Path) -> None:
-        self.settings = Settings(data_dir=folder / "data", lease_s=LEASE_S, keeper_interval_s=0.3)
-        self._logs = folder / "logs"
-        self._logs.mkdir()
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self.start("redis", *server_command(self.settings))
-        self.parts = Parts.open(self.settings)
-        assert isinstance(self.parts.queue, RqQueue)
-        wait_for_redis(self.parts.queue, 60)
-        add_assets(self.parts)
-
-    def start(self, name: str, *command: str, **more: str) -> None:
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(REPOSITORY),
-            "GRASPD_DATA_DIR": str(self.settings.data_dir),
-            "GRASPD_REDIS_URL": redis_url(self.settings),
-            "GRASPD_LEASE_S": str(LEASE_S),
-            "GRASPD_KEEPER_INTERVAL_S": "0.3",
-            "GRASPD_LOG_FORMAT": "text",
-            **more,
-        }
-        with (self._logs / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
-
-    def keeper(self, name: str, **more: str) -> None:
-        self.start(name, sys.executable, "-m", "graspd", "keeper", **more)
-
-    def says(self, name: str, what: str) -> int:
-        """How often a process said something."""
-        return len(re.findall(what, (self._logs / f"{name}.log").read_text()))
-
-    def until(self, met: Callable[[], object], what: str, seconds: float = 90.0) -> float:
-        """Seconds until a condition is met; fails when it takes longer than that."""
-        start = time.monotonic()
-        while not met():
-            logs = "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in self._logs.iterdir())
-            assert time.monotonic() - start < seconds, f"still not: {what}\n{logs}"
-            time.sleep(0.02)
-        return time.monotonic() - start
-
-    def done(self, job: str) -> int:
-        return len(self.parts.index.jobs.tasks(job=job, state=State.SUCCEEDED, limit=100).items)
-
-    def close(self) -> None:
-        self.parts.close()
-        for name in reversed(self.processes):
-            process = self.processes[name]
-            process.send_signal(signal.SIGCONT)
-            process.kill()
-            process.wait()
+from tests.fakes import request
+from tests.system.house import LEASE_S, House
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from rq.exceptions import InvalidJobOperation
 from rq.serializers import JSONSerializer
 from rq.timeouts import BaseDeathPenalty
 
+from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.domain import BATCH_SIZE, Stage
 from service.model.errors import QueueUnavailable
@@ -29,8 +30,9 @@ from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob, AllowedQueue
+from service.queue.lists import queue_names
 from service.queue.port import Event
-from service.queue.rq_queue import RqQueue, open_queue, queue_names, worker_key
+from service.queue.rq_queue import RqQueue, open_queue, worker_key
 from service.settings import Settings
 from service.store.store import open_store
 from worker.engines.devices import Device
@@ -87,7 +89,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     ) -> None:
         """Without `company` it takes one task at a time."""
         super().__init__(
-            queues=queue_names(stages),
+            queues=queue_names(stages, ability=own_ability()),
             name=name,
             connection=queue.connection,
             serializer=JSONSerializer,
@@ -253,7 +255,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """RQ calls this after each task it took: which lane comes first for the next one."""
         self._taken += 1
         queues = {queue.name: queue for queue in self.queues}
-        self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken)]
+        self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]
 
     def kill_horse(self, sig: signal.Signals = signal.SIGTERM) -> None:
         """RQ's way to stop a task: there is no child to kill, so the task is asked."""
@@ -390,4 +392,6 @@ def _first_beat(name: str, device: Device, stages: Collection[Stage]) -> WorkerB
         task_id="",
         started=now,
         seen=now,
+        schemas=own_ability().schemas,
+        revisions=dict(own_ability().revisions),
     )

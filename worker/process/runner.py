@@ -14,11 +14,11 @@ from pydantic import ValidationError
 
 from service import logs, tracing
 from service.model import names
+from service.model.ability import need_of, own_ability
 from service.model.clock import timestamp
 from service.model.domain import IngestMessage, Origin, Stage, TaskMessage
 from service.model.errors import DamagedError, DamagedShard, InputError, TaskCancelled, TaskRefused, UnavailableError
 from service.model.records import AttemptRecord
-from service.model.version import STAGE_REVISIONS, TASK_SCHEMA
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.records import put_record
@@ -81,16 +81,9 @@ class Runner:
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()
         try:
-            if raw.get("schema") != TASK_SCHEMA:
-                raise TaskRefused(
-                    f"the task has schema {raw.get('schema')} and this worker knows {TASK_SCHEMA}; "
-                    "run workers and API of one version"
-                )
-            if isinstance(message, TaskMessage) and message.revision != STAGE_REVISIONS[message.stage]:
-                raise TaskRefused(
-                    f"the job was planned for revision {message.revision} of {message.stage} and this worker makes "
-                    f"revision {STAGE_REVISIONS[message.stage]}; submit the job again"
-                )
+            if lacking := own_ability().lacks(need_of(message)):
+                # For another worker: the keeper sees who is there, and tells what none of them can do.
+                return self._event(EventKind.DEFERRED, message, message=f"another version of worker does it: {lacking}")
             return self._do(message, context)
         except TaskCancelled:
             return self._stopped(message, context, started)

@@ -49,6 +49,13 @@ def test_the_rate_of_a_running_batch_is_what_it_did_since_it_was_first_seen() ->
     assert status.message == "phase 1"
 
 
+def test_a_stage_that_waits_says_why() -> None:
+    waits = task(0).model_copy(update={"state": State.QUEUED, "message": "held back"})
+    stage = StageProgress(stage=Stage.SYNTHESIZE, tasks=1, queued=1)
+    (status,) = stage_statuses(job(stage, state=State.QUEUED), [waits], Paces(Clock()))
+    assert (status.message, status.rate_per_s) == ("held back", None)
+
+
 def test_a_batch_seen_once_has_no_rate() -> None:
     (status,) = stage_statuses(
         job(StageProgress(stage=Stage.SYNTHESIZE, tasks=1, running=1, done=0.2)), [task(20)], Paces(Clock())

@@ -75,6 +75,33 @@ def test_a_schema_goes_back_and_forward_with_its_rows(url: str, engine: Engine, 
         assert compare_metadata(made, metadata) == []
 
 
+def test_migrations_only_add_so_that_an_older_process_goes_on_beside_the_newer_one(tmp_path: Path) -> None:
+    """Expand, then contract: what an older version reads and writes is dropped one release after nobody uses it."""
+    made = f"sqlite:///{tmp_path / 'index.sqlite'}"
+    Index(made).close()
+    engine = create_engine(made)
+
+    def columns() -> dict[tuple[str, str], bool]:
+        """Each column, and whether a row can be put without it."""
+        found = inspect(engine)
+        return {
+            (table, str(column["name"])): bool(column["nullable"]) or column["default"] is not None
+            for table in found.get_table_names()
+            for column in found.get_columns(table)
+        }
+
+    newer = columns()
+    for revision in REVISIONS[-2::-1]:
+        downgrade(made, revision)
+        older = columns()
+        tables = {table for table, _ in older}
+        assert older.keys() <= newer.keys(), f"after {revision} a column is gone that its processes use"
+        added = {name: optional for name, optional in newer.items() if name[0] in tables and name not in older}
+        assert all(added.values()), f"after {revision} its processes can put no row: {added}"
+        newer = older
+    engine.dispose()
+
+
 def test_the_first_revision_can_be_taken_back_too(url: str, engine: Engine) -> None:
     downgrade(url, "base")
     assert set(rows(engine)) == {"alembic_version"}

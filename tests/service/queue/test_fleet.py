@@ -6,10 +6,11 @@ import pytest
 
 from service.model.clock import timestamp
 from service.model.domain import Lane, Stage
+from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s
 from service.queue.reports import REPORTS
-from service.queue.rq_queue import RqQueue, queue_name
+from service.queue.rq_queue import RqQueue
 from tests.fakes import message_for
 from tests.memory_queue import MemoryQueue
 

@@ -15,8 +15,9 @@ from service.model.clock import timestamp
 from service.model.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.model.worker_beat import WorkerBeat
 from service.queue.allowed import AllowedJob, AllowedQueue
+from service.queue.lists import queue_names
 from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, TaskQueue
-from service.queue.rq_queue import RqQueue, queue_names, worker_key
+from service.queue.rq_queue import RqQueue, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
 from worker.process.heartbeat import Heartbeat, Hold, place_of

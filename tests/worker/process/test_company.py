@@ -17,8 +17,9 @@ from service.model.domain import Lane, Stage, TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.queue.allowed import TASK_FUNCTION, AllowedJob
+from service.queue.lists import queue_name
 from service.queue.port import EventKind
-from service.queue.rq_queue import WORKERS, RqQueue, queue_name
+from service.queue.rq_queue import WORKERS, RqQueue
 from service.queue.taking import take_alike
 from service.settings import Settings
 from service.store.manifests import shard_exists

@@ -183,22 +183,24 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
     assert not bench.store.exists(names.shard_file(Stage.SYNTHESIZE, message.output))
 
 
-def test_a_task_of_another_schema_is_refused_with_the_mend(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"schema": 99, "newest_schema": 99, "something_new": True}, "schema 99"),
+        ({"schema": 1, "newest_schema": 1}, "schema 1"),
+        ({"revision": 99}, "revision 99 of synthesize"),
+    ],
+)
+def test_what_another_version_must_do_is_handed_back_and_no_attempt_is_used_up(
+    bench: Bench, changed: dict[str, Any], why: str
+) -> None:
     message = message_for()
-    outcome = bench.run(message, schema=99, something_new=True)
+    outcome = bench.run(message, **changed)
     assert outcome is not None
-    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
-    assert "schema 99" in outcome.message
-    assert "one version" in outcome.message
+    assert outcome.kind is EventKind.DEFERRED
+    assert why in outcome.message
     assert bench.calls == 0
-
-
-def test_a_job_planned_for_another_revision_is_refused_with_the_mend(bench: Bench) -> None:
-    message = message_for()
-    outcome = bench.run(message, revision=message.revision + 1)
-    assert outcome is not None
-    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
-    assert "submit the job again" in outcome.message
+    assert task_attempts(bench.store, message.task_id) == []
 
 
 def test_what_is_no_message_is_refused(bench: Bench) -> None:

@@ -1,0 +1,60 @@
+"""Where a task waits, given the versions of the workers that are there."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from service.model.ability import Ability, Need, own_ability
+from service.model.domain import Stage
+from service.model.worker_beat import WorkerBeat
+
+#: What a keeper announces while some worker cannot do what this version plans: only it then puts tasks into the queue.
+MIXED: Final = "mixed"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a task goes."""
+
+    apart: bool = False
+    """Into a list that only some workers of its stage look into."""
+    held: str = ""
+    """Why it is held back; "" if it is not."""
+
+
+class Routes:
+    """What the living workers of each stage can do."""
+
+    def __init__(self, present: Sequence[WorkerBeat] = ()) -> None:
+        self._here: dict[Stage, list[Ability]] = defaultdict(list)
+        for beat in present:
+            for stage in beat.stages:
+                if beat.ability not in self._here[stage]:
+                    self._here[stage].append(beat.ability)
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether some worker reads or makes other things than this version does."""
+        own = own_ability()
+        return any(
+            one.schemas != own.schemas or one.revisions.get(stage.value, 0) != own.revisions.get(stage.value, 0)
+            for stage, abilities in self._here.items()
+            for one in abilities
+        )
+
+    def place(self, need: Need) -> Place:
+        """Of a task.
+
+        What every worker of its stage can do goes to all of them, and what some can do to those. Where these do not
+        look apart, it goes to all, and the others hand it back. What none can do is held back. While there is no
+        worker, those of this version are expected.
+        """
+        here = self._here.get(need.stage) or [own_ability()]
+        lacking = {one.lacks(need) for one in here} - {""}
+        able = [one for one in here if not one.lacks(need)]
+        if not able:
+            return Place(held=f"held back, no worker that is here can do it: {'; '.join(sorted(lacking))}")
+        return Place(apart=bool(lacking) and any(one.looks_apart for one in able))

@@ -1,0 +1,118 @@
+"""Where a task waits while workers of several versions are there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+
+import pytest
+
+from service.model.ability import Need, own_ability
+from service.model.domain import JobRequest, Lane, Stage
+from service.model.planning import needed_schema
+from service.model.worker_beat import WorkerBeat
+from service.pipeline.routes import Place, Routes
+from service.queue import entries
+from service.queue.lists import is_apart, known_lists, queue_name, queue_names
+from service.queue.rq_queue import RqQueue
+from tests.fakes import message_for, request
+
+OWN = own_ability()
+REVISION = OWN.revisions["synthesize"]
+NEED = Need(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
+
+
+def beat(
+    *, schemas: tuple[int, int] | None = OWN.schemas, revision: int = REVISION, stage: Stage = Stage.SYNTHESIZE
+) -> WorkerBeat:
+    now = "2026-01-01T00:00:00.000Z"
+    revisions = {**OWN.revisions, "synthesize": revision} if schemas else {}
+    return WorkerBeat("w", "h", 1, "cpu", "CPU", (stage,), "0", "idle", "", now, now, "", schemas, revisions)
+
+
+NEXT = beat(revision=REVISION + 1)
+UNTOLD = beat(schemas=None)
+
+
+@pytest.mark.parametrize(
+    ("present", "need", "place"),
+    [
+        ([], NEED, Place()),
+        ([beat()], NEED, Place()),
+        ([beat(), beat(stage=Stage.SCENE, revision=1)], NEED, Place()),
+        ([beat(), NEXT], NEED, Place(apart=True)),
+        ([beat(), beat(schemas=(9, 9))], NEED, Place(apart=True)),
+        ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Place(apart=True)),
+        ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Place()),
+        # One that does not say what it can looks only where everybody does.
+        ([UNTOLD, NEXT], replace(NEED, revision=10), Place()),
+        ([UNTOLD, NEXT], replace(NEED, revision=REVISION + 1), Place(apart=True)),
+    ],
+)  # fmt: skip
+def test_a_task_goes_where_those_look_who_can_do_it(present: list[WorkerBeat], need: Need, place: Place) -> None:
+    assert Routes(present).place(need) == place
+
+
+@pytest.mark.parametrize(
+    ("present", "need", "why"),
+    [
+        ([NEXT], NEED, f"revision {REVISION} of synthesize is needed, and revision {REVISION + 1} is made"),
+        ([], replace(NEED, revision=1), "revision 1 of synthesize is needed"),
+        ([UNTOLD], replace(NEED, schema=3, newest=3), "schema 3 of tasks is needed, and 2 is the newest known"),
+        ([beat(schemas=(5, 6))], replace(NEED, newest=4), "schema 4 of tasks is the newest it may have"),
+    ],
+)  # fmt: skip
+def test_what_nobody_can_do_is_held_back_with_the_reason(present: list[WorkerBeat], need: Need, why: str) -> None:
+    assert why in Routes(present).place(need).held
+
+
+def test_a_fleet_is_mixed_while_one_differs() -> None:
+    assert not Routes([beat(), beat(stage=Stage.SCENE)]).is_mixed
+    assert Routes([beat(), NEXT]).is_mixed
+
+
+def test_a_task_asks_for_the_schema_of_the_newest_field_that_it_uses() -> None:
+    since = {"friction": 3, "touch": 4}
+    assert needed_schema(request(), since) == OWN.schemas[0]
+    assert needed_schema(request(friction=0.5), since) == 3
+    assert needed_schema(request(friction=0.5, fidelity="draft"), {**since, "fidelity": 4}) == 4
+    assert isinstance(request(), JobRequest)
+
+
+def test_a_beat_without_abilities_is_one_of_the_version_before_they_were_told() -> None:
+    told = asdict(beat())
+    assert entries.beat(json.dumps(told).encode()) == beat()
+    for name in ("schemas", "revisions"):
+        del told[name]
+    old = entries.beat(json.dumps(told).encode())
+    assert old is not None and not old.ability.looks_apart and old.ability.schemas == (2, 2)
+
+
+def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
+    names = queue_names([Stage.SYNTHESIZE], ability=OWN)
+    assert names[:2] == [f"interactive-synthesize.2.{REVISION}", "interactive-synthesize"]
+    assert not any(is_apart(name) for name in queue_names([Stage.SYNTHESIZE], ability=UNTOLD.ability))
+
+
+def test_tasks_that_wait_apart_are_seen_and_leave_with_those_who_take_them(rq_queue: RqQueue) -> None:
+    message = message_for()
+    name = f"rq:queue:{queue_name(Lane.BULK, Stage.SYNTHESIZE, NEED)}"
+    assert rq_queue.enqueue([message], Lane.BULK, apart=True) == 1
+    assert rq_queue.connection.llen(name) == 1
+    assert rq_queue.waiting() == {message.task_id}
+    assert rq_queue.depths()[Lane.BULK, Stage.SYNTHESIZE] == 1
+    assert rq_queue.now(lease_s=6).depth[Lane.BULK, Stage.SYNTHESIZE] == 1
+    rq_queue.clear_untaken([beat(), NEXT])
+    assert rq_queue.waiting() == {message.task_id}
+    rq_queue.clear_untaken([NEXT])
+    assert rq_queue.waiting() == set()
+    assert known_lists(rq_queue.connection) == known_lists(rq_queue.connection)[:8]
+    assert rq_queue.enqueue([message], Lane.BULK) == 1, "nothing of it is left"
+
+
+def test_forged_names_of_lists_are_nobodys(rq_queue: RqQueue) -> None:
+    forged = [f"rq:queue:bulk-synthesize.{n}.1" for n in range(200)]
+    rq_queue.connection.sadd("rq:queues", "rq:queue:other.2.10", "rq:queue:bulk-synthesize.x.1", b"\xff", *forged)
+    assert len(known_lists(rq_queue.connection)) == 8 + 64
+    rq_queue.connection.set("rq:queues", "no set")
+    assert len(known_lists(rq_queue.connection)) == 8
