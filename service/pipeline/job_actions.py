@@ -21,7 +21,7 @@ from service.model.planning import lane_of, message_of
 from service.model.records import JobRecord
 from service.pipeline import fidelity_choice
 from service.pipeline.backends import Parts
-from service.pipeline.routes import MIXED, Routes
+from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours
 from service.queue.port import Event, EventKind
@@ -154,21 +154,18 @@ def retry(parts: Parts, job_id: str, *, cause: str = "") -> JobView:
     return _told(parts, job_id)
 
 
-def queue_tasks(
-    parts: Parts, ready: Sequence[ReadyTask], *, again: bool = False, routes: Routes | None = None
-) -> set[str]:
+def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
     """Put tasks into the queue and mark them in the index; what no worker can do waits, and its job says why.
 
     The mark comes first: a task marked but not queued is found missing and queued by the keeper; one queued but not
     marked might run twice.
 
     Args:
-        routes: who is there; by default nobody is known, and workers of this version are expected.
+        routes: who is there.
 
     Returns:
         why tasks are held back.
     """
-    routes = routes or Routes()
     to_queue: dict[tuple[Lane, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
@@ -191,11 +188,10 @@ def queue_tasks(
 def _start(parts: Parts, job_id: str) -> None:
     """Queue as much of a job as the queue's window holds; the keeper feeds the rest, and all of it if Redis is away."""
     try:
-        if parts.queue.announced(MIXED):
-            return
         room = parts.settings.queue_window - sum(parts.queue.depths().values())
         if room > 0:
-            queue_tasks(parts, parts.index.feed.ready_of_job(job_id, limit=room))
+            routes = Routes(parts.queue.workers())
+            queue_tasks(parts, parts.index.feed.ready_of_job(job_id, limit=room), routes=routes)
         _told(parts, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)

@@ -19,6 +19,7 @@ from service.model.domain import Lane
 from service.model.errors import DamagedError, StoreUnavailable, UnavailableError
 from service.model.planning import ingest_id, ingest_message
 from service.model.turns import Turns
+from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.indexer import Indexer
@@ -26,7 +27,7 @@ from service.pipeline.job_actions import HELD_S, queue_tasks
 from service.pipeline.pace import Pace
 from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
-from service.pipeline.routes import MIXED, Routes
+from service.pipeline.routes import Routes
 from service.pipeline.scrubber import Scrubber
 from service.pipeline.sweeper import Sweeper
 from service.queue.port import Event, EventKind
@@ -40,6 +41,8 @@ _EVENTS_A_ROUND: Final = 2000
 _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
+#: How long what a worker can do counts after it was last seen.
+_REMEMBERED_S: Final = 60.0
 #: How often the progress of tasks is passed on: as often as pages ask for it.
 _REPORTS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
@@ -61,6 +64,7 @@ class Keeper:
         self._turns = Turns()
         self._backlog: list[tuple[str, Event]] = []
         self._routes = Routes()
+        self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
         """Why tasks were held back when the queue was last filled."""
         self._news = False
@@ -162,10 +166,13 @@ class Keeper:
         # One that ended as it should says so, but its registration is gone a moment before that is read.
         present = self._parts.queue.workers()
         self._workers = len(present)
-        self._routes = Routes(present)
-        if self._routes.is_mixed:
-            self._parts.queue.announce(MIXED, 5 * self._parts.settings.keeper_interval_s + 5)
-        self._parts.queue.clear_untaken(present)
+        # One that is silent for a moment is still there for what it cannot do.
+        now = self._clock()
+        self._seen |= {beat.name: (now, beat) for beat in present}
+        self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
+        known = [beat for _, beat in self._seen.values()]
+        self._routes = Routes(known)
+        self._parts.queue.clear_untaken(known)
         self._parts.index.live.set_workers(
             present,
             lost_before=timestamp(self._parts.settings.lease_s),

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 from service.model.ability import Ability, Need, own_ability
 from service.model.domain import Stage
 from service.model.worker_beat import WorkerBeat
-
-#: What a keeper announces while some worker cannot do what this version plans: only it then puts tasks into the queue.
-MIXED: Final = "mixed"
 
 
 @dataclass(frozen=True)
@@ -34,16 +30,6 @@ class Routes:
             for stage in beat.stages:
                 if beat.ability not in self._here[stage]:
                     self._here[stage].append(beat.ability)
-
-    @property
-    def is_mixed(self) -> bool:
-        """Whether some worker reads or makes other things than this version does."""
-        own = own_ability()
-        return any(
-            one.schemas != own.schemas or one.revisions.get(stage.value, 0) != own.revisions.get(stage.value, 0)
-            for stage, abilities in self._here.items()
-            for one in abilities
-        )
 
     def place(self, need: Need) -> Place:
         """Of a task.

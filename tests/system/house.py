@@ -27,8 +27,8 @@ LEASE_S = 2.0
 class House:
     """Redis, keepers and a worker as processes, each with a log."""
 
-    def __init__(self, folder: Path) -> None:
-        self.settings = Settings(data_dir=folder / "data", lease_s=LEASE_S, keeper_interval_s=0.3)
+    def __init__(self, folder: Path, *, lease_s: float = LEASE_S) -> None:
+        self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, keeper_interval_s=0.3)
         self._logs = folder / "logs"
         self._logs.mkdir()
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -44,7 +44,7 @@ class House:
             "PYTHONPATH": str(REPOSITORY),
             "GRASPD_DATA_DIR": str(self.settings.data_dir),
             "GRASPD_REDIS_URL": redis_url(self.settings),
-            "GRASPD_LEASE_S": str(LEASE_S),
+            "GRASPD_LEASE_S": str(self.settings.lease_s),
             "GRASPD_KEEPER_INTERVAL_S": "0.3",
             "GRASPD_LOG_FORMAT": "text",
             **more,

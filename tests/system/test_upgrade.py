@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.model import version
+from service.model.ability import UNTOLD_REVISIONS
 from service.model.domain import State
+from service.model.version import STAGE_REVISIONS
 from service.pipeline import job_actions
 from tests.conftest import REPOSITORY
 from tests.fakes import request
@@ -20,18 +21,16 @@ from tests.system.house import House
 
 #: The last commit whose workers do not say what they can do.
 PREVIOUS = "5ac0e5f"
-NEXT = f"""
-import sys
-from service.model import version
-version.TASK_SCHEMA = 3
-version.STAGE_REVISIONS["synthesize"] = {version.STAGE_REVISIONS["synthesize"] + 1}
-"""
+#: Revisions of synthesize that it and the next version make.
+OLD, NEW = UNTOLD_REVISIONS["synthesize"], UNTOLD_REVISIONS["synthesize"] + 1
+MAKES = "from service.model.version import STAGE_REVISIONS; STAGE_REVISIONS['synthesize'] = {};"
 FAKES = "import tests.fakes; tests.fakes.main()"
 
 
 @pytest.fixture
 def house(tmp_path: Path) -> Iterator[House]:
-    made = House(tmp_path)
+    # Nobody is killed here: on a busy machine a worker may be silent for long and is there all the same.
+    made = House(tmp_path, lease_s=60.0)
     yield made
     made.close()
 
@@ -43,39 +42,38 @@ def older_worker(house: House, folder: Path) -> None:
     if found.returncode == 0:
         with tarfile.open(fileobj=io.BytesIO(found.stdout)) as archive:
             archive.extractall(folder, filter="data")
-        house.start("older", sys.executable, "-m", "tests.fakes", PYTHONPATH=str(folder))
+        # -P: not the code of the folder that the tests run in.
+        house.start("older", sys.executable, "-P", "-m", "tests.fakes", PYTHONPATH=str(folder))
     else:
-        house.start("older", sys.executable, "-m", "tests.fakes")
+        house.start("older", sys.executable, "-c", MAKES.format(OLD) + FAKES)
 
 
 @pytest.mark.chaos
 def test_each_version_of_worker_takes_what_it_can_and_the_keeper_holds_back_the_rest(
     house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def submit(seed: int, *, planned_by_the_next: bool) -> str:
+    def submit(seed: int, *, revision: int) -> str:
         with monkeypatch.context() as patch:
-            if planned_by_the_next:
-                made = version.STAGE_REVISIONS["synthesize"] + 1
-                patch.setitem(version.STAGE_REVISIONS, "synthesize", made)
+            patch.setitem(STAGE_REVISIONS, "synthesize", revision)
             return job_actions.submit(house.parts, request(grasps=96, seed=seed))[0].id
 
     def state(job: str) -> State:
         return house.parts.index.jobs.get(job).state
 
     older_worker(house, tmp_path / "previous")
-    before = submit(1, planned_by_the_next=False)
-    house.start("keeper", sys.executable, "-c", f"{NEXT}from graspd.cli import main; main()", "keeper")
+    before = submit(1, revision=OLD)
+    house.start("keeper", sys.executable, "-c", MAKES.format(NEW) + "from graspd.cli import main; main()", "keeper")
     house.until(lambda: state(before) is State.SUCCEEDED, "the older worker does what was planned before the upgrade")
 
-    after = submit(2, planned_by_the_next=True)
+    after = submit(2, revision=NEW)
     house.until(lambda: house.says("keeper", "held back, no worker that is here can do it"), "the keeper says so")
     assert state(after) is State.QUEUED
     tasks = house.parts.index.jobs.tasks(job=after, limit=10).items
     assert [task.attempt for task in tasks] == [1] * 3
     assert all("held back" in str(task.message) for task in tasks)
 
-    house.start("next", sys.executable, "-c", f"{NEXT}{FAKES}")
-    late = submit(3, planned_by_the_next=False)
+    house.start("next", sys.executable, "-c", MAKES.format(NEW) + FAKES)
+    late = submit(3, revision=OLD)
     house.until(lambda: state(after) is State.SUCCEEDED, "the next version's worker does what was planned for it")
     house.until(lambda: state(late) is State.SUCCEEDED, "the older one still does what is left for it")
 

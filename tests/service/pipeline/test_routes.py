@@ -66,11 +66,6 @@ def test_what_nobody_can_do_is_held_back_with_the_reason(present: list[WorkerBea
     assert why in Routes(present).place(need).held
 
 
-def test_a_fleet_is_mixed_while_one_differs() -> None:
-    assert not Routes([beat(), beat(stage=Stage.SCENE)]).is_mixed
-    assert Routes([beat(), NEXT]).is_mixed
-
-
 def test_a_task_asks_for_the_schema_of_the_newest_field_that_it_uses() -> None:
     since = {"friction": 3, "touch": 4}
     assert needed_schema(request(), since) == OWN.schemas[0]
