@@ -11,7 +11,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
-from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, STORED_PLACE, machine_of
+from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
 from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
 
 #: Seconds that a stage of the fakes says it took.
@@ -203,3 +203,11 @@ def test_grasps_in_scenes_have_a_price_of_their_own(parts: Parts) -> None:
     placed = estimate(parts.index, there)
     assert placed.measured_share == 1
     assert placed.seconds_by_stage["scene"] == pytest.approx(4 * FAKE_SECONDS)
+
+
+def test_other_models_cost_what_they_take_of_each_valid_grasp(parts: Parts) -> None:
+    told = [estimate(parts.index, wanted(**models)) for models in ({}, {"robust": 0.9}, {"robust_models": 16})]
+    none, eight, sixteen = (one.seconds_by_stage["synthesize"] for one in told)
+    assert eight - none == pytest.approx(8 * STORED_MODEL_S * told[0].valid, rel=0.01)
+    assert sixteen - none == pytest.approx(2 * (eight - none), rel=0.01)
+    assert all("16 models" in rate.origin for rate in told[2].rates)
