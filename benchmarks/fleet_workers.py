@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from service.model import names
+from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.domain import Lane, Stage, TaskMessage
 from service.model.version import PACKAGE_VERSION
@@ -194,7 +195,7 @@ def _beat(name: str, held: Held | None) -> dict[str, Any]:
     task = held.message["task_id"] if held else ""
     return {"name": name, "host": "fleet", "pid": 1, "device": "cpu", "device_name": "none", "stages": ["synthesize"],
             "version": PACKAGE_VERSION, "state": "busy" if held else "idle", "task_id": task, "started": now,
-            "seen": now}  # fmt: skip
+            "seen": now, "schemas": own_ability().schemas, "revisions": dict(own_ability().revisions)}  # fmt: skip
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from service.model.ability import own_ability
 from service.model.clock import timestamp
 from service.model.domain import Lane, Stage, State
 from service.model.worker_beat import WorkerBeat
@@ -97,9 +98,24 @@ def test_how_far_a_task_is_reaches_the_index_and_goes_with_its_worker(parts: Par
 def test_a_fleet_larger_than_the_window_finds_work(parts: Parts) -> None:
     small = Parts(parts.settings.model_copy(update={"queue_window": 1}), parts.store, parts.index, parts.queue)
     assert isinstance(parts.queue, MemoryQueue)
-    now = timestamp()
+    now, own = timestamp(), own_ability()
     for name in map(str, range(20)):
-        parts.queue._workers[name] = WorkerBeat(name, "h", 1, "cpu", "", (Stage.SYNTHESIZE,), "0", "idle", "", now, now)
+        parts.queue._workers[name] = WorkerBeat(
+            name,
+            "h",
+            1,
+            "cpu",
+            "",
+            (Stage.SYNTHESIZE,),
+            "0",
+            "idle",
+            "",
+            now,
+            now,
+            "",
+            own.schemas,
+            dict(own.revisions),
+        )
     clock = Clock()
     keeper = Keeper(small, clock=clock)
     keeper.round()
