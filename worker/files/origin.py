@@ -15,7 +15,6 @@ from urllib.parse import unquote, urlsplit
 from service.model.digests import digest_files, digest_variant
 from service.model.domain import AssetKind
 from service.model.errors import GraspdError, NotFoundError
-from service.settings import Settings
 from service.store.assets import builtin_files, builtin_names
 from service.store.attributes import Attribute
 from service.store.library import load_asset_files
@@ -99,6 +98,8 @@ def _paths(sought: Sought, looked: list[str]) -> Iterator[Path]:
 
 
 def _stored(sought: Sought, looked: list[str]) -> Found | None:
+    from service.settings import Settings
+
     url = Settings().resolved_store_url
     looked.append(f"in the store {url}")
     parts = urlsplit(url)

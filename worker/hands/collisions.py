@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from scipy.optimize import nnls
 
 from service.model.transforms import IDENTITY_POSE, apply
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
+from worker.objects.kept_arrays import recalled
 
 #: Pieces closer than this [m] at rest count as touching.
 TOUCH_M = 1e-4
@@ -51,6 +51,12 @@ def hull_distance(a: Floats, b: Floats) -> float:
 
     Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1, the sums as heavy extra rows.
     """
+    return float(recalled("distance", [a, b], lambda: [_hull_distance(a, b)])["0"])
+
+
+def _hull_distance(a: Floats, b: Floats) -> Floats:
+    from scipy.optimize import nnls  # slow to load
+
     scale = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))
     middle = a.mean(axis=0)
     weight = 1e3
@@ -60,4 +66,4 @@ def hull_distance(a: Floats, b: Floats) -> float:
     rows[3, : len(a)] = weight
     rows[4, len(a) :] = weight
     solution, _ = nnls(rows, np.array([0, 0, 0, weight, weight]), maxiter=20 * rows.shape[1])
-    return float(np.linalg.norm(rows[:3] @ solution) * scale)
+    return np.asarray(np.linalg.norm(rows[:3] @ solution) * scale)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, apply, compose, quat_rotate
@@ -16,6 +16,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel, PalmFrame
 from worker.hands.options import HandOptions
 from worker.hands.tree import Tree
+from worker.objects.kept_arrays import recalled
 
 #: Share of the way from open to closed at which the hand approaches.
 PRESHAPE_SHARE = 0.25
@@ -260,7 +261,7 @@ def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float 
     none."""
     ends = []
     for corners in parts:
-        planes = ConvexHull(corners).equations
+        planes = recalled("planes", [corners], partial(_planes, corners))["0"]
         rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
         # Planes along the line bound nothing; those that the point lies outside of are not met at all.
         across = np.abs(rate) > 1e-9
@@ -269,6 +270,13 @@ def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float 
         if first <= last and (room[~across] >= 0).all():
             ends.append(float(point @ direction) + float(last))
     return max(ends, default=None)
+
+
+def _planes(corners: Floats) -> list[Floats]:
+    """One array (F, 4): planes n x + d <= 0 of the hull of corners (V, 3)."""
+    from scipy.spatial import ConvexHull  # slow to load
+
+    return [np.asarray(ConvexHull(corners).equations)]
 
 
 def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = PRESHAPE_SHARE) -> Floats:

@@ -13,10 +13,10 @@ from service.model.digests import digest_files, digest_variant
 from service.model.domain import AssetKind
 from service.model.errors import HandError, InputError, NotFoundError
 from service.model.transforms import compose
-from service.settings import Settings
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack, without_common_folder
 from service.store.hand_files import files_of_hand
 from service.store.hand_main import hand_name, main_of
+from worker.hands import collisions, guess, primitives
 from worker.hands.collisions import resting_neighbours
 from worker.hands.drive import with_drive
 from worker.hands.guess import complete
@@ -29,6 +29,7 @@ from worker.hands.shapes import Hulls, make_pieces
 from worker.hands.tendons import tendons_of
 from worker.hands.tree import Tree, build_tree, joint_type
 from worker.hands.visuals import PlacedShape, Visuals
+from worker.objects.kept_arrays import recalling
 
 #: Mass of a link whose URDF gives none, per volume of its pieces [kg/m^3].
 DENSITY = 1000.0
@@ -52,7 +53,8 @@ def load_hand(
     settings = parse_options(files, options)
     main = main_file(files, settings)
     robot = read_robot(files, main, settings.xacro)
-    hand = assemble(robot, settings, files, main, name=name, digest=digest)
+    with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives)):
+        hand = assemble(robot, settings, files, main, name=name, digest=digest)
     return replace(hand, drag=_drag(robot, hand)) if drag else hand
 
 
@@ -231,6 +233,8 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         known = ", ".join(builtin_names(AssetKind.HAND))
         raise NotFoundError(f"{path} is neither a file nor a built-in hand ({known})")
     if path.suffix.lower() == ".zip":
+        from service.settings import Settings
+
         packed = unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes)
         return path.stem, without_common_folder(packed), {}
     found, main = files_of_hand(path)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from service.model.errors import HandError
 from service.model.transforms import Floats
 from worker.hands.robot import Ints
+from worker.objects.kept_arrays import recalled
 
 #: Corners of a circle in tessellations: the chord stays within 0.5 % of the radius.
 SEGMENTS = 32
@@ -24,6 +24,13 @@ def hull(points: Floats) -> tuple[Floats, Ints]:
     Raises:
         HandError: the points lie in a plane.
     """
+    made = recalled("hull", [points], lambda: _hull(points))
+    return made["0"], made["1"]
+
+
+def _hull(points: Floats) -> tuple[Floats, Ints]:
+    from scipy.spatial import ConvexHull, QhullError  # slow to load
+
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if len(points) < 4 or scale <= 0:
         raise HandError("a collision shape has no volume; give it at least four points that are not in one plane")

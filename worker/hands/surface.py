@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from service.model import transforms
 from service.model.errors import HandError
@@ -53,6 +52,8 @@ _lock = threading.Lock()
 
 
 def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
+    from scipy.spatial import cKDTree
+
     candidates = _candidates(hand, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
     if len(candidates) < count:
         # Most of the surface is hidden inside other pieces: look harder once, in proportion.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from worker.objects.topology import Floats, Indices
 
@@ -24,6 +23,8 @@ class MeshDistance:
     """
 
     def __init__(self, vertices: Floats, faces: Indices) -> None:
+        from scipy.spatial import cKDTree
+
         self._corners = vertices[faces]
         a, b, c = np.moveaxis(self._corners, 1, 0)
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)

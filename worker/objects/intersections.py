@@ -7,7 +7,6 @@ from typing import Any, Final
 import manifold3d
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from worker.objects import solid, topology
 from worker.objects.distance import MeshDistance, cut, surface_points
@@ -38,6 +37,8 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     Broad phase: faces cut into pieces of one size, and pieces whose balls meet. Narrow phase: an edge of one face
     through the inside of the other.
     """
+    from scipy.spatial import cKDTree
+
     if len(faces) > MAX_FACES:
         return None
     corners = vertices[faces]

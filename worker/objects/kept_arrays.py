@@ -6,7 +6,9 @@ import hashlib
 import io
 import platform
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +27,7 @@ _LIBRARIES: Final = ("numpy", "scipy")
 _LIMIT_BYTES: Final = 256 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
+_recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", default=None)
 
 
 def arrays_kept_or_made(
@@ -38,19 +41,68 @@ def arrays_kept_or_made(
         code: modules whose change would change them.
         make: computes them; what it raises is not kept.
     """
-    address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
-    file = user_cache.folder(kind) / f"{address}.npz"
-    if (held := user_cache.load(file)) is not None:
-        try:
-            with np.load(io.BytesIO(held), allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
-            pass
+    file = _file(kind, terms, code)
+    if (held := _read(file)) is not None:
+        return held
     made = make()
-    whole = io.BytesIO()
-    np.savez(whole, **dict[str, Any](made))
-    user_cache.keep(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
+    _write(file, made)
     return made
+
+
+@contextmanager
+def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
+    """What `recalled` gives inside is kept in one entry, and read from there the next time.
+
+    For small steps of something large, the dearest of which is to load the library that they need.
+
+    Args:
+        kind, terms, code: see `arrays_kept_or_made`; the terms only tell entries apart.
+    """
+    file = _file(kind, terms, code)
+    known = _read(file) or {}
+    now = dict(known)
+    token = _recalled.set(now)
+    try:
+        yield
+    finally:
+        _recalled.reset(token)
+    if len(now) > len(known):
+        _write(file, now)
+
+
+def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
+    """Arrays that follow from others alone, by their numbers "0", "1", ...: from the present `recalling`, or made."""
+    known = _recalled.get()
+    if known is None:
+        return {str(number): array for number, array in enumerate(make())}
+    whole = hashlib.sha256(what.encode())
+    for array in given:
+        whole.update(f"{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    key = f"{whole.hexdigest()[:32]}-"
+    if key + "0" not in known:
+        known |= {f"{key}{number}": array for number, array in enumerate(make())}
+    return {name.removeprefix(key): array.copy() for name, array in known.items() if name.startswith(key)}
+
+
+def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
+    address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
+    return user_cache.folder(kind) / f"{address}.npz"
+
+
+def _read(file: Path) -> dict[str, NDArray[Any]] | None:
+    if (held := user_cache.load(file)) is None:
+        return None
+    try:
+        with np.load(io.BytesIO(held), allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(file: Path, arrays: Arrays) -> None:
+    whole = io.BytesIO()
+    np.savez(whole, **dict[str, Any](arrays))
+    user_cache.keep(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
 
 
 @lru_cache(maxsize=16)

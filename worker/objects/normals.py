@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from worker.objects.model import Floats, Ints
 
@@ -18,6 +17,8 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
     The normal of a corner is the mean of the normals of the faces at its vertex, weighted by their angle there, over
     those faces that are inclined to the corner's own face by less than the crease angle.
     """
+    from scipy.sparse import csr_matrix
+
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     face_normals = np.cross(b - a, c - a)
     face_normals /= np.maximum(np.linalg.norm(face_normals, axis=1, keepdims=True), 1e-300)

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from service.model.digests import digest_files, digest_variant
 from service.model.domain import AssetKind
 from service.model.errors import GraspdError, MeshError, NotFoundError
-from service.settings import Settings
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.kept import kept_or_made
@@ -116,6 +114,8 @@ def build(mesh: Repaired, face_error_m: float) -> ObjectModel:
 
 def convex_hull(points: Floats) -> tuple[Floats, Ints]:
     """Corners (H, 3) and outward triangles (G, 3)."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         qhull = ConvexHull(points)
     except QhullError:
@@ -157,6 +157,8 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         known = ", ".join(builtin_names(AssetKind.OBJECT))
         raise NotFoundError(f"{path} is neither a file nor a built-in object ({known})")
     if path.suffix.lower() == ".zip":
+        from service.settings import Settings
+
         return path.stem, unpack(path.read_bytes(), limit_bytes=UNPACK_FACTOR * Settings().max_upload_bytes), {}
     files = {path.name: path.read_bytes()}
     beside = path.parent / "asset.json"

@@ -9,9 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from service.model.errors import MeshError
 from worker.objects import solid, topology
@@ -150,6 +147,10 @@ def _close(mesh: Repaired) -> Repaired:
 
 
 def _weld(mesh: Repaired) -> Repaired:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     pairs = cKDTree(mesh.vertices).query_pairs(WELD * extent, output_type="ndarray")
     if not len(pairs) or len(pairs) > 10 * len(mesh.vertices):

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -121,12 +119,22 @@ def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
     return one % len(faces), two % len(faces), agree
 
 
+def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32]:
+    """(N,) number of the connected part of each of `count` nodes; edges join nodes `one` (E,) with `other` (E,)."""
+    from scipy.sparse import coo_matrix  # slow to load, and a prepared object needs none
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    return label
+
+
 def components(faces: Indices) -> Indices:
     """(F,) number of the connected component (by shared vertices) of each face."""
     n = int(faces.max()) + 1
     rows = np.concatenate([faces[:, 0], faces[:, 1]])
     columns = np.concatenate([faces[:, 1], faces[:, 2]])
-    _, label = connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
+    label = parts_of_graph(rows, columns, n)
     _, numbers = np.unique(label[faces[:, 0]], return_inverse=True)
     return numbers.reshape(-1).astype(np.int64)
 
@@ -142,8 +150,7 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
     cross = np.where(agree, 0, count)
     rows = np.concatenate([one, one + count])
     columns = np.concatenate([two + cross, two + count - cross])
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count))
-    _, label = connected_components(graph, directed=False)
+    label = parts_of_graph(rows, columns, 2 * count)
     orientable = bool((label[:count] != label[count:]).all())
     # Of a patch's two choices take the one that turns fewer faces: the majority of the file is usually right.
     low = np.minimum(label[:count], label[count:])
@@ -175,8 +182,7 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     start, end = _corner(a, count), _corner(b, count)
     after, before = _corner(a, count, 1), _corner(b, count, 1)
     rows, columns = np.concatenate([start, after]), np.concatenate([before, end])
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * count, 3 * count))
-    _, label = connected_components(graph, directed=False)
+    label = parts_of_graph(rows, columns, 3 * count)
     _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
     return vertices[faces.reshape(-1)[first]], inverse.reshape(-1, 3).astype(np.int64)
 

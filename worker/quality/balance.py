@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from worker.simulation.kernels import balance as kernels
 
@@ -56,6 +55,8 @@ def nonnegative_weights(matrix: Floats, target: Floats, ridge: float, count: NDA
 
 def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
     """One system by SciPy, the ridge as rows of its own."""
+    from scipy.optimize import nnls
+
     system = np.vstack([matrix[:count].T, ridge * np.eye(count)])
     out = np.zeros(len(matrix))
     out[:count] = nnls(system, np.concatenate([target, np.zeros(count)]))[0]

@@ -11,11 +11,10 @@ Epsilon is the radius of the largest ball around the origin inside the space, he
 
 from __future__ import annotations
 
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from service.model.errors import InputError
 from service.model.transforms import cross
@@ -139,7 +138,9 @@ def _points(edge_wrenches: Floats, norm: Norm) -> Floats:
     return edge_wrenches.reshape(-1, edge_wrenches.shape[-1]) if norm == "l1" else _minkowski(edge_wrenches)
 
 
-def _hull(points: Floats) -> ConvexHull | None:
+def _hull(points: Floats) -> Any:
+    from scipy.spatial import ConvexHull, QhullError
+
     if len(points) <= points.shape[1] or _flat(points):
         return None
     # Joggled input is fastest and simplicial; exact merging is for what defeats it.

@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from service.model.errors import MeshError
 from worker.hands.features import convex_edges
@@ -33,6 +32,8 @@ def outer_solid(corners: Floats, most: int = MOST_PLANES) -> tuple[Obstacle, flo
     Raises:
         MeshError: the points lie in a plane.
     """
+    from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
     try:
         hull = ConvexHull(corners)
         faces = np.column_stack([hull.equations[:, :3], -hull.equations[:, 3]])
@@ -66,6 +67,8 @@ def _as_qhull(planes: Floats) -> Floats:
 
 def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Distinct corners of a convex solid and the edges between them."""
+    from scipy.spatial import ConvexHull
+
     _, first = np.unique(np.round(points / _SAME_M).astype(np.int64), axis=0, return_index=True)
     hull = ConvexHull(points[np.sort(first)])
     kept = hull.vertices

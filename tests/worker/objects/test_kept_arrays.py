@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,9 @@ from service import user_cache
 from tests.worker.models import two_finger_hand
 from tests.worker.objects.shapes import sphere, stl
 from worker.hands import surface
+from worker.hands.load import hand_from_path
 from worker.objects import kept_arrays
-from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.kept_arrays import arrays_kept_or_made, recalled, recalling
 from worker.objects.prepare import load_object
 from worker.simulation import sampling
 
@@ -59,3 +62,31 @@ def test_samples_of_hand_and_object_are_those_of_a_process_without_a_cache() -> 
         found, fresh = surface.sample_surface(hand, 120, seed=2), surface._sample(hand, 120, 2)
         assert all(np.array_equal(getattr(found, name), array) for name, array in vars(fresh).items())
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
+
+
+def test_small_steps_are_kept_together_and_each_follows_from_what_it_was_given(own_cache: Path) -> None:
+    def halves(array: np.ndarray) -> np.ndarray:
+        return recalled("half", [array], lambda: [array / 2])["0"]
+
+    for _ in range(2):
+        with recalling("steps", ("one thing",), (kept_arrays,)):
+            assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1]
+            assert halves(np.arange(2.0)).tolist() == [0, 0.5]
+    assert len(list((own_cache / "steps").iterdir())) == 1
+    with recalling("steps", ("one thing",), (kept_arrays,)):
+        step = recalled("half", [np.arange(3.0)], lambda: list(never().values()))["0"]
+        step += 1
+        assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1], "nobody writes into what is kept"
+        assert halves(np.arange(3)).dtype == float, "another type is another step"
+    assert halves(np.arange(2.0)).tolist() == [0, 0.5]
+
+
+def test_a_hand_is_the_same_from_kept_shapes_and_needs_no_scipy(tmp_path: Path) -> None:
+    first, again = hand_from_path("barrett"), hand_from_path("barrett")
+    assert first.content == again.content
+    code = (
+        "import sys; from worker.hands.load import hand_from_path; import worker.certified; "
+        "print(hand_from_path('barrett').content, *{'scipy', 'trimesh', 'pydantic_settings'} & set(sys.modules))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told.split() == [first.content]
