@@ -1,10 +1,15 @@
 """What a valid grasp costs from the planner to its row in the shard, of two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
+       python -m benchmarks.chain BEFORE AFTER --service [--grasps 256] [--pairs ...] [--json OUT]
 
 BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. Each stage is run by one thread and timed by processor
 time: other programs on the machine change the ratios little. Nothing is stored or sent: that part is in
 docs/results/service.md.
+
+With --service a job of built-in hand and object goes through a whole service of each checkout: submitted over HTTP,
+planned, certified, measured, stored, indexed, after a small job that loads everything. Processor time is that of all
+processes of the service; beside it stands what BEFORE's planner alone takes for a raw grasp.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any, Final
 
@@ -101,23 +107,74 @@ def table(pair: str, before: dict[str, Any], after: dict[str, Any]) -> list[str]
     return [*lines, row("all but the planner", *rest), row("all", *totals), ""]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("before", type=Path)
-    parser.add_argument("after", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--grasps", type=int, default=64, help="raw grasps of each pair, in batches of 32")
-    parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+def through_service(root: Path, hand: str, obj: str, grasps: int) -> dict[str, float]:
+    """A job of valid grasps: how many, and the wall and processor time of the service."""
+    from benchmarks.service_of import service_of  # which uses this module
+
+    with service_of(root) as service:
+        service.job(hand=hand, object=obj, grasps=8, seed=1)
+        spent, began = service.processor_s(), time.perf_counter()
+        job = service.job(hand=hand, object=obj, grasps=grasps, seed=2)
+        wall = time.perf_counter() - began
+        return {"valid": job["valid"], "wall": wall, "processor": service.processor_s() - spent}
+
+
+def service_table(pair: str, before: dict[str, float], after: dict[str, float], raw_ms: float) -> list[str]:
+    """Rates of both jobs, and what the second is of the raw rate of the first checkout's planner."""
+    rates = [found["valid"] / found["wall"] for found in (before, after)]
+    costs = [1e3 * found["processor"] / found["valid"] for found in (before, after)]
+    return [
+        f"### {pair}: {before['valid']:.0f} and {after['valid']:.0f} valid grasps", "",
+        "| through the service | before | after | times |", "| --- | --: | --: | --: |",
+        f"| valid grasps/s | {rates[0]:.2f} | {rates[1]:.2f} | {rates[1] / rates[0]:.2f} |",
+        row("core-ms a valid grasp", *costs),
+        f"| core-ms a raw grasp of the planner alone, before | {raw_ms:.1f} | | |",
+        f"| valid grasps over raw ones of that planner, for the same processor time | {raw_ms / costs[0]:.2f} "
+        f"| {raw_ms / costs[1]:.2f} | |", "",
+    ]  # fmt: skip
+
+
+def compare_services(given: argparse.Namespace) -> dict[str, Any]:
+    """Jobs of all pairs through both services, one after the other."""
+    found: dict[str, Any] = {}
+    for number, pair in enumerate(given.pairs):
+        hand, obj = pair.split(":")
+        roots = [root.resolve() for root in (given.before, given.after)]
+        alone = run(roots[0], hand, obj, "64", str(100 + number))
+        both = [through_service(root, hand, obj, given.grasps or 256) for root in roots]
+        found[pair] = dict(zip(("planner", "before", "after"), (alone, *both), strict=True))
+        lines = service_table(pair, *both, raw_ms=alone["ms"]["planner"] / alone["raw"])
+        sys.stdout.write("\n".join(lines) + "\n")
+        sys.stdout.flush()
+    return found
+
+
+def compare_stages(given: argparse.Namespace) -> dict[str, Any]:
+    """The stages of all pairs, of both checkouts."""
     found: dict[str, Any] = {}
     for number, pair in enumerate(given.pairs):
         hand, obj = pair.split(":")
         (urdf, *_) = sorted((given.data / "hands" / hand).glob("*.urdf"))
-        arguments = (str(urdf.resolve()), obj, str(given.grasps), str(100 + number))
+        arguments = (str(urdf.resolve()), obj, str(given.grasps or 64), str(100 + number))
         both = [run(root.resolve(), *arguments) for root in (given.before, given.after)]
         found[pair] = dict(zip(("before", "after"), both, strict=True))
         sys.stdout.write("\n".join(table(pair, *both)) + "\n")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", type=Path)
+    parser.add_argument("after", type=Path)
+    parser.add_argument("data", type=Path, nargs="?")
+    parser.add_argument("--service", action="store_true", help="jobs through the whole service")
+    parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 raw, or 256 valid ones")
+    parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    if not given.service and given.data is None:
+        parser.error("without --service the folder of hands is needed")
+    found = compare_services(given) if given.service else compare_stages(given)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -10,20 +10,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
-import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
 from benchmarks.chain import environment_of
+from benchmarks.service_of import service_of
 
 #: Laps of a process that makes one valid grasp; processor seconds of each on stderr.
 FIRST: Final = """
@@ -49,7 +46,6 @@ worker.certified.certified_grasps(hand, obj, request, count=1, batch=1)
 lap("one more")
 print(json.dumps({"valid": len(found.grasps), "laps": laps}))
 """
-_PATIENCE_S: Final = 300.0
 
 
 def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
@@ -69,68 +65,24 @@ def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
 
 def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
     """Seconds of a service in an empty folder: until a worker waits, and from there until 32 valid grasps are there."""
-    with tempfile.TemporaryDirectory() as folder:
-        environment = environment_of(root)
-        up = [sys.executable, "-m", "graspd", "up", "--port", "0", "--data-dir", folder, "--json"]
-        log = (Path(folder) / "up.log").open("w")
-        service = subprocess.Popen(
-            up, cwd=root, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
-        )
-        try:
-            began = time.perf_counter()
-            url = _address(service)
-            _wait(root, environment, url, hand)
-            ready = time.perf_counter() - began
-            spent = _processor(service.pid)
-            began = time.perf_counter()
-            job = [sys.executable, "-m", "graspd", "submit", "--hand", hand, "--object", obj, "--url", url, "--wait"]
-            subprocess.run(job, cwd=root, env=environment, check=True, capture_output=True)
-            clock = time.perf_counter() - began
-            return {"until a worker waits": ready, "job": clock, "processor": _processor(service.pid) - spent}
-        finally:
-            os.killpg(service.pid, signal.SIGTERM)
-            service.wait(60)
-            log.close()
-
-
-def _address(service: subprocess.Popen[str]) -> str:
-    """Where the API of a service answers, from what it prints."""
-    assert service.stdout is not None
-    for line in service.stdout:
-        for word in line.split():
-            if "http://" in word:
-                return "http://" + word.partition("http://")[2].strip('",/;')
-    sys.exit("the service has not said where it answers")
-
-
-def _wait(root: Path, environment: Mapping[str, str], url: str, hand: str) -> None:
-    """Until a worker waits for tasks and the hand is there."""
-    ask = (
-        "import sys, json, urllib.request as u\n"
-        "get = lambda path: json.load(u.urlopen(sys.argv[1] + path))\n"
-        "w = get('/v1/workers'); w = w.get('items', w.get('workers', [])) if isinstance(w, dict) else w\n"
-        "sys.exit(not any(x['state'] == 'idle' for x in w))"
-    )
-    until = time.monotonic() + _PATIENCE_S
-    while subprocess.run(
-        [sys.executable, "-c", ask, url], capture_output=True, check=False, env=environment
-    ).returncode:
-        if time.monotonic() > until:
-            sys.exit("no worker is ready")
-        time.sleep(0.1)
-
-
-def _processor(leader: int) -> float:
-    """Processor seconds of a process and all below it that live, and of their children that have ended."""
-    parent, ticks = dict[int, int](), dict[int, int]()
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            fields = stat.read_text().rpartition(")")[2].split()
-            parent[int(stat.parent.name)], ticks[int(stat.parent.name)] = int(fields[1]), sum(map(int, fields[11:15]))
-    family = {leader}
-    while more := {pid for pid, above in parent.items() if above in family} - family:
-        family |= more
-    return sum(ticks.get(pid, 0) for pid in family) / os.sysconf("SC_CLK_TCK")
+    with service_of(root) as service:
+        spent, began = service.processor_s(), time.perf_counter()
+        job = [
+            sys.executable,
+            "-m",
+            "graspd",
+            "submit",
+            "--hand",
+            hand,
+            "--object",
+            obj,
+            "--url",
+            service.url,
+            "--wait",
+        ]
+        subprocess.run(job, cwd=root, env=environment_of(root), check=True, capture_output=True)
+        clock = time.perf_counter() - began
+        return {"until a worker waits": service.ready_s, "job": clock, "processor": service.processor_s() - spent}
 
 
 def table(title: str, found: Mapping[str, list[dict[str, float]]]) -> list[str]:

@@ -1,0 +1,133 @@
+"""What certificate and quality table take with threads and with processes; prints Markdown.
+
+usage: python -m benchmarks.processes DATA_DIR [--grasps 256] [--hand allegro] [--object mug] [--ways 1t 2t 2p]
+
+DATA_DIR holds hands/. A way is a number of threads (t) or processes (p). Raw grasps of a pair are planned once, and
+judged and measured in each way, the processes started and the models built before. Told are wall and processor time for
+a raw grasp, of all processes together, the memory of a process, and whether all came out bit for bit as by one thread.
+
+How much of its time one thread holds Python's lock: the samples of `py-spy record --gil -f raw`, over those without
+`--gil`, of `--ways 1t --only judge` or `table`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from service.model.domain import BATCH_SIZE, FIDELITIES
+from worker.grasps import GraspSet, joined
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
+from worker.planners import Run, Wanted, synthesize
+from worker.pool.pool import Pool
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.judge import judge
+from worker.quality.table import measure
+from worker.together import MODULES
+
+#: Clock ticks and bytes as /proc tells them.
+_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
+_FIELDS: Final = ("VmRSS", "RssAnon")
+
+
+@dataclass(frozen=True)
+class Way:
+    """Threads of this process, or processes beside it."""
+
+    name: str
+
+    @property
+    def number(self) -> int:
+        return int(self.name[:-1])
+
+    def told(self) -> str:
+        """In words."""
+        what = "thread" if self.name.endswith("t") else "process"
+        return f"{self.number} {what}{'' if self.number == 1 else 'es' if what == 'process' else 's'}"
+
+
+def processor_s(pids: Sequence[int]) -> float:
+    """Processor time of this process and others [s]."""
+    spent = time.process_time()
+    for pid in pids:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        spent += (int(fields[11]) + int(fields[12])) * _TICK_S
+    return spent
+
+
+def memory_mib(pid: int) -> list[float]:
+    """Resident memory of a process, and what of it is not of files, which others share [MiB]."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    found = [re.search(rf"^{name}:\s+(\d+) kB", status, re.MULTILINE) for name in _FIELDS]
+    return [int(one.group(1)) / 1024 for one in found if one is not None]
+
+
+class Pair:
+    """Raw grasps of a hand on an object, and what is made of them."""
+
+    def __init__(self, data: Path, hand: str, obj: str, count: int) -> None:
+        (urdf, *_) = sorted((data / "hands" / hand).glob("*.urdf"))
+        fidelity = FIDELITIES["standard"]
+        self.hand, self.obj = hand_from_path(str(urdf)), object_from_path(obj, face_error_m=fidelity.face_error_m)
+        self.pieces = decompose(self.obj)
+        batches = range(count // BATCH_SIZE)
+        made = [synthesize(self.hand, self.obj, Wanted(BATCH_SIZE, fidelity, 19, batch)) for batch in batches]
+        self.grasps: GraspSet = joined(made)
+
+    def judged(self, run: Run, grasps: GraspSet) -> dict[str, Any]:
+        found = judge(self.hand, self.obj, grasps, pieces=self.pieces, run=run)
+        return {name: getattr(found, name) for name in ("success", "outcome", "margin", "penetration_depth_mm")}
+
+    def measured(self, run: Run, grasps: GraspSet) -> dict[str, Any]:
+        return measure(self.hand, self.obj, grasps, run=run)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--grasps", type=int, default=256)
+    parser.add_argument("--hand", default="allegro")
+    parser.add_argument("--object", default="mug")
+    parser.add_argument("--ways", nargs="*", default=["1t", "2t", "2p"])
+    parser.add_argument("--only", choices=["judge", "table"])
+    given = parser.parse_args()
+    pair = Pair(given.data, given.hand, given.object, given.grasps)
+    parts = {"judge": pair.judged, "table": pair.measured}
+    parts = {name: work for name, work in parts.items() if given.only in (None, name)}
+    first: dict[str, dict[str, Any]] = {}
+    heads = [f"{name}: {what} ms" for name in parts for what in ("wall", "core")]
+    lines = ["| | " + " | ".join([*heads, "as by one thread", "MiB a process"]) + " |"]
+    lines += ["| --- |" + " --: |" * (len(heads) + 2)]
+    for way in map(Way, given.ways):
+        pool = Pool(way.number, MODULES) if way.name.endswith("p") else None
+        run, cells, same = Run(threads=way.number, pool=pool), list[str](), True
+        for name, work in parts.items():
+            work(run, pair.grasps.take(slice(0, 64)))
+            pids = pool.pids if pool is not None else []
+            began, spent = time.perf_counter(), processor_s(pids)
+            made = work(run, pair.grasps)
+            wall, core = time.perf_counter() - began, processor_s(pids) - spent
+            cells += [f"{1e3 * seconds / len(pair.grasps):.1f}" for seconds in (wall, core)]
+            known = first.setdefault(name, made)
+            same &= all(np.array_equal(made[key], known[key], equal_nan=known[key].dtype.kind == "f") for key in known)
+        told = [memory_mib(pid) for pid in pids] if pool is not None else [memory_mib(os.getpid())]
+        resident, own = (max(column) for column in zip(*told, strict=True))
+        cells += ["yes" if same else "NO", f"{resident:.0f}, {own:.0f} of them its own"]
+        lines.append(f"| {way.told()} | " + " | ".join(cells) + " |")
+        if pool is not None:
+            pool.close()
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
