@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from service.model.transforms import apply
 from worker.grasps import Posture
@@ -20,6 +19,8 @@ Floats = NDArray[np.float64]
 POINTS: Final = 64
 #: Pairs of grasps that are compared at a time.
 _PAIRS: Final = 4096
+#: Grasps of which all pairs are looked at: SciPy, whose tree finds the near ones of many, is slow to load.
+FEW: Final = 256
 
 
 def explained_variance(posture: Posture) -> Floats:
@@ -69,13 +70,24 @@ def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool
     if least <= 0 or len(points) < 2:
         return kept
     # The mean distance of points is at least the distance of their means.
-    pairs = cKDTree(points.mean(axis=1)).query_pairs(least, output_type="ndarray")
+    pairs = _near(points.mean(axis=1), least)
     near = pairs[distances(points, pairs[:, 0], pairs[:, 1]) < least]
     near = near[near[:, 1] >= given]
     for first, second in near[np.lexsort((near[:, 0], near[:, 1]))].tolist():
         if kept[first]:
             kept[second] = False
     return kept
+
+
+def _near(places: Floats, reach: float) -> NDArray[np.intp]:
+    """(K, 2) pairs of places (N, 3), the lower number first, that are no farther apart than `reach` [m]."""
+    if len(places) > FEW:
+        from scipy.spatial import cKDTree
+
+        return np.asarray(cKDTree(places).query_pairs(reach, output_type="ndarray"), np.intp)
+    one, other = np.triu_indices(len(places), 1)
+    near = np.linalg.norm(places[one] - places[other], axis=1) <= reach
+    return np.stack([one[near], other[near]], axis=1)
 
 
 def _rotation_vector(quaternion: Floats) -> Floats:

@@ -15,6 +15,7 @@ from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, postur
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
+from worker.quality import diversity
 from worker.quality.approach import approach_cells, cells_of
 from worker.quality.diversity import POINTS, distances, distinct, hand_points
 from worker.quality.table import measure
@@ -54,7 +55,9 @@ def test_distance_does_not_depend_on_where_the_object_lies() -> None:
     assert distances(there, FIRST, SECOND) == pytest.approx(distances(points, FIRST, SECOND), rel=1e-9)
 
 
-def test_of_grasps_that_are_near_the_first_is_kept() -> None:
+@pytest.mark.parametrize("few", [0, 1000])
+def test_of_grasps_that_are_near_the_first_is_kept(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diversity, "FEW", few)
     rng = np.random.default_rng(11)
     points = rng.normal(0, 0.02, (200, 1, 3)) + rng.normal(0, 0.002, (200, 8, 3))
     kept = distinct(points, 0.01)

@@ -12,9 +12,6 @@ from itertools import groupby
 from typing import Final, Literal
 
 import numpy as np
-import trimesh
-from scipy.optimize import linprog
-from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from service.model.transforms import IDENTITY_POSE, apply, invert, quat_from_matrix
 from worker.hands.collisions import resting_neighbours
@@ -116,6 +113,8 @@ def _fitted(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
 
 def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
     """Volume, centre, variances (3,) of the solid along its principal axes, least first, and these as columns."""
+    import trimesh  # slow to load, as SciPy below
+
     solid = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
     inertia = np.asarray(solid.moment_inertia)
     spread, axes = np.linalg.eigh((np.trace(inertia) / 2 * np.eye(3) - inertia) / solid.volume)
@@ -179,6 +178,8 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
     Half-spaces of the faces and, where it grows, of the corners' mean normals: each at the distance at which the sum
     with a ball has it. So what grows by 1 mm has its support 1 mm farther in all of these directions.
     """
+    from scipy.spatial import ConvexHull, HalfspaceIntersection
+
     scale = float(np.ptp(vertices, axis=0).max())
     points, by = (vertices - vertices.mean(axis=0)) / scale, by_m / scale
     solid = ConvexHull(points)
@@ -201,6 +202,8 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
 
 def _deepest(planes: Floats) -> tuple[Floats, float]:
     """Centre and radius of the largest ball in a convex solid of unit planes (F, 4): n x + b <= 0."""
+    from scipy.optimize import linprog
+
     found = linprog([0, 0, 0, -1], np.column_stack([planes[:, :3], np.ones(len(planes))]), -planes[:, 3],
                     bounds=[(None, None)] * 3 + [(0, None)])  # fmt: skip
     assert found.x is not None, "a convex solid holds a ball"
