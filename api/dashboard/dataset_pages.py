@@ -42,6 +42,7 @@ _MAKE: Final = {
     "scene": "free",
     "faces": "drawn",
     "touch": "0",
+    "min_distance": "0.005",
     "neighbours": "",
 }
 

@@ -3,11 +3,12 @@
 Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), told by the opposition that
 Iberall (1987) found in them:
 
-    power      palm opposition: the palm touches, or two digits at least touch with more than their last links
-    lateral    side opposition: half at least of the digits that touch do so by a side, and the palm is free
-    precision  pad opposition: the last links of two digits or more
+    power      palm opposition: the palm touches, or two digits at least wrap: they touch with more than their last
+               links, and not by a side
+    lateral    side opposition: half at least of the digits that touch do so by a side
+    precision  pad opposition: all others in which two digits touch
 
-They are asked in the order palm, side, links. A *digit* is a chain of bodies that ends in a fingertip; all other bodies
+They are asked in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies
 are palm. A digit touches *by a side* where more than half of its surface within 2 mm of the object looks along the axis
 of its flexion, to within 45 degrees. Robots have other hands than people: a jaw has no side, so a gripper's grasps are
 of precision, or of power where its palm touches.
@@ -46,9 +47,9 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     sides = touches & _by_sides(probe, found, finger, digits)
     count = touches.sum(axis=1)
     lateral = sides.any(axis=1) & (2 * sides.sum(axis=1) >= count)
-    told = np.where(wraps.sum(axis=1) >= ENVELOPING, GraspType.POWER, GraspType.PRECISION)
-    told = np.where(lateral, GraspType.LATERAL, told)
-    told = np.where(palm, GraspType.POWER, told)
+    power = palm | ((wraps & ~sides).sum(axis=1) >= ENVELOPING)
+    told = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
+    told = np.where(power, GraspType.POWER, told)
     return np.where(count + palm < 2, GraspType.NONE, told).astype(np.int32)
 
 

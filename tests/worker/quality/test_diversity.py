@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
 from service.model.transforms import apply, quat_from_axis_angle
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import grasp_set, pad_hand, plate_hand, posture
+from worker.files.cases import load_case
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -136,3 +138,10 @@ def test_fingers_that_touch_by_their_sides_are_a_lateral_grasp() -> None:
     found = measure(hand, card, grasp_set(Posture(pose, hand.expand(straight[None]))))
     assert found["quality/contact_links"][0] >= 2
     assert found["quality/grasp_type"].tolist() == [GraspType.LATERAL]
+
+
+def test_published_fingertip_grasps_are_precision_grasps(shared_data: Path) -> None:
+    """FRoGGeR plans with four fixed points on the fingertips, so whoever plans nothing else holds nothing else."""
+    case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
+    types = measure(case.hand, case.obj, case.grasps, thresholds_m=[0.005])["quality/grasp_type"]
+    assert (types == GraspType.PRECISION).all()
