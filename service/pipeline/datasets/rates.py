@@ -103,7 +103,7 @@ STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
 #: A try in a scene over one around a free object, and the share of tries that is valid there: what built-in hands and
 #: objects have on tables, to within a factor of four.
 STORED_IN_SCENE: Final = (1.6, 0.5)
-#: Seconds of a valid grasp in each model around the nominal one, with as many cores: docs/results/robust.md, 25 to 40
+#: Seconds of a valid grasp in each model around the nominal one, with as many cores: docs/results/robust.md, 25 to 70
 #: core-ms. All of them count: a share that is missed ends sooner, and few are.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
