@@ -43,6 +43,7 @@ _MAKE: Final = {
     "faces": "drawn",
     "touch": "0",
     "min_distance": "0.005",
+    "robust": "0",
     "neighbours": "",
 }
 

@@ -164,3 +164,13 @@ def test_the_share_of_a_cell_says_in_which_scene_its_grasps_are_valid(
     assert f"32 grasps each{place} ·" in page
     assert f">{valid} valid{place}<" in page
     assert ("Valid grasps in scenes" in page) == bool(place)
+
+
+def test_a_dataset_and_a_job_ask_for_robust_grasps(http: TestClient, parts: Parts) -> None:
+    form = {"name": "sure", "grasps": "32", "robust": "0.9", "hands": ["allegro"], "objects": ["mug"]}
+    assert "sure" in http.post("/datasets", data=form).text
+    assert parts.index.datasets.get("sure").options.robust == 0.9
+    http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75"})
+    assert parts.index.jobs.page().items[0].request.robust == 0.75
+    refused = http.post("/submit", data={"hand": "allegro", "object": "mug", "robust": "0.75", "referee": "none"})
+    assert refused.status_code == 422 and "choose a referee" in refused.text
