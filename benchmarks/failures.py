@@ -1,0 +1,181 @@
+"""The failures that are left: the worst objects of each hand, what became of their grasps, and pictures of some.
+
+usage: python benchmarks/failures.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
+DATA_DIR holds hands/ and objects/. Raw standard grasps are judged at level certificate; stopped runs go on (cells.py).
+Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cells import HANDS, SEED, Cell, cells, write_json
+from numpy.typing import NDArray
+from PIL import Image
+
+from service.model.version import STAGE_REVISIONS
+from worker.hands.oppositions import oppositions_of
+from worker.quality.contact import contact_distance_consistency_mm
+from worker.quality.postures import hold_forces
+from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
+from worker.quality.referee.judge import judge
+from worker.quality.table import measure
+from worker.rendering.pages.pictures import grasp_pictures
+from worker.rendering.pages.sheets import contact_sheet
+
+#: Objects of a hand that are shown, and failures of each beside one that holds.
+WORST, SHOWN = 3, 3
+EDGE = 260
+#: A body whose volume over half its surface is less is a shell [mm]; the engine's pieces stand out 0.85 mm at most.
+THIN_MM = 8.0
+#: An object is wide for a hand whose pads face one another at no more than so many times its least extent.
+ROOMY = 1.25
+#: Lost grasps that are so much deeper in the engine, beyond the mesh, than those that hold were pushed off [mm].
+PUSHED_MM = 0.3
+
+
+def found_out(cell: Cell) -> dict[str, Any]:
+    """Verdict and figures of each grasp, and what of the object and the hand decides them."""
+    grasps, hand, obj = cell.grasps, cell.hand, cell.obj
+    verdicts = judge(hand, obj, grasps)
+    columns = measure(hand, obj, grasps, thresholds_m=[0.005])
+    probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+    apart = contact_distance_consistency_mm(hand, probe.body_distance(probe.measure(grasps.grasp)))
+    corners = obj.vertices[obj.faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    return {
+        "success": verdicts.success.tolist(),
+        "reasons": verdicts.reasons,
+        "margin": np.minimum(verdicts.margin, 1e3).tolist(),
+        "engine_mm": verdicts.penetration_depth_mm.tolist(),
+        "mesh_mm": columns["quality/penetration_depth_mm"].tolist(),
+        "links": columns["quality/contact_links"].tolist(),
+        "uneven_mm": apart.tolist(),
+        "residual": hold_forces(hand, obj, grasps.grasp).residual.tolist(),
+        "excess_mm": 1e3 * verdicts.excess_m,
+        "pieces": verdicts.pieces,
+        "thickness_mm": 2e3 * obj.volume / float(area),
+        "least_extent_mm": 1e3 * float(np.ptp(obj.vertices, axis=0).min()),
+        "widest_mm": 1e3 * oppositions_of(hand).widest,
+    }
+
+
+def kind(reason: str) -> str:
+    """A reason without its direction."""
+    words = {"displaced": "slips", "rotated": "turns", "lost while closing": "lost while closing"}
+    return next((word for start, word in words.items() if reason.startswith(start)), reason)
+
+
+def why(found: dict[str, Any]) -> str:
+    """What the figures say of a pair, the strongest first."""
+    held = np.array(found["success"]) == 1
+    lost = ~held
+    said = []
+    if found["least_extent_mm"] * ROOMY > found["widest_mm"]:
+        said.append(
+            f"does not fit well: {found['least_extent_mm']:.0f} mm at its narrowest, the pads face one another at "
+            f"{found['widest_mm']:.0f} mm at most"
+        )
+    if found["thickness_mm"] < THIN_MM:
+        said.append(
+            f"a thin shell, {found['thickness_mm']:.1f} mm: pieces stand out {found['excess_mm']:.2f} mm a side"
+        )
+    deeper = np.array(found["engine_mm"]) - np.array(found["mesh_mm"])
+    if held.any() and np.median(deeper[lost]) > np.median(deeper[held]) + PUSHED_MM:
+        said.append(
+            f"hands are {np.median(deeper[lost]):.1f} mm deeper in the engine than on the mesh "
+            f"({_median(deeper[held], 1)} where it holds) and push the object off as they close"
+        )
+    for name, text, unit, digits in (
+        ("residual", "contact forces that do not balance at μ = 0.3, residual", "", 3),
+        ("uneven_mm", "fingers that touch one after another, apart by", " mm", 1),
+    ):
+        values = np.array(found[name])
+        if held.any() and np.median(values[lost]) > 1.5 * np.median(values[held]) + 1e-3:
+            said.append(
+                f"{text} {_median(values[lost], digits)}{unit} ({_median(values[held], digits)} where it holds)"
+            )
+    return "; ".join(said) or "none of the figures tells the lost ones from those that hold"
+
+
+def _median(values: NDArray[np.float64], digits: int) -> str:
+    return f"{np.median(values):.{digits}f}" if len(values) else "-"
+
+
+def chosen(found: dict[str, Any]) -> list[int]:
+    """Rows of failures of the commonest kinds, one of each, then more of the first; last one that holds."""
+    kinds = [kind(reason) for reason in found["reasons"]]
+    order = [name for name, _ in Counter(kinds).most_common() if name != "held"]
+    rows = [kinds.index(name) for name in order[:SHOWN]]
+    rows += [row for row, name in enumerate(kinds) if order and name == order[0] and row not in rows]
+    return rows[:SHOWN] + ([kinds.index("held")] if "held" in kinds else [])
+
+
+def picture(cell: Cell, found: dict[str, Any], file: Path) -> None:
+    """Some grasps at the moment of contact, with what became of them."""
+    rows = chosen(found)
+    grasp = cell.grasps.grasp.take(np.array(rows))
+    drawn = grasp_pictures(cell.hand, cell.obj, grasp.hand_pose, grasp.joint_positions, (EDGE, EDGE), samples=8)[:, 0]
+    captions = [[(f"margin {found['margin'][row]:.1f}", found["reasons"][row])] for row in rows]
+    held = np.mean(found["success"])
+    page = contact_sheet(drawn, captions, title=f"{cell.hand_name} on {cell.object_name}", subtitle=f"{held:.0%} hold")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    few = Image.open(io.BytesIO(page)).convert("RGB").quantize(96, dither=Image.Dither.NONE)
+    few.save(file, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--grasps", type=int, default=64)
+    parser.add_argument("--out", type=Path, default=Path("docs/results"))
+    args = parser.parse_args()
+    lines = [
+        "# The failures left\n",
+        f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, judged at level `certificate` (revision "
+        f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand the {WORST} objects on which least hold, of "
+        f"{len(args.objects or []) or 'all'} objects. Made by `python benchmarks/failures.py DATA --objects ...`; a "
+        "margin is the worst motion over its limit. The pictures show the moment of contact: the first three fail, the "
+        "last one holds. What is said of a pair are medians over its lost grasps.\n",
+    ]
+    told: list[dict[str, Any]] = []
+    for hand in args.hands:
+        every = list(cells(args.data, args.work, hand, args.grasps, args.objects))
+        figures = []
+        for cell in every:
+            figures.append(cell.kept("failures", lambda cell=cell: found_out(cell)))  # type: ignore[misc]
+            sys.stderr.write(f"{hand}: {cell.object_name} {np.mean(figures[-1]['success']):.2f}\n")
+        order = np.argsort([np.mean(found["success"]) for found in figures], kind="stable")
+        lines += [f"## {hand}\n", "| object | hold | lost while closing | turns | slips | too deep | other |",
+                  "| --- | --: | --: | --: | --: | --: | --: |"]  # fmt: skip
+        for at in order:
+            counts = Counter(kind(reason) for reason in figures[at]["reasons"])
+            named = ("held", "lost while closing", "turns", "slips", "penetration")
+            numbers = [counts[name] for name in named]
+            numbers.append(sum(counts.values()) - sum(numbers))
+            lines.append(f"| {every[at].object_name} | {' | '.join(map(str, numbers))} |")
+            told.append(
+                {"hand": hand, "object": every[at].object_name, **dict(zip((*named, "other"), numbers, strict=True))}
+            )
+        lines.append("")
+        for at in order[:WORST]:
+            cell, found = every[at], figures[at]
+            name = f"failures/{hand}-{cell.object_name}.png"
+            picture(cell, found, args.out / name)
+            lines += [f"**{cell.object_name}**, {np.mean(found['success']):.0%} hold: {why(found)}.\n",
+                      f"![{hand} on {cell.object_name}: three grasps that fail, one that holds]({name})\n"]  # fmt: skip
+    (args.out / "failures.md").write_text("\n".join(lines))
+    write_json(args.out / "failures.json", told)
+
+
+if __name__ == "__main__":
+    main()
