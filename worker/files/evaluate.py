@@ -16,7 +16,7 @@ from service.model.robust import axis_word
 from worker.files.cases import Case
 from worker.hands.same_hand import SameHand
 from worker.quality.contact import contact_distance_consistency_mm
-from worker.quality.diversity import explained_variance
+from worker.quality.diversity import explained_variance, hand_points, nearest
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
@@ -57,7 +57,8 @@ def evaluate(
     Keys: n, protocol, level, hard, mu; gsr (share that holds), osr (1 if any holds), sgs (holding grasps per second of
     making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
-    the first principal component. verdicts, where somebody judged: see `told`. Judged in `models` models around the
+    the first principal component; nearest_mm: distance of the two grasps that are most alike.
+    verdicts, where somebody judged: see `told`. Judged in `models` models around the
     nominal one: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis.
     With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
     model of the hand as `judge_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
@@ -198,10 +199,12 @@ def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64]
     }
     row = {key: _median(table[f"quality/{name}"]) for key, name in columns.items()}
     shares = explained_variance(case.grasps.grasp)
+    apart = nearest(hand_points(case.hand, case.grasps.grasp))
     return row | {
         "cdc_mm": _median(cdc),
         "sd_cm": None if sd is None else _median(sd),
         "diversity": _plain(float(shares[0])) if len(shares) else None,
+        "nearest_mm": None if apart is None else _plain(1e3 * apart),
     }
 
 
@@ -247,6 +250,8 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     for key in _MEDIANS:
         known = [row[key] for row in rows if row[key] is not None]
         out[key] = _plain(float(np.median(known))) if known else None
+    near = [row["nearest_mm"] for row in rows if row.get("nearest_mm") is not None]
+    out["nearest_mm"] = min(near) if near else None
     return out
 
 

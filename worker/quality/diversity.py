@@ -58,6 +58,22 @@ def distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) ->
     return np.concatenate([np.zeros(0), *found])
 
 
+def nearest(points: Floats) -> float | None:
+    """Distance of the two grasps that are nearest to each other, of N (N, P, 3) [m]; None of fewer than two."""
+    if len(points) < 2:
+        return None
+    from scipy.spatial import cKDTree
+
+    middles = cKDTree(points.mean(axis=1))
+    near = np.asarray(middles.query(middles.data, k=2)[1])
+    rows = np.arange(len(points))
+    # With twins of a middle the first neighbour need not be the point itself.
+    bound = float(distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
+    # The mean distance of points is at least the distance of their means.
+    pairs = middles.query_pairs(bound, output_type="ndarray")
+    return min(bound, *distances(points, pairs[:, 0], pairs[:, 1]).tolist()) if len(pairs) else bound
+
+
 def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
     """(N,) grasps to keep so that no two are nearer than `least` [m]: each that is not near to one kept before it.
 

@@ -39,6 +39,7 @@ SAID = {"hand": "allegro", "object": "006_mustard_bottle"}
         ("hand != allegro", []),
         ("clearance_m > -1", []),  # a shard that lacks a metric fails every comparison with it
         ("pushes or lift_hard", []),
+        ("robust >= 0.75 or robust_share < 0.75", []),
     ],
 )
 def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
