@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, apply, compose, invert, quat_from_axis_angle, quat_from_matrix
@@ -160,6 +159,8 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
         poses: (N, T, 7) bodies of fingertips in the other base frame.
         guess: (T, 3) where fingertips are in the frames of these bodies, roughly.
     """
+    from scipy.optimize import least_squares  # slow to load
+
     start = _placed(apply(poses, guess), where)
 
     def pose_of(x: Floats) -> Floats:

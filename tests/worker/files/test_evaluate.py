@@ -240,3 +240,17 @@ def test_each_grasp_has_its_verdict_with_the_reason(tmp_path: Path) -> None:
     assert verdicts[0]["outcomes"] == ["held"] * 6 and verdicts[0]["margin"] < 1
     assert verdicts[2]["outcomes"] == ["displaced"] + ["not_tried"] * 5 and verdicts[2]["margin"] > 1
     assert verdicts[2]["reason"] == "displaced under +x"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--joint-map", "FFJ3=bend"], "name that hand"),
+        (["--judge-hand", "shadow", "--joint-map", "FFJ3"], "must be OURS=THEIRS"),
+        (["--judge-hand", "shadow", "--protocol", "lift"], "judges by protocol dexgraspbench"),
+    ],
+)
+def test_another_model_is_asked_for_in_full(options: list[str], says: str) -> None:
+    done = CliRunner().invoke(app, ["grasps.h5", *options])
+    assert done.exit_code == 2
+    assert says in done.output

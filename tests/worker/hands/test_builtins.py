@@ -31,7 +31,7 @@ def test_the_committed_files_are_what_the_generator_writes(name: str) -> None:
     assert builtin_files(AssetKind.HAND, name) == files_of(name)
 
 
-@pytest.mark.parametrize(("name", "joints", "dofs"), [("allegro", 16, 16), ("barrett", 8, 4), ("shadow", 22, 18)])
+@pytest.mark.parametrize(("name", "joints", "dofs"), [("allegro", 16, 16), ("barrett", 8, 4), ("shadow", 22, 22)])
 def test_degrees_of_freedom(name: str, joints: int, dofs: int) -> None:
     hand = hand_from_path(name)
     assert (len(hand.joint_names), hand.dofs) == (joints, dofs)

@@ -11,6 +11,7 @@ import pytest
 from service.model.errors import InputError
 from service.model.transforms import compose, invert, quat_from_axis_angle
 from tests.worker.hands.test_mjcf import package_file
+from worker.files.exchange.bench_hand import write_hand
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.same_hand import same_hand
@@ -69,6 +70,16 @@ def test_another_hand_of_the_same_joints_is_refused_with_its_farthest_fingertip(
     with pytest.raises(InputError, match=r"fingertip 'MF_distal' is up to \d+\.\d+ mm .* 1 mm are allowed") as error:
         same_hand(HAND, dataclasses.replace(HAND, name="mirrored", axis=axis))
     assert "\n" not in str(error.value)
+
+
+def test_a_urdf_and_the_mjcf_that_is_written_of_it_are_one_hand(tmp_path: Path) -> None:
+    back = hand_from_path(tmp_path / write_hand(HAND, "shadow", tmp_path))
+    # Twelve digits are written.
+    assert same_hand(HAND, back).fingertips_m < 1e-9
+    assert {t.coefficients for t in back.tendons} == {(1.0, 1.0)} and len(back.tendons) == 4
+    for ours, theirs in zip(HAND.tendons, back.tendons, strict=True):
+        assert theirs.gain(back.stiffness) == pytest.approx(ours.gain(HAND.stiffness))
+        assert theirs.limit(back.effort) == pytest.approx(ours.limit(HAND.effort))
 
 
 def test_the_urdf_of_shadow_and_robopianists_mjcf_are_one_hand(shared_data: Path) -> None:

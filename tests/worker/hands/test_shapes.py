@@ -120,3 +120,19 @@ def test_the_scale_of_a_mesh_turns_millimetres_into_metres() -> None:
 def test_a_mesh_in_millimetres_without_scale_is_refused_with_the_mend() -> None:
     with pytest.raises(HandError, match=r"0\.001"):
         load_hand(hand_with_mesh("", 20.0), name="h", digest="0" * 32)
+
+
+def test_a_hand_may_touch_with_what_it_looks_like() -> None:
+    thin, fat = ('<geometry><cylinder radius="0.007" length="0.04"/></geometry>',
+                 '<geometry><cylinder radius="0.009" length="0.05"/></geometry>')  # fmt: skip
+    seen = link("b", f"<visual>{fat}</visual><collision>{thin}</collision>")
+    # A link that touches nothing does not begin to, and one that shows nothing keeps its shapes.
+    bare = link("c", f"<visual>{fat}</visual>")
+    text = robot(link("palm"), link("a"), seen, bare, joint("j1", "palm", "a"), joint("j2", "a", "b"),
+                 joint("j3", "b", "c"))  # fmt: skip
+    sizes = {}
+    for shapes in ("collision", "visual"):
+        hand = load_hand({"hand.urdf": text}, name="hand", digest="0" * 32, options={"shapes": shapes})
+        sizes[shapes] = {piece.link: piece.size for piece in hand.pieces}
+    assert sizes["collision"]["b"] == (0.007, 0.04)
+    assert sizes["visual"] == {**sizes["collision"], "b": (0.009, 0.05)}

@@ -62,11 +62,12 @@ def test_a_command_of_torques_commands_the_pull_that_exerts_them() -> None:
 
 
 def test_asset_json_puts_joints_on_a_tendon_over_a_ratio_and_takes_it_away() -> None:
-    name, built_in, _ = files_from_path("shadow")
-    said = {"FFJ0": {"FFJ2": 1, "FFJ1": 1}}
-    hand = load_hand(built_in, name=name, digest="0" * 32, options={"tendons": said})
-    assert pulls(hand) == {"FFJ0": {"FFJ2": 1.0, "FFJ1": 1.0}}
-    assert "FFJ1" in hand.dof_names
+    barrett = hand_from_path("barrett")
+    assert "finger_1_distal" not in barrett.dof_names
+    said = {"cord": {"finger_1_medial": 1.0, "finger_1_distal": 0.3}}
+    hand = hand_from_path("barrett", {"tendons": said})
+    assert pulls(hand) == said
+    assert set(hand.dof_names) - set(barrett.dof_names) == {"finger_1_distal"}
     assert not load(tendons={}).tendons
 
 

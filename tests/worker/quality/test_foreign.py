@@ -17,9 +17,11 @@ from worker.files.evaluate import combine, evaluate
 from worker.hands.model import Drag, HandModel
 from worker.hands.same_hand import same_hand
 from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.first.screening import first_terms
 from worker.quality.referee.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
 from worker.quality.referee.key import verdict_key
 from worker.quality.referee.model import MujocoOptions, Scene, build
+from worker.run import Run
 
 FAR = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
 
@@ -88,6 +90,10 @@ def test_a_drive_stays_what_it_is_whether_joints_follow_it_or_hang_on_a_tendon()
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
 
 
+def test_the_first_judge_leaves_hands_with_tendons_to_the_cpu() -> None:
+    assert first_terms(load(root="palm"), "certificate", Run(first_judge="on")) == []
+
+
 def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
     row = evaluate(plates_case(), judge_hand=same_hand(HAND, HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
@@ -96,16 +102,14 @@ def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
     json.dumps(row, allow_nan=False)
 
 
-def test_a_model_with_thinner_pads_says_otherwise_and_shapes_are_told_to_be_why(tmp_path: Path) -> None:
-    pieces = tuple(
-        dataclasses.replace(p, size=tuple(0.8 * s for s in p.size), vertices=0.8 * p.vertices) for p in HAND.pieces
-    )
+def test_a_model_with_other_pads_says_otherwise_and_shapes_are_told_to_be_why(tmp_path: Path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
+    back = {body: np.array([0, 0, -0.04 if body else 0.0]) for body in range(HAND.bodies)}
     shorter = tuple(
         dataclasses.replace(
-            p, vertices=p.vertices - [0, 0, 0.04 * (p.body > 0)], pose=p.pose - [0, 0, 0.04 * (p.body > 0), 0, 0, 0, 0]
+            p, vertices=p.vertices + back[p.body], pose=np.concatenate([p.pose[:3] + back[p.body], p.pose[3:]])
         )
-        for p in pieces
+        for p in HAND.pieces
     )
     other = dataclasses.replace(HAND, name="shorter", pieces=shorter)
     same = same_hand(HAND, other)

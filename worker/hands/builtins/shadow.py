@@ -17,9 +17,9 @@ METACARPAL_TURN: Final = 0.959931089
 
 
 def shadow() -> tuple[str, dict[str, Any]]:
-    """Shadow Dexterous Hand E: palm normal -y, fingers +z, thumb toward +x; 22 joints, 18 degrees of freedom.
+    """Shadow Dexterous Hand E: palm normal -y, fingers +z, thumb toward +x; 22 joints, 18 drives.
 
-    One tendon drives the two outer joints of each finger; here J1 follows J2, the value a free finger takes.
+    One tendon drives the two outer joints of each finger, J1 + J2; on approach they are bent alike, as a free finger's.
     """
     hand = UrdfWriter("shadow")
     hand.link(
@@ -42,14 +42,15 @@ def shadow() -> tuple[str, dict[str, Any]]:
     _finger(hand, "LF", "LF_metacarpal", (0.053973, 0, 0.037795), (0, METACARPAL_TURN, 0), Y)
     _thumb(hand)
     fingers = ("FF", "MF", "RF", "LF")
-    preshape = {f"{f}J3": 0.3 for f in fingers} | {f"{f}J2": 0.35 for f in fingers}
+    preshape = {f"{f}J3": 0.3 for f in fingers} | {f"{f}J{k}": 0.35 for f in fingers for k in (2, 1)}
     preshape |= {"THJ5": 0.3, "THJ4": 1.1, "THJ3": 0.0, "THJ2": 0.0, "THJ1": 0.25}
-    closing = {f"{f}J4": 0 for f in fingers} | {f"{f}J{k}": 1 for f in fingers for k in (3, 2)}
+    closing = {f"{f}J4": 0 for f in fingers} | {f"{f}J{k}": 1 for f in fingers for k in (3, 2, 1)}
     closing |= {"LFJ5": 0, "THJ5": 0, "THJ4": 0, "THJ3": 0, "THJ2": 1, "THJ1": 1}
     return hand.text(), {
-        "description": "Shadow Dexterous Hand E, right, of primitives, without wrist: 5 fingers, 22 joints, 18 dofs.",
+        "description": "Shadow Dexterous Hand E, right, of primitives, without wrist: 5 fingers, 22 joints, 18 drives.",
         "palm": {"link": "palm", "centre": [0.0, -0.012, 0.06], "approach": [0.0, -1.0, 0.0]},
         "fingertips": [f"{f}_distal" for f in (*fingers, "TH")],
+        "tendons": {f"{f}J0": {f"{f}J2": 1.0, f"{f}J1": 1.0} for f in fingers},
         "preshape": preshape,
         "closing": closing,
         "stiffness": 5.0,
@@ -64,9 +65,7 @@ def _finger(hand: UrdfWriter, name: str, parent: str, xyz: Vector, rpy: Vector, 
     hand.joint(f"{name}J4", parent, f"{name}_knuckle", xyz, spread_axis, SPREAD, rpy=rpy, effort=2.0)
     hand.joint(f"{name}J3", f"{name}_knuckle", f"{name}_proximal", ZERO, X, KNUCKLE, effort=2.0)
     hand.joint(f"{name}J2", f"{name}_proximal", f"{name}_middle", (0, 0, 0.045), X, FLEX, effort=2.0)
-    hand.joint(
-        f"{name}J1", f"{name}_middle", f"{name}_distal", (0, 0, 0.025), X, FLEX, effort=2.0, mimic=(f"{name}J2", 1.0)
-    )
+    hand.joint(f"{name}J1", f"{name}_middle", f"{name}_distal", (0, 0, 0.025), X, FLEX, effort=2.0)
 
 
 def _thumb(hand: UrdfWriter) -> None:

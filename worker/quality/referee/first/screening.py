@@ -62,12 +62,15 @@ class Screened:
 def first_terms(hand: HandModel, level: str, run: Run) -> list[Any]:
     """The terms of the first judge where it takes part in verdicts of a level, for `verdict_key`; else none.
 
-    Grippers have none: their flat pads touch in an area, and how the engines spread contacts over it differs.
+    Grippers have none: their flat pads touch in an area, and how the engines spread contacts over it differs. Hands
+    with tendons have none: how the engines agree on them is not measured.
 
     Raises:
         InputError: it is insisted on, and not installed.
     """
-    if run.first_judge == "off" or level not in ("certificate", "screen") or jaws_of(hand) is not None:
+    if run.first_judge == "off" or level not in ("certificate", "screen"):
+        return []
+    if jaws_of(hand) is not None or hand.tendons:
         return []
     if run.first_judge == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
         return []
