@@ -125,7 +125,7 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
         "# Shadow grasps in a foreign model", "",
         "`python -m benchmarks.foreign DATA --sources /tmp/hands --out docs/results/foreign --objects ...`: "
         f"{facts['grasps']} raw standard grasps on each object, seed {facts['seed']}, planned with the URDF, "
-        "judged by the certificate in it (*nominal*) and in robopianist's MJCF (*foreign*), whose fingertips are within "
+        "judged by the certificate in it (*nominal*) and in robopianist's MJCF (*foreign*), fingertips within "
         f"{facts['fingertips_mm']:.2f} mm. Counts: grasps that hold nominally and, of these, in the foreign model.", "",
         "| object | " + " | ".join(PLANS) + " |", "| --- | " + " | ".join("--:" for _ in PLANS) + " |",
     ]  # fmt: skip
