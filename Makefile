@@ -5,9 +5,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: clusters dist gpu-check help install demo test test-slow check format browser screenshots docs pins audit clean
+.PHONY: clusters dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins audit clean
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info < (3, 14) else "graspd needs Python 3.11, 3.12 or 3.13: make PYTHON=python3.12 ...")'
@@ -24,7 +24,10 @@ test: $(STAMP) ## the tests (under 20 minutes on 2 cores)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 test-slow: $(STAMP) ## the long accuracy and soak runs
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m 'slow and not containers'
+
+test-containers: $(STAMP) ## images built, compose up, a job through two kills (needs a container engine)
+	$(BIN)/python -m pytest -m containers -rs tests/containers
 
 check: $(STAMP) ## format, lint, types, import contract
 	$(BIN)/ruff format --check .
