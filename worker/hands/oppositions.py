@@ -7,6 +7,7 @@ sampling and random steps, for as many widths as there are.
 
 from __future__ import annotations
 
+import sys
 import threading
 from dataclasses import dataclass
 from typing import Final
@@ -15,13 +16,17 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from service.model import transforms
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, quat_rotate
+from worker.hands import jaws, kinematics, primitives, surface
+from worker.hands import pads as pads_code
 from worker.hands.guess import posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
 from worker.hands.pads import Pad, fingertip_pad
 from worker.hands.surface import sample_surface
+from worker.objects.kept_arrays import arrays_kept_or_made
 
 #: Postures that are wanted, from so many times as many, and random steps that make them better.
 POSTURES: Final = 160
@@ -77,10 +82,13 @@ _lock = threading.Lock()
 
 
 def oppositions_of(hand: HandModel) -> Oppositions:
-    """The opposed postures of a hand, from memory where they are known; none of a hand with one finger."""
+    """The opposed postures of a hand, from memory or this machine's cache where they are known; none of a hand with one
+    finger."""
     with _lock:
         if hand.content not in _known:
-            _known[hand.content] = _oppositions(hand)
+            code = (sys.modules[__name__], jaws, kinematics, pads_code, primitives, surface, transforms)
+            made = arrays_kept_or_made("oppositions", (hand.content,), code, lambda: vars(_oppositions(hand)))
+            _known[hand.content] = Oppositions(**made)
         return _known[hand.content]
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from worker.hands import oppositions
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
@@ -39,3 +41,16 @@ def test_a_hand_of_one_finger_opposes_nothing() -> None:
     alone = oppositions_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
     assert len(alone) == 0
     assert alone.widest == 0.0
+
+
+def test_postures_that_the_machine_keeps_are_those_that_were_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    hand = hand_from_path("barrett")
+    found = []
+    for find in (oppositions._oppositions, lambda hand: pytest.fail("it is there already")):
+        monkeypatch.setattr(oppositions, "_oppositions", find)
+        monkeypatch.setattr(oppositions, "_known", {})
+        found.append(vars(oppositions_of(hand)))
+    assert all(np.array_equal(found[0][name], array) for name, array in found[1].items())
