@@ -168,7 +168,7 @@ def main() -> None:
     parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
     parser.add_argument("--objects", nargs="+", default=OBJECTS)
     parser.add_argument("--grasps", type=int, default=16, help="raw grasps of each hand on each object")
-    parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--draws", type=int, default=2, help="models of each axis for each grasp")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     done = []

@@ -18,6 +18,7 @@ from tests.worker.cards.conftest import Case, case
 from tests.worker.cards.makers import HANDS, OBJECTS, dataset
 from worker.cards.card import write_card
 from worker.cards.contents import contents_of_folder, contents_of_store, with_provenance
+from worker.cards.findings import _qualities
 from worker.commands.card import app
 
 
@@ -205,3 +206,9 @@ def test_a_mistake_is_one_line_and_exit_2(
 def test_the_matrix_is_that_of_the_dataset(kitchen: Case) -> None:
     pairs = [(cell["hand"], cell["object"]) for cell in kitchen.card["cells"]]
     assert pairs == [(hand, obj) for hand in HANDS for obj in OBJECTS]
+
+
+def test_a_card_says_in_how_many_models_half_of_its_grasps_hold() -> None:
+    told = [_qualities({"quality": {"allegro": {"robust_share": {"median": median}}}}) for median in (0.625, 1.0)]
+    assert "allegro: half hold in 62 % or less of the models around the nominal one" in told[0]
+    assert told[1] == ""
