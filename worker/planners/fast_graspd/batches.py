@@ -98,9 +98,9 @@ class Batches:
         if len(self.errors) == len(self.asked):
             raise self.errors[min(self.errors)]
 
-    def generators(self, rows: Rows) -> list[np.random.Generator]:
-        """Random numbers of the starts of these rows, those of one grasp side by side."""
-        each = range(self.fidelity.starts)
+    def generators(self, rows: Rows, attempt: int = 0) -> list[np.random.Generator]:
+        """Random numbers of the starts of these rows at an attempt, those of one grasp side by side."""
+        each = range(attempt * self.fidelity.starts, (attempt + 1) * self.fidelity.starts)
         wanted = [self.asked[owner].wanted for owner in self.owner[rows].tolist()]
         indices = self.index[rows].tolist()
         return [

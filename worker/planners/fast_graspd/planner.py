@@ -43,6 +43,8 @@ Rows = NDArray[np.intp]
 CHUNK: Final = 10
 #: Fewest grasps worth a thread of their own.
 PART: Final = 4
+#: A grasp whose merit is above this sets out once more: of such grasps a fifth (Shadow) to a half hold, of others most.
+POOR: Final = 0.05
 
 
 @dataclass
@@ -54,6 +56,8 @@ class Part:
     state: HandState
     loss: Floats
     """(n,) L_stable."""
+    merit: Floats
+    """(n,) of the hand that was chosen; 0 where there was nothing to choose from."""
     curve: list[Floats] = field(default_factory=list)
     """(n,) L_stable of each grasp's hands in the mean, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
@@ -62,7 +66,8 @@ class Part:
     def take(self, which: NDArray[np.intp]) -> Part:
         """Some of the grasps."""
         grasps = None if self.grasps is None else self.grasps.take(which)
-        return Part(self.rows[which], self.state[which], self.loss[which], [one[which] for one in self.curve], grasps)
+        curve = [one[which] for one in self.curve]
+        return Part(self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
 
 
 def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
@@ -123,6 +128,7 @@ def optimise(pair: Pair, batches: Batches, run: Run, *, postures: bool = False) 
 
     def work(which: range) -> Part:
         part = _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
+        part = _tried_again(launch, part)
         return _posed(launch, part) if postures and part.grasps is None else part
 
     return run_parts(cut(len(rows), run, least=PART), work)
@@ -165,21 +171,12 @@ class _Begun:
 
 def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
     """The starts of grasps."""
-    batches, coarse = launch.batches, launch.coarse
-    fidelity = batches.fidelity
 
     def work(which: range) -> _Begun:
         some = rows[which.start : which.stop]
-        placed, generators = launch.placed(some), batches.generators(some)
-        if placed is None:
-            state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
-        else:
-            state, depth = scene_starts.clear_scene_starts(
-                coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways
-            )
-        touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
-        batches.step(some, 1, "starts")
-        return _Begun(some, state, depth, touch)
+        found = _set_out(launch, some)
+        launch.batches.step(some, 1, "starts")
+        return found
 
     parts = run_parts(cut(len(rows), run, least=PART), work)
     touch = (
@@ -187,6 +184,20 @@ def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
     )
     depth = np.concatenate([part.depth for part in parts])
     return _Begun(np.concatenate([part.rows for part in parts]), _joined_states([p.state for p in parts]), depth, touch)
+
+
+def _set_out(launch: _Launch, rows: Rows, attempt: int = 0) -> _Begun:
+    """The starts of grasps at the first attempt or a later one."""
+    batches, coarse = launch.batches, launch.coarse
+    fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
+    if placed is None:
+        state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
+    else:
+        state, depth = scene_starts.clear_scene_starts(
+            coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways
+        )
+    touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
+    return _Begun(rows, state, depth, touch)
 
 
 def _with_place(launch: _Launch, begun: _Begun) -> Rows:
@@ -226,10 +237,27 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     seats = _Seats(launch, rows, state, losses, curve)
     if last > 1 and placed is not None and batches.has_trial:
         taken = tried(hand, obj, order, seats.seated, placed, batches.trial, device=pair.hand.device)
-        return Part(rows, taken.state, taken.losses, curve, taken.joined())
+        return Part(rows, taken.state, taken.losses, np.zeros(n), curve, taken.joined())
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
     winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
-    return Part(rows, seated.state[winners], seated.losses[winners], curve)
+    return Part(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
+
+
+def _tried_again(launch: _Launch, part: Part) -> Part:
+    """Grasps of free objects that balance poorly set out once more; of both the better one stays."""
+    poor = np.flatnonzero(part.merit > POOR)
+    if launch.batches.placed is not None or not len(poor):
+        return part
+    begun = _set_out(launch, part.rows[poor], attempt=1)
+    again = _work(launch, begun)
+    lost = begun.depth.reshape(len(poor), -1).max(axis=1) > NO_PLACE
+    better = np.flatnonzero((again.merit < part.merit[poor]) & ~lost)
+    rows = poor[better]
+    for whole, new in [(part.state.pivot, again.state.pivot), (part.state.rotation, again.state.rotation),
+                       (part.state.q, again.state.q), (part.loss, again.loss), (part.merit, again.merit),
+                       *zip(part.curve, again.curve, strict=True)]:  # fmt: skip
+        whole[rows] = new[better]
+    return part
 
 
 def _posed(launch: _Launch, part: Part) -> Part:
