@@ -1,11 +1,12 @@
 """Grasps planned in scenes against grasps planned around free objects and filtered, per hand and object.
 
 usage: python -m benchmarks.scene_grasps DATA_DIR --work W [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
-           [--per-face 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
+           [--per-face 0] [--filtered 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
        DATA_DIR holds hands/ and objects/
 
-Scenes: each stable resting face of the object that at least 3 % of drops end on, on a table. Both ways get the same
-number of raw grasps in the same scenes, judged alike: `--grasps` a pair, or `--per-face` for each face if that is more.
+Scenes: each stable resting face of the object that at least 3 % of drops end on, on a table: `--grasps` a pair, or
+`--per-face` for each face if that is more. Free grasps are put into the same scenes and judged alike: as many, or
+`--filtered` a pair if that is more, for few of them lift.
 A second is one of CPU time of one thread: other programs on the machine change the ratios little. What a pair has found
 lies under W: a run that was stopped goes on, and several may run beside one another with other hands.
 """
@@ -44,7 +45,7 @@ from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 
 COMMAND = (
-    "python -m benchmarks.scene_grasps DATA --work W --grasps 16 --per-face 2 "
+    "python -m benchmarks.scene_grasps DATA --work W --grasps 16 --per-face 2 --filtered 96 "
     "--page docs/results/scenes-grasps.md --json docs/results/scenes-grasps.json"
 )
 #: Not a seed that any setting was chosen with.
@@ -66,6 +67,7 @@ def study(
     least: int,
     per_face: int,
     *,
+    filtered: int = 0,
     touch: float = TOUCH,
     seed: int = SEED,
 ) -> dict[str, Any]:
@@ -80,13 +82,15 @@ def study(
     for where in (placed.take(slice(0, 1)), None):
         synthesize(hand, obj, Wanted(1, FIDELITY, SEED, placed=where, trial=trial), run)
     planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, trial=trial), run))
-    free, free_seconds = _timed(lambda: synthesize(hand, obj, wanted, run))
+    many = max(count, filtered)
+    free, free_seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, count=many), run))
+    free_seconds *= count / many
     found = _judged(hand, obj, planned, placed, pieces)
-    filtered = _judged(hand, obj, free, placed, pieces)
-    free_held = judge(hand, obj, free, pieces=pieces).success.mean()
-    rate, free_rate = found["lift"] / seconds, filtered["lift"] / free_seconds
+    scenes = Scenes(supports_of(spec), poses).placed(np.arange(many) % len(poses))
+    free_lift = _judged(hand, obj, free, scenes, pieces, only_lift=True)["lift"]
+    free_held = judge(hand, obj, free.take(np.arange(count)), pieces=pieces).success.mean()
+    rate, free_rate = found["lift"] / seconds, free_lift / free_seconds
     held = np.asarray(found.pop("rows"))
-    filtered.pop("rows")
     faces = np.array([held[placed.index == s].any() for s in range(len(poses))])
     known = oppositions_of(hand)
     reach = np.array([Openings.of(known, obj, scene).within_reach for scene in placed.scenes])
@@ -98,18 +102,25 @@ def study(
         "reach": int(reach.sum()),
         "reach_held": float(faces[reach].mean()) if reach.any() else None,
         "pushes_of_clear": found["pushes"] / found["clear_way"] if found["clear_way"] else None,
-        "filter_lift": filtered["lift"],
+        "filter_count": many,
+        "filter_lift": free_lift,
         "seconds": seconds / count,
         "free_seconds": free_seconds / count,
         "price": seconds / free_seconds,
-        "gain": rate / free_rate if free_rate else rate * count * free_seconds,
+        "gain": rate / free_rate if free_rate else rate * many * free_seconds,
         "gain_at_least": not free_rate,
         "of_free": rate / (free_held / free_seconds) if free_held else None,
     }
 
 
 def _judged(
-    hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed, pieces: ConvexPieces
+    hand: HandModel,
+    obj: ObjectModel,
+    grasps: GraspSet,
+    placed: Placed,
+    pieces: ConvexPieces,
+    *,
+    only_lift: bool = False,
 ) -> dict[str, Any]:
     way = plan_way(hand, obj, grasps, placed)
     grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
@@ -117,11 +128,14 @@ def _judged(
     share = {"clear_contact": float((way.contact >= MARGIN_M).mean()), "clear_way": float(way.clear.mean())}
     mine, where = grasps.take(clear), placed.take(clear)
     lifted = np.zeros(len(grasps), bool)
-    for name, options in {"lift": {}, "hard": {"hard": True}, "letter": {"level": "letter"}}.items():
-        verdicts = judge_lifts(hand, obj, mine, where, pieces=pieces, **options)  # type: ignore[arg-type]
+    levels: dict[str, dict[str, Any]] = {"lift": {}, "hard": {"hard": True}, "letter": {"level": "letter"}}
+    for name, options in list(levels.items())[: 1 if only_lift else None]:
+        verdicts = judge_lifts(hand, obj, mine, where, pieces=pieces, **options)
         share[name] = float(verdicts.success.sum() / len(grasps))
         if name == "lift":
             lifted[clear[verdicts.success == 1]] = True
+    if only_lift:
+        return share
     pushes = judge(hand, obj, mine, pieces=pieces).success.sum() if len(clear) else 0
     return {**share, "pushes": float(pushes / len(grasps)), "rows": lifted.tolist()}
 
@@ -169,11 +183,15 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
         lines += ["", f"## {name}", "", table(rows)]
     every = [row for rows in results.values() for row in rows]
     raw = sum(row["count"] for row in every)
-    lifted, filtered = (round(sum(row[name] * row["count"] for row in every)) for name in ("lift", "filter_lift"))
-    seconds, free_seconds = (sum(row[name] * row["count"] for row in every) for name in ("seconds", "free_seconds"))
+    lifted, filtered = (
+        round(sum(row[name] * row[count] for row in every))
+        for name, count in (("lift", "count"), ("filter_lift", "filter_count"))
+    )
+    seconds = sum(row["seconds"] * row["count"] for row in every)
+    free_seconds = sum(row["free_seconds"] * row["filter_count"] for row in every)
     lines += [
         "", f"Planned in their scenes {lifted} of {raw} grasps lift, {lifted / seconds:.2f} a second; planned free and "
-        f"filtered {filtered}, {filtered / free_seconds:.3f} a second: "
+        f"filtered {filtered} of {sum(row['filter_count'] for row in every)}, {filtered / free_seconds:.3f} a second: "
         f"{lifted / seconds * free_seconds / max(filtered, 1):.0f} times as many.",
     ]  # fmt: skip
     return "\n".join(
@@ -189,6 +207,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+")
     parser.add_argument("--grasps", type=int, default=32)
     parser.add_argument("--per-face", type=int, default=0)
+    parser.add_argument("--filtered", type=int, default=0, help="free grasps a pair that are filtered, at least")
     parser.add_argument("--touch", type=float, default=TOUCH, help="mm that fingertips keep from the table")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--json", type=Path)
@@ -201,7 +220,7 @@ def main() -> None:
         for mesh in sorted((said.data / "objects").glob("*/clean.stl")):
             if said.objects and mesh.parent.name not in said.objects:
                 continue
-            terms = f"{said.grasps}-{said.per_face}-{said.touch:g}-{said.seed}"
+            terms = f"{said.grasps}-{said.per_face}-{said.filtered}-{said.touch:g}-{said.seed}"
             kept = said.work / f"{name}-{mesh.parent.name}-{terms}.json"
             if not kept.exists():
                 obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
@@ -211,6 +230,7 @@ def main() -> None:
                     decompose(obj, cache=said.work / "pieces"),
                     said.grasps,
                     said.per_face,
+                    filtered=said.filtered,
                     touch=said.touch,
                     seed=said.seed,
                 )

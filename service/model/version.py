@@ -15,4 +15,4 @@ OLDEST_TASK_SCHEMA: Final = 2
 SCHEMA_OF_FIELD: Final[dict[str, int]] = {}
 
 #: Revision of each stage's algorithm. Part of the digest of a result, so results of two revisions never collide.
-STAGE_REVISIONS: Final = {"synthesize": 15, "scene": 2, "render": 3}
+STAGE_REVISIONS: Final = {"synthesize": 16, "scene": 2, "render": 3}

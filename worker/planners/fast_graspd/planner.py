@@ -22,7 +22,7 @@ from worker.planners.fast_graspd.batches import Batches, finalists
 from worker.planners.fast_graspd.candidates import Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.selection import best_of_each, merits, ranked
+from worker.planners.fast_graspd.selection import FRICTION, SCENE_FRICTION, best_of_each, merits, ranked
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.planners.port import Asked, Wanted
@@ -151,6 +151,12 @@ class _Launch:
     def placed(self, rows: Rows) -> Placed | None:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
+    def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
+        """See `selection.merits`."""
+        hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
+        friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
+        return merits(hand, obj, state, losses, depths, friction=friction, device=device)
+
 
 @dataclass(frozen=True)
 class _Begun:
@@ -230,7 +236,7 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
     if last < fidelity.starts:
-        merit = merits(hand, obj, state, losses, device=pair.hand.device)
+        merit = launch.merits(state, losses)
         if placed is not None:
             merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
@@ -295,9 +301,7 @@ class _Seats:
         state, depths = Projection(launch.fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
         if rows.shape[1] == 1:
             return Seated(state, losses, np.zeros(len(flat)))
-        hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
-        merit = merits(hand, obj, state, losses, depths, device=launch.pair.hand.device)
-        return Seated(state, losses, merit)
+        return Seated(state, losses, launch.merits(state, losses, depths))
 
 
 def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:

@@ -40,13 +40,13 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
 
 
 def in_scene(fidelity: Fidelity) -> Fidelity:
-    """The fidelity of grasps in scenes: obstacles leave fewer good approaches, and how well a hand balances is hard to
-    tell before it is seated, so more hands set out and more go on, a shorter way each."""
+    """The fidelity of grasps in scenes: obstacles leave fewer good approaches, so more hands set out and more go on.
+    They set out with the object between their fingers, so a short way does."""
     return fidelity.model_copy(
         update={
-            "starts": min(3 * fidelity.starts, 64),
+            "starts": min(2 * fidelity.starts, 64),
             "finalists": min(2 * fidelity.finalists, 64),
-            "coarse_iterations": _share(fidelity.coarse_iterations, 0.5),
+            "coarse_iterations": _share(fidelity.coarse_iterations, 0.25),
             "fine_iterations": _share(fidelity.fine_iterations, 0.375),
             "polish_iterations": _share(fidelity.polish_iterations, 0.6),
         }

@@ -77,19 +77,23 @@ class ShortLift(Lift):
                 if void(self.data) or moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION:
                     return LOST
         self._save()
-        hung = self._hung()
+        hung = self._hung(enough=1.0)
         if hung < 1.0:
             return hung
         self.scene = self._scenes.whole
         self._restore()
         return SLIPS + self._hung()
 
-    def _hung(self) -> float:
-        """Displacement or rotation over its limit when the support has gone."""
+    def _hung(self, enough: float = np.inf) -> float:
+        """Displacement or rotation over its limit when the support has gone; that is all if it is `enough` before."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -PULL * self._up
-        self._run(HANGING * STAGE_S)
-        return LOST if void(self.data) else self._excess()
+        for _ in range(HANGING):
+            self._run(STAGE_S)
+            excess = LOST if void(self.data) else self._excess()
+            if excess >= enough:
+                break
+        return excess
 
     def comes(self, grasps: GraspSet, row: int) -> bool:
         """Whether the open hand reaches its pregrasp as the lift test asks; `grasps.approach` says how it comes."""
