@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from graspd.cli import build
 from service.model.errors import InputError
 from service.model.transforms import compose, invert
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard, read_shard, write_shard
 from tests.worker.files.exchange.bench_loader import PREFIX, files_of, load, tabletop_test
 from worker.files.exchange import dexgraspbench
 from worker.files.exchange.bench_hand import body_names
@@ -29,6 +29,7 @@ CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
 #: Rounding of a pose in float64 through text of 12 digits [m].
 ROUNDING_M = 1e-8
 COUNT = 12
+LIMP = 3
 
 
 def graspd(*words: object) -> dict[str, Any]:
@@ -40,12 +41,17 @@ def graspd(*words: object) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Raw grasps in two scenes; most of them lift, it may be all."""
+    """Raw grasps in two scenes: most lift, the first `LIMP` do not, for they squeeze no more than the open hand."""
     out = tmp_path_factory.mktemp("scenes") / "g.h5"
     graspd(
         "synth", "--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", 2, "-n", COUNT,
         "--want", "raw", "--fidelity", "draft", "-o", out,
     )  # fmt: skip
+    made = read_shard(out, kind="base")
+    squeeze, held = np.array(made["squeeze/joint_positions"]), np.array(made["quality/success"])
+    squeeze[:LIMP], held[:LIMP] = made["pregrasp/joint_positions"][:LIMP], 0
+    changed = {"squeeze/joint_positions": squeeze, "quality/success": held}
+    out.write_bytes(write_shard("base", {**made.arrays, **changed}, made.attributes))
     return out
 
 
