@@ -88,8 +88,8 @@ class Synthesized:
 
     def _diversity(self) -> dict[str, Any]:
         """Types of the grasps, and the entropies of types and of directions of approach."""
-        types = np.bincount(self.arrays["quality/grasp_type"], minlength=len(GraspType))
-        cells = np.bincount(self.arrays["quality/approach_cell"], minlength=CELLS)
+        types = np.bincount(np.asarray(self.arrays["quality/grasp_type"], int), minlength=len(GraspType))
+        cells = np.bincount(np.asarray(self.arrays["quality/approach_cell"], int), minlength=CELLS)
         return {
             "types": {kind.name.lower(): int(types[kind]) for kind in GraspType if types[kind]},
             "type_entropy_bits": round(entropy_bits(types.tolist()), 4),
