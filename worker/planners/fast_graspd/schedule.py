@@ -44,7 +44,7 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
     They set out with the object between their fingers, so a short way does."""
     return fidelity.model_copy(
         update={
-            "starts": min(2 * fidelity.starts, 64),
+            "starts": min(5 * fidelity.starts // 2, 64),
             "finalists": min(2 * fidelity.finalists, 64),
             "coarse_iterations": _share(fidelity.coarse_iterations, 0.25),
             "fine_iterations": _share(fidelity.fine_iterations, 0.375),
