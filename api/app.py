@@ -13,6 +13,7 @@ from fastapi.staticfiles import StaticFiles
 
 from api import problems
 from api.access.keys import KeyFile
+from api.access.proxy import Proxy
 from api.dashboard import pages
 from api.dashboard.rendering import STATIC, problem_page
 from api.hosts import host_name, is_loopback
@@ -22,7 +23,7 @@ from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
 from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
-from api.routes import datasets, grasps, hand_corrections, jobs, shards, system
+from api.routes import datasets, grasps, hand_corrections, jobs, shards, system, usage
 from api.routes.assets import asset_router
 from api.routes.dependencies import provide
 from api.routes.long_requests import FORMS, UPLOADS, Turns
@@ -42,11 +43,14 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     """The application over given parts, or over parts it opens from the settings and closes at its end.
 
     Raises:
-        InputError: the address to bind is reachable from elsewhere and no key exists.
+        InputError: the address to bind is reachable from elsewhere and no key exists; or what the settings say of a
+            proxy cannot be read.
         StoreUnavailable, IndexUnavailable: where the parts cannot be opened.
     """
-    keys = KeyFile(settings.resolved_keys_file)
-    check_exposure(settings.host, keys)
+    proxy = Proxy(settings)
+    keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
+    if not proxy.is_on:
+        check_exposure(settings.host, keys)
     opened = parts or Parts.open(settings)
     with suppress(UnavailableError):
         complete_if_new(opened.index, opened.store)
@@ -68,12 +72,12 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         lifespan=lifespan,
     )
     app.state.settings = settings
-    app.state.keys = keys
+    app.state.keys, app.state.proxy = keys, proxy
     provide(app, opened)
     app.state.metrics = Metrics()
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
     problems.install(app, problem_page)
-    plain = (jobs, grasps, shards, system, hand_corrections)
+    plain = (jobs, grasps, shards, system, hand_corrections, usage)
     routers = [*(routes.router for routes in plain), *map(asset_router, AssetKind)]
     pages.install(app, opened)
     for router in (*routers, *datasets.routers, *pages.routers):
@@ -81,7 +85,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         # silence warnings meanwhile, for the whole process and so not safely where two applications build at once.
         app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    _add_middleware(app, settings, keys, rates)
+    _add_middleware(app, settings, keys, proxy, rates)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 
@@ -95,11 +99,11 @@ def check_exposure(host: str, keys: KeyFile) -> None:
         )
 
 
-def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, rates: Rates) -> None:
+def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
     """Innermost first: limits on bodies, who asks and how often, foreign web pages, request ids around everything."""
     uploads = frozenset({"/v1/hands", "/v1/objects", "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
-    app.add_middleware(Turnstile, keys=keys, settings=settings, rates=rates)
+    app.add_middleware(Turnstile, keys=keys, proxy=proxy, settings=settings, rates=rates)
     allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None
     app.add_middleware(SameOrigin, allowed_hosts=allowed)
     app.add_middleware(RequestContext, metrics=app.state.metrics)

@@ -44,6 +44,7 @@ class Job(BaseModel):
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: not known yet")
     created: str
     owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")
     finished: str | None = None
     reason: str | None = Field(None, description="why it failed")
     stages: list[StageStatus]

@@ -31,6 +31,13 @@ class Settings(BaseSettings):
     )
     api_key: SecretStr | None = Field(None, description="key the client commands send")
     keys_file: Path | None = Field(None, description="file of the API keys; unset: keys.json in data_dir")
+    proxy_addresses: str | None = Field(
+        None, description="addresses or networks of a proxy that signs people in, with commas; unset: there is none"
+    )
+    proxy_secret: SecretStr | None = Field(None, description="what it proves itself with; at least 16 characters")
+    proxy_groups: dict[str, str] = Field(
+        {}, description='rights of its groups, the first that fits counts: {"lab": "vision:submit", "*": ":read"}'
+    )
     metrics_need_key: bool = Field(True, description="whether /metrics asks for a key once there are keys")
     requests_per_minute: int = Field(1200, ge=0, description="requests of one key; 0: no limit")
     address_requests_per_minute: int = Field(

@@ -1,4 +1,5 @@
-"""Who asks: the key that a request shows, by header or by the cookie of a browser, and what it may do.
+"""Who asks: the key that a request shows, by header or by the cookie of a browser, or whom a proxy has signed in; and
+what they may do.
 
 The service is open while no key was ever made and it binds to this machine only. Once there is a key it stays closed,
 also when the last one is revoked or expired.
@@ -15,7 +16,9 @@ from starlette.requests import HTTPConnection
 from starlette.types import Scope as AsgiScope
 
 from api.access.keys import Key, KeyFile, Scope
+from api.access.proxy import Proxy
 from api.problems import ApiError
+from service.model.projects import EVERYTHING, Reach
 
 SESSION_COOKIE: Final = "graspd_session"
 #: Headers that a proxy adds: while the service is open they mean that somebody else's requests arrive here.
@@ -29,6 +32,12 @@ def caller_id() -> str:
     """Id of the caller's key; empty while the service is open."""
     key = caller.get()
     return key.id if key else ""
+
+
+def reach() -> Reach:
+    """What the key of the present request may see: its project; with `admin`, and while the service is open, all."""
+    key = caller.get()
+    return EVERYTHING if key is None else Reach(key.project, everything=key.scope.includes(Scope.ADMIN))
 
 
 class NotYours(ApiError):
@@ -62,32 +71,37 @@ def may_still(request: HTTPConnection, scope: Scope) -> bool:
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         return True
-    key = identify(request.scope, keys)
+    key = identify(request.scope, keys, request.app.state.proxy)
     return key is not None and key.scope.includes(scope)
 
 
-def may_change(owner: str) -> bool:
-    """Whether the key of the present request may cancel, retry or delete a thing: its own, or with `admin` any.
+def may_change(owner: str, project: str = "") -> bool:
+    """Whether the key of the present request may cancel, retry or delete a thing: its own or its project's, or with
+    `admin` any.
 
     Args:
         owner: id of the key that the thing was submitted with; empty where it was submitted without one, or before
             ids were recorded: then it takes `admin`.
+        project: what the thing belongs to. Keys of a project act for each other; those of none, for themselves.
     """
     key = caller.get()
-    return key is None or key.scope.includes(Scope.ADMIN) or (key.scope.includes(Scope.SUBMIT) and key.id == owner)
+    if key is None or key.scope.includes(Scope.ADMIN):
+        return True
+    is_theirs = key.project == project if project else key.id == owner
+    return key.scope.includes(Scope.SUBMIT) and is_theirs
 
 
-def must_own(owner: str, what: str) -> None:
+def must_own(owner: str, what: str, project: str = "") -> None:
     """Refuse to change somebody else's thing. The route has asked for `submit` before.
 
     Args:
-        owner: as in `may_change`.
+        owner, project: as in `may_change`.
         what: names the thing in the refusal, such as "job 1a2b".
 
     Raises:
         NotYours: it is not the caller's, and the key is no `admin` key.
     """
-    if not may_change(owner):
+    if not may_change(owner, project):
         key = caller.get()
         assert key is not None
         raise NotYours(
@@ -124,11 +138,13 @@ def refuse_strangers(request: HTTPConnection) -> None:
     )
 
 
-def identify(scope: AsgiScope, keys: KeyFile) -> Key | None:
-    """The live key that a header or a session cookie names."""
+def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
+    """The live key that a header or a session cookie names, or the person that the proxy vouches for."""
     scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
     if scheme.lower() == "bearer" and token:
         return keys.find(token.strip())
+    if person := proxy.find(scope):
+        return person
     cookie = HTTPConnection(scope).cookies.get(SESSION_COOKIE)
     return keys.find_session(cookie) if cookie else None
 

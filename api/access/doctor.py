@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from api.access.keys import Key, KeyFile, Scope
+from api.access.proxy import Proxy
 from service.model.errors import GraspdError
 from service.model.finding import Finding, bad, good, warning
 from service.settings import Settings
@@ -24,6 +25,8 @@ def keys(settings: Settings) -> Finding:
     except GraspdError as error:
         return bad(name, str(error), f"restore {path}, or make new keys: move it away, then {_ADD}")
     if not found:
+        if Proxy(settings).is_on:
+            return good(name, "there are none; people come through the proxy alone")
         if settings.host in _LOCAL:
             return good(name, f"there are none, and none are needed: the API binds {settings.host}")
         return bad(name, f"there are none, and the API does not start on {settings.host} without one", _ADD)

@@ -12,6 +12,7 @@ import hashlib
 import hmac
 import json
 import os
+import re
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +25,7 @@ from typing import Final, Self
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from service.model.projects import PATTERN, Project
 
 PREFIX: Final = "gd_"
 SESSION_S: Final = 12 * 3600
@@ -53,12 +55,23 @@ class KeyLimits(BaseModel):
     jobs_per_day: int | None = Field(None, ge=0, description="new jobs from midnight to midnight UTC")
 
 
+class ProjectLimits(BaseModel):
+    """What the keys of one project may use together. None or 0: no limit."""
+
+    grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
+    grasps_per_day: int | None = Field(None, ge=0, description="grasps asked for from midnight to midnight UTC")
+    gpu_seconds_per_day: int | None = Field(
+        None, ge=0, description="time of GPU workers on its tasks from midnight to midnight UTC; then no new job [s]"
+    )
+
+
 class Key(BaseModel):
     """A key as it is kept. Its id lasts through rotation, and no later key of the same name has it."""
 
     id: str = ""
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}$")
     scope: Scope
+    project: Project = ""
     sha256: str
     created: str
     revoked: str | None = None
@@ -80,13 +93,19 @@ class Key(BaseModel):
 class _Document(BaseModel):
     session_secret: str
     keys: list[Key] = []
+    projects: dict[str, ProjectLimits] = {}
 
 
 class KeyFile:
-    """The file of keys."""
+    """The file of keys.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        closed: whether there are other ways in than a key: then the service is not open without one either.
+    """
+
+    def __init__(self, path: Path, *, closed: bool = False) -> None:
         self.path = path
+        self._closed = closed
         self._stamp: tuple[int, ...] | None = None
         self._document = _Document(session_secret="")
 
@@ -97,42 +116,56 @@ class KeyFile:
     @property
     def is_open(self) -> bool:
         """Whether no key was ever made, so that anybody on this machine may use the service."""
-        return not self._read().keys
+        return not self._closed and not self._read().keys
 
     @property
     def has_live_key(self) -> bool:
         return any(key.is_live for key in self._read().keys)
 
     def add(
-        self, name: str, scope: Scope, *, lifetime: timedelta | None = None, limits: KeyLimits | None = None
+        self,
+        name: str,
+        scope: Scope,
+        *,
+        lifetime: timedelta | None = None,
+        limits: KeyLimits | None = None,
+        project: str = "",
     ) -> str:
         """Make a key and return it; it cannot be shown again.
 
+        Args:
+            project: what it submits belongs to this project; empty: to the one without a name.
+
         Raises:
             ConflictError: a live key has this name.
-            InputError: the name is not a plain word.
+            InputError: the name or the project is not a plain word.
         """
         with self._changing() as document:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
+            if "@" in name:
+                raise InputError(f"{name!r} is no key name: those with an @ are of people that a proxy signs in")
             token = PREFIX + secrets.token_urlsafe(32)
             try:
                 key = Key(
                     id=secrets.token_hex(8),
                     name=name,
                     scope=scope,
+                    project=project,
                     sha256=_sha256(token),
                     created=_now(),
                     expires=_now(lifetime) if lifetime else None,
                     limits=limits or KeyLimits(),
                 )
-            except ValidationError:
+            except ValidationError as error:
+                if error.errors()[0]["loc"] == ("project",):
+                    raise InputError(_no_project(project)) from None
                 raise InputError(f"{name!r} is no key name; use letters, digits, dot, dash and underscore") from None
             document.keys.append(key)
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """A new secret for a key; the old one still opens for `grace`. Scope and limits stay.
+        """A new secret for a key; the old one still opens for `grace`. Scope, project and limits stay.
 
         Raises:
             NotFoundError: no live key has this name.
@@ -165,6 +198,29 @@ class KeyFile:
             for key in (found := _live(document, name)):
                 key.limits = key.limits.model_copy(update=limits.model_dump(exclude_unset=True))
         return found[-1].limits
+
+    def projects(self) -> dict[str, ProjectLimits]:
+        """Projects that a key belongs to or that have limits, by name."""
+        document = self._read()
+        named = {key.project: ProjectLimits() for key in document.keys if key.project}
+        return dict(sorted((named | document.projects).items()))
+
+    def limits_of(self, project: str) -> ProjectLimits:
+        """What a project may use."""
+        return self._read().projects.get(project, ProjectLimits())
+
+    def limit_project(self, project: str, limits: ProjectLimits) -> ProjectLimits:
+        """Change those limits of a project that are given; returns all of them.
+
+        Raises:
+            InputError: it is no name of a project.
+        """
+        if not re.fullmatch(PATTERN, project):
+            raise InputError(_no_project(project))
+        with self._changing() as document:
+            known = document.projects.get(project, ProjectLimits())
+            document.projects[project] = known.model_copy(update=limits.model_dump(exclude_unset=True))
+        return document.projects[project]
 
     def revoke(self, name: str) -> None:
         """End a key's life; it stays in the list.
@@ -240,6 +296,10 @@ class KeyFile:
             file.flush()
             os.fsync(file.fileno())
         draft.replace(self.path)
+
+
+def _no_project(name: str) -> str:
+    return f"{name!r} is no name of a project; use up to 32 lower-case letters, digits and dashes"
 
 
 def _live(document: _Document, name: str) -> list[Key]:

@@ -1,4 +1,5 @@
-"""What one key may have in work: grasps in unfinished jobs, and new jobs a day.
+"""What one key, and the keys of one project together, may have in work: grasps in unfinished jobs, and what is asked
+for in a day.
 
 Redis counts, in one step for all API processes. What it holds may be lost: then a quota is forgotten, never a job.
 A job counts with the grasps that were asked for, from its submission until it ends. Whether it has ended is asked of
@@ -10,14 +11,14 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from redis.exceptions import RedisError
 
-from api.access.keys import Key
+from api.access.keys import Key, ProjectLimits
 from service.model.errors import QuotaError
 from service.settings import Settings
 
@@ -33,7 +34,7 @@ _PENDING_S: Final = 60
 # that claim counts as being entered; 0 once the job is in the index.
 _CLAIM: Final = """
 local job, grasps, number = ARGV[1], tonumber(ARGV[2]), ARGV[7]
-local most_grasps, most_jobs = tonumber(ARGV[3]), tonumber(ARGV[4])
+local most_grasps, most_today, amount = tonumber(ARGV[3]), tonumber(ARGV[4]), tonumber(ARGV[6])
 local now = tonumber(redis.call('TIME')[1])
 local entry = function(size) return size .. ' ' .. number .. ' ' .. (now + tonumber(ARGV[8])) end
 local known = redis.call('HGET', KEYS[1], job)
@@ -44,13 +45,13 @@ if known then
 end
 local held = tonumber(redis.call('HGET', KEYS[1], 'grasps') or '0')
 if most_grasps > 0 and held + grasps > most_grasps then return {'grasps', tostring(held)} end
-local jobs = tonumber(redis.call('GET', KEYS[2]) or '0')
-if most_jobs > 0 and jobs >= most_jobs then return {'jobs', tostring(jobs)} end
+local today = tonumber(redis.call('GET', KEYS[2]) or '0')
+if most_today > 0 and today + amount > most_today then return {'today', tostring(today)} end
 redis.call('HSET', KEYS[1], job, entry(ARGV[2]))
 redis.call('HINCRBY', KEYS[1], 'grasps', grasps)
 redis.call('EXPIRE', KEYS[1], ARGV[5])
-if ARGV[6] == '1' then
-  redis.call('INCR', KEYS[2])
+if amount > 0 then
+  redis.call('INCRBY', KEYS[2], amount)
   redis.call('EXPIRE', KEYS[2], 2 * 86400)
 end
 return {'', '0'}
@@ -105,17 +106,63 @@ class Claim:
     counts: bool = True
 
 
+@dataclass(frozen=True)
+class _Holder:
+    """Whose counters they are: a key's, which counts the jobs of a day, or a project's, which counts their grasps."""
+
+    name: str
+    words: str
+    grasps: int
+    today: int
+    counts_jobs: bool
+
+    @property
+    def is_limited(self) -> bool:
+        return bool(self.grasps or self.today)
+
+    @property
+    def held(self) -> str:
+        return f"graspd:quota:{self.name}:held"
+
+    @property
+    def day(self) -> str:
+        return f"graspd:quota:{self.name}:{datetime.now(UTC):%Y-%m-%d}"
+
+    def refusal(self, met: str, amount: int) -> QuotaError:
+        if met == "grasps":
+            return QuotaError(
+                f"{self.words} has {amount} grasps in work and may have {self.grasps}; "
+                "wait for a job to end, or ask for fewer grasps",
+                retry_after_s=60,
+            )
+        if self.counts_jobs:
+            words = f"{self.words} has submitted its {self.today} jobs of today; more tomorrow (UTC)"
+        else:
+            words = f"{self.words} has asked for {amount} of its {self.today} grasps of today; more tomorrow (UTC)"
+        return QuotaError(words, retry_after_s=_until_midnight())
+
+
 class Quotas:
-    """The counters of all keys.
+    """The counters of all keys and projects.
 
     Args:
         connection: Redis.
         unfinished: of these job ids, those whose job has not ended.
+        limits_of: what a project may use.
+        gpu_seconds: time of GPU workers on a project's tasks on a day [s].
     """
 
     def __init__(
-        self, settings: Settings, connection: Any, unfinished: Callable[[Collection[str]], Collection[str]]
+        self,
+        settings: Settings,
+        connection: Any,
+        unfinished: Callable[[Collection[str]], Collection[str]],
+        *,
+        limits_of: Callable[[str], ProjectLimits] = lambda project: ProjectLimits(),
+        gpu_seconds: Callable[[str, str], float] = lambda project, day: 0.0,
     ) -> None:
+        self._limits_of = limits_of
+        self._gpu_seconds = gpu_seconds
         self._settings = settings
         self._connection = connection
         self._unfinished = unfinished
@@ -129,96 +176,108 @@ class Quotas:
             is_new: whether it counts as one of today's jobs; one that is retried does not.
 
         Raises:
-            QuotaError: the key has all it may have.
+            QuotaError: the key, or its project, has all it may have.
         """
         claim = Claim()
-        if key is None or not any(self._limits(key)):
+        if key is None:
             yield claim
             return
-        number = uuid.uuid4().hex
-        met = self._claim(key, job, grasps, number, is_new=is_new)
-        try:
+        self._refuse_spent(key.project)
+        with ExitStack() as claimed:
+            for holder in self._holders(key):
+                claimed.enter_context(self._counted(holder, claim, job, grasps, is_new=is_new))
             yield claim
+
+    def _refuse_spent(self, project: str) -> None:
+        """QuotaError where a project used up its GPU seconds of today. What it submitted before goes on."""
+        most = self._limits_of(project).gpu_seconds_per_day if project else None
+        if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
+            raise QuotaError(
+                f"the project {project!r} has used {used:.0f} of its {most} GPU seconds of today; more tomorrow (UTC)",
+                retry_after_s=_until_midnight(),
+            )
+
+    def _holders(self, key: Key) -> list[_Holder]:
+        """Whose counters a submission adds to: those that have a limit."""
+        own, all_ = key.limits, self._settings
+        grasps = all_.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight
+        jobs = all_.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day
+        found = [_Holder(key.name, f"the key {key.name!r}", grasps, jobs, counts_jobs=True)]
+        if key.project:
+            limits = self._limits_of(key.project)
+            most = limits.grasps_in_flight or 0, limits.grasps_per_day or 0
+            # No name of a key holds a colon.
+            words = f"the project {key.project!r}"
+            found.append(_Holder(f"project:{key.project}", words, *most, counts_jobs=False))
+        return [holder for holder in found if holder.is_limited]
+
+    @contextmanager
+    def _counted(self, holder: _Holder, claim: Claim, job: str, grasps: int, *, is_new: bool) -> Iterator[None]:
+        number = uuid.uuid4().hex
+        met = self._claim(holder, job, grasps, number, is_new=is_new)
+        try:
+            yield
         except BaseException:
             claim.counts = False
             raise
         finally:
-            with self._forgiving(key):
-                self._end(key, job, grasps, number, met, counts=claim.counts, is_new=is_new)
+            with self._forgiving(holder):
+                self._end(holder, job, grasps, number, met, counts=claim.counts, is_new=is_new)
 
-    def _claim(self, key: Key, job: str, grasps: int, number: str, *, is_new: bool) -> str:
+    def _claim(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> str:
         """How a job is counted: empty where this claim counts it, `shared` where another claim that has not ended did,
         `known` where it was counted before, `unknown` without Redis."""
-        met, amount = self._ask(key, job, grasps, number, is_new=is_new)
+        met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
         if met == "grasps":
-            with self._forgiving(key):
-                self._forget_ended(key)
-            met, amount = self._ask(key, job, grasps, number, is_new=is_new)
-        most_grasps, most_jobs = self._limits(key)
-        if met == "grasps":
-            raise QuotaError(
-                f"the key {key.name!r} has {amount} grasps in work and may have {most_grasps}; "
-                "wait for a job to end, or ask for fewer grasps",
-                retry_after_s=60,
-            )
-        if met == "jobs":
-            raise QuotaError(
-                f"the key {key.name!r} has submitted its {most_jobs} jobs of today; more tomorrow (UTC)",
-                retry_after_s=_until_midnight(),
-            )
+            with self._forgiving(holder):
+                self._forget_ended(holder)
+            met, amount = self._ask(holder, job, grasps, number, is_new=is_new)
+        if met in ("grasps", "today"):
+            raise holder.refusal(met, amount)
         return met
 
-    def _ask(self, key: Key, job: str, grasps: int, number: str, *, is_new: bool) -> tuple[str, int]:
-        most_grasps, most_jobs = self._limits(key)
-        limits = (most_grasps, most_jobs if is_new else 0)
-        about = (job, grasps, *limits, _KEPT_S, int(is_new), number, _PENDING_S)
+    def _ask(self, holder: _Holder, job: str, grasps: int, number: str, *, is_new: bool) -> tuple[str, int]:
+        limits = (holder.grasps, holder.today if is_new else 0)
+        about = (job, grasps, *limits, _KEPT_S, _amount(holder, grasps) if is_new else 0, number, _PENDING_S)
         met, amount = b"unknown", b"0"
-        with self._forgiving(key):
-            met, amount = self._connection.eval(_CLAIM, 2, _held(key), _today(key), *about)
+        with self._forgiving(holder):
+            met, amount = self._connection.eval(_CLAIM, 2, holder.held, holder.day, *about)
         return met.decode(), int(amount)
 
-    def _forget_ended(self, key: Key) -> None:
+    def _forget_ended(self, holder: _Holder) -> None:
         """Drop the jobs that have ended. One that is being entered is not in the index yet, so it is not asked for; one
         that is claimed again meanwhile has another entry, and stays."""
-        found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, _held(key))]
+        found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
         for start in range(0, len(ended), _AT_ONCE):
             some = [word for job in ended[start : start + _AT_ONCE] for word in (job, entries[job])]
-            self._connection.eval(_DROP, 1, _held(key), *some)
+            self._connection.eval(_DROP, 1, holder.held, *some)
 
-    def _end(self, key: Key, job: str, grasps: int, number: str, met: str, *, counts: bool, is_new: bool) -> None:
+    def _end(
+        self, holder: _Holder, job: str, grasps: int, number: str, met: str, *, counts: bool, is_new: bool
+    ) -> None:
         if counts or met == "known":
-            self._connection.eval(_SETTLE, 1, _held(key), job, grasps, number)
+            self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
         else:
-            self._connection.eval(_UNDO, 1, _held(key), job, number)
+            self._connection.eval(_UNDO, 1, holder.held, job, number)
         # Of two claims of one job the one that made it counts as one of today's.
         if is_new and met == "shared" and counts:
-            self._connection.incr(_today(key))
+            self._connection.incrby(holder.day, _amount(holder, grasps))
         if is_new and met == "" and not counts:
-            self._connection.decr(_today(key))
+            self._connection.decrby(holder.day, _amount(holder, grasps))
 
     @contextmanager
-    def _forgiving(self, key: Key) -> Iterator[None]:
+    def _forgiving(self, holder: _Holder) -> Iterator[None]:
         try:
             yield
         except RedisError as error:
-            log.warning("the quota of key %s is not counted while Redis does not answer: %s", key.name, error)
-
-    def _limits(self, key: Key) -> tuple[int, int]:
-        own, all_ = key.limits, self._settings
-        return (
-            all_.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight,
-            all_.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day,
-        )
+            log.warning("the quota of %s is not counted while Redis does not answer: %s", holder.words, error)
 
 
-def _held(key: Key) -> str:
-    return f"graspd:quota:{key.name}:held"
-
-
-def _today(key: Key) -> str:
-    return f"graspd:quota:{key.name}:{datetime.now(UTC):%Y-%m-%d}"
+def _amount(holder: _Holder, grasps: int) -> int:
+    """What a new job adds to the counter of the day."""
+    return 1 if holder.counts_jobs else grasps
 
 
 def _until_midnight() -> int:

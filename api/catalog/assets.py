@@ -6,15 +6,17 @@ import contextlib
 import io
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
+from dataclasses import replace
 from typing import Final
 
-from api.access.auth import caller_id, must_own
+from api.access.auth import caller_id, must_own, reach
 from service.index.views import AssetView, Page
 from service.model import names
 from service.model.digests import digest_files
 from service.model.domain import AssetKind
 from service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
+from service.model.projects import marks_of
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
 from service.store import library
@@ -28,17 +30,17 @@ _NAMES_TRIED: Final = 100
 
 
 class Assets:
-    """Hands and objects of everybody; what takes one away asks whose it is. A `name` may be a digest."""
+    """Hands and objects within the caller's reach; what takes one away asks whose it is. A `name` may be a digest."""
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
 
     def page(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
         """All of a kind, by name."""
-        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor)
+        return self._parts.index.assets.page(kind, limit=limit, cursor=cursor, reach=reach())
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
-        return self._parts.index.assets.get(kind, name)
+        return self._parts.index.assets.get(kind, name, reach=reach())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         """Its files as they were uploaded, `asset.json` among them."""
@@ -52,21 +54,37 @@ class Assets:
         """
         return self._parts.store.get(names.asset_model(asset.kind, asset.digest))
 
-    def add(self, kind: AssetKind, name: str, files: Mapping[str, bytes], *, self_test: bool = False) -> AssetView:
+    def add(
+        self,
+        kind: AssetKind,
+        name: str,
+        files: MutableMapping[str, bytes],
+        *,
+        self_test: bool = False,
+        shared: bool = False,
+    ) -> AssetView:
         """Keep an uploaded hand or object; the keeper queues its check, which ends with grasps if `self_test` says so.
 
+        Args:
+            shared: whether every project may use it.
+
         Raises:
-            ConflictError: the name stands for other content, or the content has another name.
+            ConflictError: the name stands for other content, or the content has another name or belongs to another
+                project.
         """
-        self._refuse_taken(kind, name, digest_files(kind, files))
+        project = reach().project
+        digest = self._mark(kind, name, files, "" if shared else project)
+        self._refuse_hidden(kind, digest)
+        self._refuse_taken(kind, name, digest)
         index, store = self._parts.index, self._parts.store
-        asset = library.store_files(store, kind, name, files, owner=caller_id(), self_test=self_test)
+        said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
+        asset = library.store_files(store, kind, name, files, said=said)
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
         with index.database.writing() as connection:
             self._refuse_taken(kind, name, asset.digest)
             asset = library.record_asset(store, asset)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
-        return index.assets.get(kind, asset.digest)
+        return self.one(kind, asset.digest)
 
     def hand_facts(self, asset: AssetView) -> HandFacts:
         """What was found and guessed of a hand.
@@ -103,8 +121,10 @@ class Assets:
         files["asset.json"] = text
         if not new_name:
             # The same corrections are the same hand.
-            with contextlib.suppress(NotFoundError):
-                return self.one(AssetKind.HAND, digest_files(AssetKind.HAND, files))
+            for mark in ({}, marks_of(files, reach().project)):
+                files.update(mark)
+                with contextlib.suppress(NotFoundError):
+                    return self.one(AssetKind.HAND, digest_files(AssetKind.HAND, files))
         return self.add(AssetKind.HAND, new_name or self._next_name(hand.name), files)
 
     def _next_name(self, name: str) -> str:
@@ -124,15 +144,40 @@ class Assets:
         Raises:
             NotYours: another key uploaded it.
         """
-        asset = self._parts.index.assets.get(kind, name)
+        asset = self.one(kind, name)
         if not asset.builtin:
-            must_own(asset.owner, f"{kind.value} {name!r}")
-        deletion.delete_asset(self._parts, kind, asset.digest, owner=caller_id())
+            must_own(asset.owner, f"{kind.value} {name!r}", asset.project)
+        deletion.delete_asset(self._parts, kind, asset.digest, owner=caller_id(), reach=reach())
         log.info("%s %s deleted", kind, asset.name)
+
+    def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
+        """Put the mark of the project among the files, which keeps them to itself; their digest."""
+        files.update(marks_of(files, ""))
+        digest = digest_files(kind, files)
+        if not project:
+            return digest
+        with contextlib.suppress(NotFoundError):
+            # The very files are shared already: they stay one hand or object.
+            known = self.one(kind, digest)
+            if known.name == name and (known.shared or known.builtin):
+                return digest
+        files.update(marks_of(files, project))
+        return digest_files(kind, files)
+
+    def _refuse_hidden(self, kind: AssetKind, digest: str) -> None:
+        known = None
+        with contextlib.suppress(NotFoundError):
+            known = self._parts.index.assets.get(kind, digest)
+        if known is not None:
+            with contextlib.suppress(NotFoundError):
+                self.one(kind, digest)
+                return
+            raise ConflictError(f"another project keeps this {kind.value} to itself; upload it without sharing it")
 
     def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
         with contextlib.suppress(NotFoundError):
-            known = self._parts.index.assets.get(kind, name)
+            # Another project's names take none from this one, an admin's neither.
+            known = self._parts.index.assets.get(kind, name, reach=replace(reach(), everything=False))
             # A refused upload holds no name: the same file with the mend must get in.
             if known.digest != digest and known.verdict != "refuse":
                 raise ConflictError(f"there is another {kind.value} named {name!r}; choose a name of its own")

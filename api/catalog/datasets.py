@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 
-from api.access.auth import caller, caller_id, must_own
+from api.access.auth import caller, caller_id, must_own, reach
 from api.access.quotas import Quotas
 from api.access.unfinished import DATASET_PREFIX
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Datasets:
-    """Datasets of everybody; what changes one asks whose it is."""
+    """Datasets within the caller's reach; what changes one asks whose it is."""
 
     def __init__(self, parts: Parts, quotas: Quotas) -> None:
         self._parts = parts
@@ -39,10 +39,10 @@ class Datasets:
         Raises:
             QuotaError: the caller's key has all it may have.
         """
-        hands, objects = actions.members(self._parts, request)
+        hands, objects = actions.members(self._parts, request, reach())
         asked = len(hands) * len(objects) * request.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + request.name, asked) as claim:
-            dataset, claim.counts = actions.create(self._parts, request, owner=caller_id())
+            dataset, claim.counts = actions.create(self._parts, request, owner=caller_id(), reach=reach())
         return dataset
 
     def cancel(self, name: str) -> DatasetView:
@@ -79,35 +79,37 @@ class Datasets:
 
     def estimate(self, matrix: Matrix) -> Estimate:
         """What a matrix will cost. Nothing is recorded."""
-        return estimate(self._parts.index, matrix, Resolver(self._parts.store))
+        return estimate(self._parts.index, matrix, Resolver(self._parts.store), reach=reach())
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
         """Datasets, the newest first."""
-        return self._parts.index.datasets.page(limit=limit, cursor=cursor)
+        return self._parts.index.datasets.page(limit=limit, cursor=cursor, reach=reach())
 
     def one(self, name: str) -> DatasetView:
-        return self._parts.index.datasets.get(name)
+        return self._parts.index.datasets.get(name, reach=reach())
 
     def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
         """Each hand x object of a dataset with its job, hand by hand."""
-        return self._parts.index.datasets.cells(name, state=state, limit=limit, cursor=cursor)
+        return self._parts.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, reach=reach())
 
     def matrix(self) -> list[MatrixCell]:
         """Each hand x object of which there is a job, of a dataset or not."""
-        return self._parts.index.overview.matrix()
+        return self._parts.index.overview.matrix(reach=reach())
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Write down which shards a dataset holds now; and whether that made a new snapshot."""
+        self.one(name)
         return actions.snapshot(self._parts, name)
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
         """Snapshots of a dataset, the newest first."""
-        return self._parts.index.datasets.snapshots(name, limit=limit, cursor=cursor)
+        return self._parts.index.datasets.snapshots(name, limit=limit, cursor=cursor, reach=reach())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         """A snapshot with its list of shards."""
+        self.one(name)
         return load_snapshot(self._parts.store, name, digest)
 
     def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
@@ -121,17 +123,18 @@ class Datasets:
             name,
             objects,
             owner=caller_id(),
-            may_follow=lambda owner: must_own(owner, f"the set {name!r}"),
+            reach=reach(),
+            may_follow=lambda owner, project: must_own(owner, f"the set {name!r}", project),
         )
 
     def object_sets(self) -> list[ObjectSetView]:
         """The newest version of each set, by name."""
-        return self._parts.index.object_sets.newest()
+        return self._parts.index.object_sets.newest(reach=reach())
 
     def object_set(self, name: str) -> ObjectSetView:
-        return self._parts.index.object_sets.get(name)
+        return self._parts.index.object_sets.get(name, reach=reach())
 
     def _owned(self, name: str) -> DatasetView:
-        dataset = self._parts.index.datasets.get(name)
-        must_own(dataset.owner, f"dataset {name!r}")
+        dataset = self.one(name)
+        must_own(dataset.owner, f"dataset {name!r}", dataset.project)
         return dataset

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from api.access.auth import reach
 from api.catalog.grasp_files import GraspFiles
 from api.models import Diversity, GraspDetail, GraspQuery, Histogram, JobDetail
 from service.index.filters import GraspFilter, GraspSort, Metric
@@ -18,7 +19,7 @@ MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexe
 
 
 class Grasps:
-    """Grasps of all jobs; they never change."""
+    """Grasps of the jobs within the caller's reach; they never change."""
 
     def __init__(self, parts: Parts) -> None:
         self._index = parts.index
@@ -29,11 +30,13 @@ class Grasps:
     def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         """Grasps that pass every filter."""
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
-        return self._index.grasps.page(grasp_filter(query), sort=sort, limit=limit, cursor=cursor)
+        seen = reach()
+        where = grasp_filter(query).model_copy(update={"project": None if seen.everything else seen.project})
+        return self._index.grasps.page(where, sort=sort, limit=limit, cursor=cursor)
 
     def one(self, shard_id: str, row: int) -> GraspDetail:
         """One grasp with all that its shard says of it."""
-        grasp, shard = self._index.grasps.get(shard_id, row), self._index.shards.get(shard_id)
+        grasp, shard = self._index.grasps.get(shard_id, row, reach=reach()), self._index.shards.get(shard_id)
         return self._files.detail(grasp, shard)
 
     def histograms(self, job: JobView | JobDetail, *, bins: int = 20) -> list[Histogram]:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
-from api.access.auth import caller, caller_id, must_own
+from api.access.auth import caller, caller_id, must_own, reach
 from api.access.idempotency import Idempotency
 from api.access.quotas import Quotas
 from api.catalog.grasps import MEAN_METRICS, Grasps
@@ -30,7 +30,7 @@ _LOSS_BATCHES: Final = 8
 
 
 class Jobs:
-    """Jobs of everybody; what changes one asks whose it is."""
+    """Jobs within the caller's reach; what changes one asks whose it is."""
 
     def __init__(self, parts: Parts, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards) -> None:
         self._parts = parts
@@ -53,7 +53,7 @@ class Jobs:
         if idempotency_key is not None:
             bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
         with bound:
-            record = job_actions.prepare(self._parts, request, owner=caller_id())
+            record = job_actions.prepare(self._parts, request, owner=caller_id(), reach=reach())
             with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
                 job, is_new = job_actions.enter(self._parts, record)
                 claim.counts = is_new
@@ -106,16 +106,18 @@ class Jobs:
         cursor: str | None = None,
     ) -> Page[Job]:
         """Jobs, newest first."""
-        page = self._parts.index.jobs.page(state=state, hand=hand, object=object, limit=limit, cursor=cursor)
+        page = self._parts.index.jobs.page(
+            state=state, hand=hand, object=object, limit=limit, cursor=cursor, reach=reach()
+        )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
     def one(self, job_id: str) -> JobDetail:
         """A job with its attempts, mean metrics and shards."""
-        return self._detail(self._parts.index.jobs.get(job_id))
+        return self._detail(self._parts.index.jobs.get(job_id, reach=reach()))
 
     def moving(self, job_id: str) -> Job:
         """A job with the progress of its stages and nothing else: what a stream of events repeats."""
-        return self._job(self._parts.index.jobs.get(job_id), self._running(job_id))
+        return self._job(self._parts.index.jobs.get(job_id, reach=reach()), self._running(job_id))
 
     def loss_curve(self, job: JobDetail) -> LossCurve | None:
         """Mean loss of the planner over the first batches of a job; None where the planner keeps none."""
@@ -139,8 +141,8 @@ class Jobs:
         return self._losses[shard_id]
 
     def _owned(self, job_id: str) -> JobView:
-        job = self._parts.index.jobs.get(job_id)
-        must_own(job.owner, f"job {job_id}")
+        job = self._parts.index.jobs.get(job_id, reach=reach())
+        must_own(job.owner, f"job {job_id}", job.project)
         return job
 
     def _detail(self, job: JobView) -> JobDetail:
@@ -179,6 +181,7 @@ class Jobs:
             eta_s=eta_of_job(job, stages),
             created=job.created,
             owner=job.owner,
+            project=job.project,
             finished=job.finished,
             reason=job.reason,
             stages=stages,

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
+from api.access.auth import reach
 from api.catalog.health import Probes
 from api.catalog.jobs import Jobs
 from api.metrics import Snapshot
@@ -18,6 +20,7 @@ from service.index.views import FailureGroup, Stats, TaskView
 from service.model.digests import digest_json
 from service.model.domain import Lane, Stage
 from service.model.errors import NotFoundError, UnavailableError
+from service.model.projects import Reach
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import PART as KEEPER
 from service.queue.at_scrape import QueueNow
@@ -29,26 +32,30 @@ FINGERPRINT_S: Final = 1.0
 
 
 class Overview:
-    """What the home page, probes and Prometheus ask for; it changes nothing."""
+    """What the home page, probes and Prometheus ask for; it changes nothing.
+
+    Workers, queue and health are everybody's; what the jobs are and made is told within the caller's reach.
+    """
 
     def __init__(self, parts: Parts, jobs: Jobs) -> None:
         self._parts = parts
         self._jobs = jobs
         self._probes = Probes(parts)
-        self._fingerprint = (0.0, "")
+        self._fingerprints: dict[Reach, tuple[float, str]] = {}
         self._lock = threading.Lock()
 
     def workers(self) -> list[Worker]:
         """Workers, the living first, each with the stage it does and the age of its lease."""
         known = self._parts.index.overview.workers()
         doing = self._parts.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
+        seen = self._seen(worker.task_id for worker in known if worker.task_id)
         try:
             pulses = self._queue_now().workers
         except UnavailableError:
             pulses = {}
         return [
             Worker(
-                **worker.model_dump(),
+                **worker.model_dump() | ({} if worker.task_id in seen else {"task_id": None}),
                 stage=Stage(doing[worker.task_id][0]) if worker.task_id in doing else None,
                 lease_age_s=round(pulses[worker.name].lease_age_s, 3) if worker.name in pulses else None,
             )
@@ -60,26 +67,26 @@ class Overview:
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
-            return self._parts.index.jobs.task(worker.task_id)
+            return self._parts.index.jobs.task(worker.task_id, reach=reach())
         except NotFoundError:
             return None
 
     def stats(self) -> Stats:
-        return self._parts.index.overview.stats()
+        return self._parts.index.overview.stats(reach=reach())
 
     def valid_per_minute(self, *, minutes: int = 60) -> list[int]:
         """Valid grasps made in each of the last minutes, the oldest first."""
         start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=minutes - 1)
         made = [0] * minutes
         for bucket in self._parts.index.overview.throughput(
-            since=start.isoformat().replace("+00:00", "Z"), bucket_s=60
+            since=start.isoformat().replace("+00:00", "Z"), bucket_s=60, reach=reach()
         ):
             minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
             made[min(max(minute, 0), minutes - 1)] += bucket.valid
         return made
 
     def failures(self, *, limit: int = 5) -> list[FailureGroup]:
-        return self._parts.index.overview.failures(limit=limit)
+        return self._parts.index.overview.failures(limit=limit, reach=reach())
 
     def depths(self) -> dict[tuple[Lane, Stage], int]:
         """Waiting tasks by lane and stage."""
@@ -90,7 +97,10 @@ class Overview:
         return self._probes.health()
 
     def damage(self) -> tuple[int, list[Damage]]:
-        """Number of objects of the store known to be damaged or missing, and the first of them."""
+        """Number of objects of the store known to be damaged or missing, and the first of them, for whom all is in
+        reach."""
+        if not reach().everything:
+            return 0, []
         return self._parts.index.damage.known(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
@@ -107,13 +117,13 @@ class Overview:
         return found
 
     def fingerprint(self) -> str:
-        """Another text whenever a job, a task or a worker changed."""
+        """Another text whenever a job or a task within reach, or a worker, changed."""
         with self._lock:
-            at, digest = self._fingerprint
+            at, digest = self._fingerprints.get(reach(), (0.0, ""))
             now = time.monotonic()
             if not digest or now - at >= FINGERPRINT_S:
                 digest = self._digest()
-                self._fingerprint = (now, digest)
+                self._fingerprints[reach()] = (now, digest)
             return digest
 
     def _digest(self) -> str:
@@ -121,6 +131,11 @@ class Overview:
         workers = [(worker.name, worker.state, worker.task_id) for worker in self.workers()]
         moving = [(job.id, job.state, round(job.progress, 3)) for job in jobs]
         return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
+
+    def _seen(self, tasks: Iterable[str]) -> set[str]:
+        """Of these tasks, those within reach, and those that no job owns, such as the check of an upload."""
+        wanted = set(tasks)
+        return wanted if reach().everything else wanted - self._parts.index.jobs.out_of_reach(wanted, reach())
 
     def _queue_now(self) -> QueueNow:
         # A worker's registration lives for whole seconds: see `worker.process.heartbeat`.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Literal
 
+from api.access.auth import reach
 from api.models import Shard
 from service.index.views import Page, ShardView
 from service.pipeline.backends import Parts
@@ -12,7 +13,7 @@ from service.store.integrity import Checked
 
 
 class Shards:
-    """Shards of all jobs; they never change."""
+    """Shards of the jobs within the caller's reach; they never change."""
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
@@ -27,11 +28,11 @@ class Shards:
         cursor: str | None = None,
     ) -> Page[Shard]:
         """Shards, all or those of a job."""
-        page = self._parts.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor)
+        page = self._parts.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, reach=reach())
         return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
 
     def one(self, shard_id: str) -> Shard:
-        return _shard(self._parts.index.shards.get(shard_id))
+        return _shard(self._parts.index.shards.get(shard_id, reach=reach()))
 
     def intact(self, shard_id: str) -> Shard:
         """A shard whose file is what its checksum says; read through once, then again only where it was changed.
@@ -57,7 +58,7 @@ class Shards:
 
     def job_of(self, shard_id: str) -> str | None:
         """A job that a shard belongs to; None where it is gone."""
-        return self._parts.index.shards.job_of(shard_id)
+        return self._parts.index.shards.job_of(shard_id, reach=reach())
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         """Digests of the hand and the object of each shard."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -41,6 +42,7 @@ from service.store.asset_options import (
 from service.store.object_sets import files_of_set
 
 NameOption = Annotated[str | None, typer.Option("--name", help="Name to give it; default: the file's.")]
+SharedOption = Annotated[bool, typer.Option("--shared", help="Let every project use it, not only that of the key.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until a worker has checked it.")]
 
 #: How long a check is waited for, without and with a self-test [s].
@@ -67,6 +69,7 @@ def add_hand(
     self_test: Annotated[
         bool, typer.Option("--self-test/--no-self-test", help="Record how many of 64 grasps of plain objects hold.")
     ] = True,
+    shared: SharedOption = False,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -79,7 +82,7 @@ def add_hand(
     options |= provenance(licence, source)
     with upload_of(file) as (upload, main):
         said = ({"file": main} if main else {}) | options
-        _add(AssetKind.HAND, upload, name, said, self_test=self_test, wait=wait, url=url, json=json)
+        _add(AssetKind.HAND, upload, name, said, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
 
 
 @reporting_errors
@@ -94,6 +97,7 @@ def add_object(
     mass: MassOption = None,
     licence: LicenceOption = None,
     source: SourceOption = None,
+    shared: SharedOption = False,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
@@ -107,11 +111,12 @@ def add_object(
     options |= provenance(licence, source)
     if len(sizes) > 1:
         swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
-        add_set(swept, name=name or name_of_set(file), prefix=None, options=options, wait=wait, url=url, json=json)
+        add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)
     elif files := files_of_set(file):
-        add_set(files, name=name or name_of_set(file), prefix=name, options=options, wait=wait, url=url, json=json)
+        add = partial(add_set, files, name=name or name_of_set(file), prefix=name)
     else:
-        _add(AssetKind.OBJECT, file, name, options, wait=wait, url=url, json=json)
+        add = partial(_add, AssetKind.OBJECT, file, name)
+    add(options=options, shared=shared, wait=wait, url=url, json=json)
 
 
 def _add(
@@ -121,12 +126,14 @@ def _add(
     options: dict[str, Any],
     *,
     self_test: bool = False,
+    shared: bool = False,
     wait: bool,
     url: str | None,
     json: bool,
 ) -> None:
     with open_client(url) as client:
-        asset = client.upload(kind, file, name=name or name_of_upload(file.name), options=options, self_test=self_test)
+        name = name or name_of_upload(file.name)
+        asset = client.upload(kind, file, name=name, options=options, self_test=self_test, shared=shared)
         if wait:
             asset = client.wait_checked(kind, asset.name, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
     show_asset(asset.model_dump(mode="json"), json=json)

@@ -49,7 +49,15 @@ def name_of_set(path: Path) -> str:
 
 
 def add_set(
-    objects: Objects, *, name: str, prefix: str | None, options: dict[str, Any], wait: bool, url: str | None, json: bool
+    objects: Objects,
+    *,
+    name: str,
+    prefix: str | None,
+    options: dict[str, Any],
+    shared: bool = False,
+    wait: bool,
+    url: str | None,
+    json: bool,
 ) -> None:
     """Upload all, wait for all checks, give them a name together; what is refused does not stop the others.
 
@@ -57,7 +65,8 @@ def add_set(
         InputError: some were refused; each is listed before.
     """
     with open_client(url) as client:
-        told = upload_set(client, objects, prefix=prefix, options=options, wait=wait, say=None if json else typer.echo)
+        say = None if json else typer.echo
+        told = upload_set(client, objects, prefix=prefix, options=options, shared=shared, wait=wait, say=say)
         taken = [one["name"] for one in told if one["verdict"] != "refuse"]
         if taken:
             DatasetClient(client).add_object_set(name, taken)
@@ -76,6 +85,7 @@ def upload_set(
     *,
     prefix: str | None = None,
     options: dict[str, Any] | None = None,
+    shared: bool = False,
     wait: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
@@ -85,7 +95,8 @@ def upload_set(
         say: told of each as soon as its check is done.
     """
     told = [
-        _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}) for name, files in objects.items()
+        _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)
+        for name, files in objects.items()
     ]
     for one in told:
         if wait and one["verdict"] is None:
@@ -96,13 +107,15 @@ def upload_set(
     return told
 
 
-def _upload(client: Client, name: str, files: dict[str, bytes], options: dict[str, Any]) -> dict[str, Any]:
+def _upload(
+    client: Client, name: str, files: dict[str, bytes], options: dict[str, Any], *, shared: bool
+) -> dict[str, Any]:
     """One object of a set: its name and what is known of it yet."""
     try:
         with tempfile.TemporaryDirectory(prefix="graspd-set-") as folder:
             archive = Path(folder) / "object.zip"
             archive.write_bytes(pack(files))
-            asset = client.upload(AssetKind.OBJECT, archive, name=name, options=options)
+            asset = client.upload(AssetKind.OBJECT, archive, name=name, options=options, shared=shared)
     except InputError as error:
         return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
     return {"name": asset.name, "verdict": asset.verdict, "message": asset.message or "", "repairs": asset.repairs}

@@ -107,13 +107,14 @@ class Client:
         name: str | None = None,
         options: dict[str, Any] | None = None,
         self_test: bool = False,
+        shared: bool = False,
     ) -> AssetView:
         """Send a file or a ZIP, with keys that go over its `asset.json`; InputError if it cannot be opened.
 
-        The check of a hand ends with the self-test if wanted.
+        The check of a hand ends with the self-test if wanted; what is shared may be used by every project.
         """
         fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
-        fields |= {"self_test": "true"} if self_test else {}
+        fields |= {name: "true" for name, wanted in {"self_test": self_test, "shared": shared}.items() if wanted}
         try:
             with path.open("rb") as file:
                 answer = self.send(

@@ -19,6 +19,9 @@ app = typer.Typer(no_args_is_help=True, help="Make, list, rotate, limit and revo
 _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
 NameArgument = Annotated[str, typer.Argument(help="Whose key it is.")]
+ProjectOption = Annotated[
+    str, typer.Option(help="Project that it belongs to; keys of other projects see nothing of it.", metavar="NAME")
+]
 LifetimeOption = Annotated[
     str | None, typer.Option("--expires", help="How long it lives: 90d, 12h; default: for ever.")
 ]
@@ -33,6 +36,7 @@ JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs a day (UTC
 def add_key(
     name: NameArgument,
     scope: Annotated[Scope, typer.Option(help="What it may do.")] = Scope.SUBMIT,
+    project: ProjectOption = "",
     expires: LifetimeOption = None,
     requests_per_minute: RequestsOption = None,
     concurrency: ConcurrencyOption = None,
@@ -42,7 +46,8 @@ def add_key(
 ) -> None:
     """Make a key and show it, this once. Limits that are not given are those of the settings."""
     limits = _limits(requests_per_minute, concurrency, grasps_in_flight, jobs_per_day)
-    token = _key_file().add(name, scope, lifetime=duration(expires) if expires else None, limits=limits)
+    lifetime = duration(expires) if expires else None
+    token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
     _show_token(name, scope, token, json=json)
 
 
@@ -89,9 +94,13 @@ def list_keys(json: JsonFlag = False) -> None:
     if json:
         emit({"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]})
         return
-    table = Table("name", "scope", "state", "created", "expires", "limits", box=None, header_style="bold")
+    has_projects = any(key.project for key in found)
+    names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
+    table = Table(*names, box=None, header_style="bold")
     for key in found:
-        table.add_row(key.name, key.scope, _state(key), key.created[:16], (key.expires or "")[:16], _shown(key.limits))
+        of = [key.project or "-"] if has_projects else []
+        times = key.created[:16], (key.expires or "")[:16]
+        table.add_row(key.name, key.scope, *of, _state(key), *times, _shown(key.limits))
     Console().print(table if found else "no key; the service is open and answers on this machine only")
 
 

@@ -10,10 +10,12 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
+from api.access.auth import reach
 from service.index.index import Index
 from service.index.queries.costs import BatchCost, Costs
 from service.model.domain import OFFERED, Stage
 from service.model.errors import GraspdError
+from service.model.projects import Reach
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.spec import Matrix
 
@@ -62,7 +64,7 @@ class Expectations:
     def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> Expected:
         try:
             matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
-            cost = estimate(self._index, matrix, costs=self._costs.of_batches)
+            cost = estimate(self._index, matrix, costs=self._costs.of_batches, reach=reach())
         except (ValidationError, GraspdError):
             return Expected(name, WORDS[name], None, None, None, None, "")
         rate = cost.rates[0] if cost.rates else None
@@ -75,12 +77,13 @@ class _RememberedCosts:
 
     def __init__(self, costs: Costs) -> None:
         self._costs = costs
-        self._read: dict[Stage, tuple[float, list[BatchCost]]] = {}
+        self._read: dict[tuple[Stage, Reach], tuple[float, list[BatchCost]]] = {}
         self._lock = threading.Lock()
 
     def of_batches(self, stage: Stage) -> list[BatchCost]:
         with self._lock:
             now = time.monotonic()
-            if stage not in self._read or now - self._read[stage][0] > KEPT_S:
-                self._read[stage] = (now, self._costs.of_batches(stage))
-            return self._read[stage][1]
+            key = (stage, reach())
+            if key not in self._read or now - self._read[key][0] > KEPT_S:
+                self._read[key] = (now, self._costs.of_batches(stage, reach=reach()))
+            return self._read[key][1]

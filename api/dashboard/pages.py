@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from api.catalog import events
-from api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages, session
+from api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages, session, usage_pages
 from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
@@ -21,7 +21,10 @@ from service.pipeline.backends import Parts
 router = APIRouter(include_in_schema=False)
 #: Those of all pages, in the order in which they are asked.
 routers: Final = (
-    *(part.router for part in (service_pages, job_pages, grasp_pages, hand_pages, dataset_pages, forms, session)),
+    *(
+        part.router
+        for part in (service_pages, job_pages, grasp_pages, hand_pages, dataset_pages, usage_pages, forms, session)
+    ),
     router,
 )
 

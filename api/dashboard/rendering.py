@@ -25,6 +25,8 @@ NAVIGATION: Final = (
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
+#: Where there are keys, somebody may ask who used what.
+_WITH_KEYS: Final = (("/usage", "Usage"),)
 
 
 def environment() -> Environment:
@@ -51,7 +53,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "health": request.app.state.overview.health(),
     } | context
     context |= {
-        "navigation": NAVIGATION,
+        "navigation": NAVIGATION if request.app.state.keys.is_open else NAVIGATION + _WITH_KEYS,
         "version": PACKAGE_VERSION,
         "signed_in": not request.app.state.keys.is_open,
         # What the key may not do has no button; the routes refuse it all the same.

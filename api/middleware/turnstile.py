@@ -13,6 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from api.access.auth import caller as present_caller
 from api.access.auth import identify
 from api.access.keys import Key, KeyFile
+from api.access.proxy import Proxy
 from api.middleware.rates import HELD_S, WINDOW_S, Admission, Allowance, Rates, seconds_up
 from api.problems import ApiError, answer
 from service.logs import bind
@@ -30,9 +31,10 @@ class Turnstile:
     (draft-ietf-httpapi-ratelimit-headers-10).
     """
 
-    def __init__(self, app: ASGIApp, *, keys: KeyFile, settings: Settings, rates: Rates) -> None:
+    def __init__(self, app: ASGIApp, *, keys: KeyFile, proxy: Proxy, settings: Settings, rates: Rates) -> None:
         self.app = app
         self.keys = keys
+        self.proxy = proxy
         self.settings = settings
         self.rates = rates
 
@@ -41,7 +43,7 @@ class Turnstile:
             await self.app(scope, receive, send)
             return
         is_open = self.keys.is_open
-        key = scope.setdefault("state", {})["key"] = None if is_open else identify(scope, self.keys)
+        key = scope.setdefault("state", {})["key"] = None if is_open else identify(scope, self.keys, self.proxy)
         token = present_caller.set(key)
         try:
             with bind(key=key.name if key else ""):

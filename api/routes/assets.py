@@ -101,6 +101,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
             bool,
             Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker"),
         ] = False,
+        shared: Annotated[bool, Form(description="whether every project may use it, not only that of the key")] = False,
     ) -> AssetView:
         """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
         limit = request.app.state.settings.max_upload_bytes
@@ -108,7 +109,15 @@ def asset_router(kind: AssetKind) -> APIRouter:
         if self_test and kind is not AssetKind.HAND:
             raise InputError("self_test: only a hand can be tried")
         asset = await uploads.run(
-            store_upload, assets, kind, file, name, limit_bytes=limit, options=options, self_test=self_test
+            store_upload,
+            assets,
+            kind,
+            file,
+            name,
+            limit_bytes=limit,
+            options=options,
+            self_test=self_test,
+            shared=shared,
         )
         response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
         response.headers["Retry-After"] = "1"
@@ -137,6 +146,7 @@ def store_upload(
     limit_bytes: int,
     options: str = "",
     self_test: bool = False,
+    shared: bool = False,
 ) -> AssetView:
     """An asset of immutable bytes, and the task that checks it. The upload lies in a file of its own until then.
 
@@ -146,7 +156,7 @@ def store_upload(
     filename = file.filename or ""
     with _one_of_few():
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
-        return assets.add(kind, name or name_of_upload(filename), files, self_test=self_test)
+        return assets.add(kind, name or name_of_upload(filename), files, self_test=self_test, shared=shared)
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:

@@ -170,7 +170,7 @@ def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf
     "",
     status_code=201,
     dependencies=[Depends(may_submit)],
-    responses=responses(400, 401, 403, 404, 413, 422, 503),
+    responses=responses(400, 401, 403, 404, 409, 413, 422, 503),
 )
 def add_object_set(body: ObjectSetRequest, response: Response, datasets: DatasetsOf) -> ObjectSetView:
     """Give objects a name together. Others under the same name are its next version: for its owner, or an admin."""

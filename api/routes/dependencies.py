@@ -18,6 +18,7 @@ from api.catalog.grasps import Grasps
 from api.catalog.jobs import Jobs
 from api.catalog.overview import Overview
 from api.catalog.shards import Shards
+from api.catalog.usage import Usage
 from service.pipeline.backends import Parts
 from service.queue.address import redis_url
 from service.queue.connection import connect
@@ -29,13 +30,19 @@ MAX_LIMIT = 200
 def provide(app: FastAPI, parts: Parts) -> None:
     """Put what routes ask for over these parts."""
     redis = connect(redis_url(parts.settings), patience=1)
-    quotas = Quotas(parts.settings, redis, lambda ids: unfinished(parts.index, ids))
     state = app.state
+    quotas = Quotas(
+        parts.settings,
+        redis,
+        lambda ids: unfinished(parts.index, ids),
+        limits_of=state.keys.limits_of,
+        gpu_seconds=parts.index.usage.gpu_seconds,
+    )
     state.store = parts.store
     state.grasps, state.shards = Grasps(parts), Shards(parts)
     state.jobs = Jobs(parts, quotas, Idempotency(redis), state.grasps, state.shards)
     state.datasets, state.assets = Datasets(parts, quotas), Assets(parts)
-    state.overview = Overview(parts, state.jobs)
+    state.overview, state.usage = Overview(parts, state.jobs), Usage(parts, state.keys)
 
 
 def may_read(request: Request) -> None:
@@ -66,6 +73,7 @@ AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
 GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
 StoreOf = Annotated[Store, Depends(_provided("store"))]
+UsageOf = Annotated[Usage, Depends(_provided("usage"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]

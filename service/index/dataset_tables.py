@@ -20,6 +20,7 @@ datasets: Final = Table(
     Column("cells", Integer, nullable=False),
     Column("created", String(32), nullable=False),
     Column("owner", String(64), nullable=False, server_default=""),
+    Column("project", String(32), nullable=False, server_default=""),
     Column("cancelled", Boolean, nullable=False),
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
@@ -62,4 +63,5 @@ object_sets: Final = Table(
     Column("digest", String(32), primary_key=True),
     Column("objects", JSON, nullable=False),
     Column("created", String(32), nullable=False),
+    Column("project", String(32), nullable=False, server_default=""),
 )

@@ -33,6 +33,7 @@ class DatasetView(View):
     size_bytes: int
     created: str
     owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")
     finished: str | None
     cancelled: bool = Field(description="cancelled by its user; `retry` lifts it")
 
@@ -94,3 +95,4 @@ class ObjectSetView(View):
     digest: str
     objects: list[str]
     created: str
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")

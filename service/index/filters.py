@@ -19,6 +19,8 @@ class GraspFilter(Model):
     object: str | None = None
     job: str | None = None
     shard: str | None = None
+    project: str | None = None
+    """Of whose jobs; None: of everybody's."""
     valid: bool | None = None
     success: bool | None = None
     scene: str | None = None

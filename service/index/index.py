@@ -20,6 +20,7 @@ from service.index.queries.object_sets import ObjectSets
 from service.index.queries.overview import Overview
 from service.index.queries.shards import Shards
 from service.index.queries.statistics import Statistics
+from service.index.queries.usage import Usage
 
 
 class Index:
@@ -43,6 +44,7 @@ class Index:
         self.assets = Assets(database)
         self.costs = Costs(database)
         self.overview = Overview(database)
+        self.usage = Usage(database)
         self.feed = Feed(database)
         self.dataset_feed = DatasetFeed(database)
         # What is written.

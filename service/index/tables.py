@@ -8,7 +8,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    Float,
+    Index,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    Text,
+    false,
+)
 
 from service.model.metrics import Indexed, indexed
 
@@ -28,6 +41,7 @@ jobs: Final = Table(
     Column("revisions", JSON, nullable=False, server_default='{"synthesize": 1, "scene": 1, "render": 1}'),
     Column("origin", JSON(none_as_null=True)),
     Column("owner", String(64), nullable=False, server_default=""),
+    Column("project", String(32), nullable=False, server_default=""),
     Column("cancelled", Boolean, nullable=False),
     Column("created", String(32), nullable=False),
     Column("finished", String(32)),
@@ -38,6 +52,7 @@ jobs: Final = Table(
     Index("jobs_newest", "created", "id"),
     Index("jobs_by_state", "state", "created", "id"),
     Index("jobs_by_pair", "hand", "object"),
+    Index("jobs_of_project", "project", "created", "id"),
 )
 
 tasks: Final = Table(
@@ -121,12 +136,15 @@ shards: Final = Table(
     Column("seconds", Float, nullable=False),
     Column("created", String(32), nullable=False),
     Column("manifest", JSON, nullable=False),
+    # Project whose job it was made for first.
+    Column("charged", String(32), nullable=False, server_default=""),
     Index("shards_newest", "created", "id"),
     Index("shards_by_kind", "kind", "created", "id"),
     # These hold all that sums over shards need: a row itself is as long as its manifest.
     Index("shards_sums", "kind", "hand", "object", "count", "valid", "tried", "size_bytes"),
     Index("shards_of_task", "id", "count", "valid", "tried", "audited", "audit_held"),
     Index("shards_made", "created", "kind", "count", "valid", "seconds"),
+    Index("shards_charged", "created", "charged", "kind", "device", "count", "valid", "seconds", "size_bytes"),
 )
 
 #: Metrics by which grasps are bounded and sorted.
@@ -168,6 +186,8 @@ assets: Final = Table(
     Column("created", String(32), nullable=False),
     Column("builtin", Boolean, nullable=False),
     Column("owner", String(64), nullable=False, server_default=""),
+    Column("project", String(32), nullable=False, server_default=""),
+    Column("shared", Boolean, nullable=False, server_default=false()),
     Column("verdict", String(8)),
     Column("message", Text),
     Column("repairs", JSON, nullable=False),
@@ -195,6 +215,19 @@ workers: Final = Table(
     Column("reason", String(300), nullable=False, server_default=""),
 )
 
+#: What shards that are gone had cost, a row for each project, day and device: what is deleted was used all the same.
+spent: Final = Table(
+    "spent",
+    metadata,
+    Column("project", String(32), primary_key=True),
+    Column("day", String(10), primary_key=True),
+    Column("device", String(64), primary_key=True),
+    Column("grasps", BigInteger, nullable=False),
+    Column("valid", BigInteger, nullable=False),
+    Column("tasks", BigInteger, nullable=False),
+    Column("seconds", Float, nullable=False),
+)
+
 notes: Final = Table(
     "notes", metadata, Column("name", String(64), primary_key=True), Column("value", JSON, nullable=False)
 )
@@ -210,6 +243,6 @@ damage: Final = Table(
 
 #: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
 LIVE_COLUMNS: Final = frozenset(
-    {"queued", "not_before", "progress_done", "progress_total", "progress_message", "applied", "planned"}
+    {"queued", "not_before", "progress_done", "progress_total", "progress_message", "applied", "planned", "charged"}
 )
-LIVE_TABLES: Final = frozenset({"workers", "notes", "damage"})
+LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent"})

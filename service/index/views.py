@@ -48,6 +48,7 @@ class JobView(View):
     object_digest: str
     created: str
     owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")
     finished: str | None
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
@@ -168,6 +169,8 @@ class AssetView(View):
     created: str
     builtin: bool
     owner: str = Field("", description="id of the key that uploaded it; empty: none, or not known")
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    shared: bool = Field(False, description="whether every project may use it")
     verdict: str | None = Field(description="accept, repair or refuse; None: the check is still to come")
     message: str | None
     repairs: list[str]
@@ -222,6 +225,18 @@ class Throughput(View):
     valid: int
     tasks: int
     seconds: float
+
+
+class UsageDay(View):
+    """What a project used on a day: the tasks that ended then, counted for the project that asked for them first."""
+
+    project: str = Field(description="empty: the one without a name")
+    day: str = Field(description="from midnight to midnight UTC")
+    grasps: int
+    valid: int
+    tasks: int
+    gpu_seconds: float = Field(description="time that GPU workers spent on them [s]")
+    cpu_seconds: float = Field(description="time that CPU workers spent on them [s]")
 
 
 class MatrixCell(View):

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from service.model.clock import timestamp
 from service.model.digests import digest_json
 from service.model.domain import AUTO, Digest, JobOptions, JobRequest, Lane, Name
+from service.model.projects import Project
 from service.model.records import JobRecord, Record
 
 
@@ -52,6 +53,7 @@ class DatasetRecord(Record):
     fidelities: tuple[str, ...] = ()
     created: str
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
+    project: Project = Field("", description="project of that key; empty: the one without a name")
 
     @model_validator(mode="after")
     def _a_job_a_cell(self) -> DatasetRecord:
@@ -116,6 +118,8 @@ class ObjectSet(Record):
     created: str
     owner: str = ""
     """Id of the key that made the set; empty: none, or not known."""
+    project: Project = ""
+    """Project of that key; empty: the one without a name."""
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
@@ -124,11 +128,12 @@ def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> 
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
-def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "") -> JobRecord:
+def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
     """The job of a cell as it was planned when the dataset was created. Jobs of datasets go in bulk.
 
     Args:
         owner: whose dataset it is.
+        project: project of the dataset.
     """
     return JobRecord(
         id=cell.job_id,
@@ -139,12 +144,20 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
         lane=Lane.BULK,
         created=timestamp(),
         owner=owner,
+        project=project,
     )
 
 
-def object_set_of(name: str, objects: Iterable[str], *, after: str = "", owner: str = "") -> ObjectSet:
+def object_set_of(
+    name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
+) -> ObjectSet:
     """The version of a set that follows the one with digest `after`; the order of the objects does not matter."""
     members = tuple(sorted(set(objects)))
     return ObjectSet(
-        name=name, digest=digest_json([after, *members]), objects=members, created=timestamp(), owner=owner
+        name=name,
+        digest=digest_json([after, *members]),
+        objects=members,
+        created=timestamp(),
+        owner=owner,
+        project=project,
     )

@@ -113,13 +113,14 @@ def _judgement(request: JobRequest, batch: int) -> dict[str, object]:
     return found
 
 
-def job_id(request: JobRequest, hand_digest: str, object_digest: str) -> str:
-    """Address of a job: the same request on the same hand and object is the same job."""
+def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
+    """Address of a job: the same request on the same hand and object in the same project is the same job."""
     return digest_json(
         {
             "request": request.model_dump(mode="json"),
             "hand": hand_digest,
             "object": object_digest,
             "revisions": STAGE_REVISIONS,
+            **({"project": project} if project else {}),
         }
     )

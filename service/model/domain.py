@@ -16,6 +16,7 @@ from service.model.diversity import MIN_DISTANCE_M
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
 from service.model.labels import Word as Word
+from service.model.projects import Project
 from service.model.robust import MODELS, MOST_MODELS
 from service.model.scene_options import (
     BesideOption,
@@ -390,6 +391,8 @@ class Asset(Model):
     created: str = Field(description="RFC 3339, UTC")
     builtin: bool = False
     owner: str = Field("", max_length=64, description="id of the API key that uploaded it; empty: none, or not known")
+    project: Project = Field("", description="project of that key; empty: the one without a name")
+    shared: bool = Field(False, description="whether every project may use it")
     facts: dict[str, object] = Field(default_factory=dict, description="what ingest measured")
     self_test: bool = Field(False, description="of a hand: whether the check ends with grasps of plain objects")
 

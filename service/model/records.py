@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.model.domain import AssetKind, Digest, JobRequest, Lane, Origin, Stage, check_known
+from service.model.projects import Project
 from service.model.version import STAGE_REVISIONS
 
 
@@ -30,6 +31,7 @@ class JobRecord(Record):
     created: str
     origin: Origin | None = None
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
+    project: Project = Field("", description="project of that key; empty: the one without a name")
 
     @model_validator(mode="before")
     @classmethod

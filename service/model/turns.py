@@ -1,4 +1,5 @@
-"""Whose turn it is: keys share the queue evenly, and so do the jobs of one key, whoever came first or asks for most."""
+"""Whose turn it is: projects, and keys without one, share the queue evenly, and so do the jobs of each, whoever came
+first or asks for most."""
 
 from __future__ import annotations
 
@@ -16,10 +17,16 @@ _REMEMBERED: Final = 100_000
 
 @dataclass(frozen=True)
 class WaitingJob:
-    """A job with tasks that may be queued, and the key that submitted it ("" where there are no keys)."""
+    """A job with tasks that may be queued, and whose share of the queue it takes (see `share_of`)."""
 
     id: str
     key: str
+
+
+def share_of(project: str, key: str) -> str:
+    """Whose share of the queue a job takes: its project's, or without one its key's ("" where there are no keys)."""
+    # No name of a key holds a space.
+    return f"project {project}" if project else key
 
 
 class Turns:

@@ -12,6 +12,7 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.domain import AssetKind
 from service.model.errors import ConflictError, DamagedError, NotFoundError
+from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
 from service.pipeline.backends import Parts
 from service.store.deletions import Deletion
@@ -19,8 +20,12 @@ from service.store.records import put_record, read_record
 from service.store.store import Store
 
 
-def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "") -> None:
+def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
     """Take a hand or object away.
+
+    Args:
+        owner: id of the API key that deletes it.
+        reach: what a refusal may name.
 
     Raises:
         NotFoundError: there is none of that name or digest.
@@ -30,7 +35,9 @@ def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "") -
     if asset.builtin:
         raise ConflictError(f"the {kind.value} {asset.name!r} comes with graspd and cannot be deleted")
     with parts.index.database.writing() as connection:
-        if user := parts.index.removals.user_of_asset(kind, asset.name, asset.digest, within=connection):
+        if user := parts.index.removals.user_of_asset(asset, within=connection):
+            if asset.shared and not reach.everything:
+                user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         _record(parts.store, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner))
         parts.index.removals.remove_asset(kind, asset.digest, within=connection)

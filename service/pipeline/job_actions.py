@@ -18,6 +18,7 @@ from service.model.digests import job_id
 from service.model.domain import AssetKind, JobRequest, Lane, Origin, State, TaskMessage
 from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
 from service.model.planning import lane_of, message_of
+from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
 from service.pipeline import fidelity_choice
 from service.pipeline.backends import Parts
@@ -48,11 +49,14 @@ def submit(parts: Parts, request: JobRequest, *, lane: Lane | None = None) -> tu
     return enter(parts, prepare(parts, request, lane=lane))
 
 
-def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owner: str = "") -> JobRecord:
+def prepare(
+    parts: Parts, request: JobRequest, *, lane: Lane | None = None, owner: str = "", reach: Reach = EVERYTHING
+) -> JobRecord:
     """The job that a request stands for, of a hand and an object that may be used.
 
     Args:
         owner: id of the API key that submits it.
+        reach: which hands and objects it may name, and the project that it belongs to.
 
     Raises:
         NotFoundError: unknown hand, object or neighbour.
@@ -61,14 +65,14 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owne
         ConflictError: the check of one of them is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
-    hand = usable(parts, AssetKind.HAND, request.hand)
-    obj = usable(parts, AssetKind.OBJECT, request.object)
-    request, beside = with_neighbours(parts, request)
+    hand = usable(parts, AssetKind.HAND, request.hand, reach)
+    obj = usable(parts, AssetKind.OBJECT, request.object, reach)
+    request, beside = with_neighbours(parts, request, reach)
     check_scene(request, obj, beside)
     parts.queue.ping()
     request = fidelity_choice.explicit(parts.store, request.model_copy(update={"hand": hand.name, "object": obj.name}))
     return JobRecord(
-        id=job_id(request, hand.digest, obj.digest),
+        id=job_id(request, hand.digest, obj.digest, reach.project),
         request=request,
         hand_digest=hand.digest,
         object_digest=obj.digest,
@@ -76,6 +80,7 @@ def prepare(parts: Parts, request: JobRequest, *, lane: Lane | None = None, owne
         created=timestamp(),
         origin=_present_origin(),
         owner=owner,
+        project=reach.project,
     )
 
 

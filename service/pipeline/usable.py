@@ -8,20 +8,21 @@ from typing import TypeVar
 from service.index.views import AssetView
 from service.model.domain import AssetKind, JobOptions
 from service.model.errors import ConflictError, InputError
+from service.model.projects import EVERYTHING, Reach
 from service.pipeline.backends import Parts
 
 Options = TypeVar("Options", bound=JobOptions)
 
 
-def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
+def usable(parts: Parts, kind: AssetKind, name: str, reach: Reach = EVERYTHING) -> AssetView:
     """A hand or object by name or digest that jobs may use.
 
     Raises:
-        NotFoundError: there is none.
+        NotFoundError: there is none within reach.
         InputError: it was refused when it was checked.
         ConflictError: its check is still running.
     """
-    asset = parts.index.assets.get(kind, name)
+    asset = parts.index.assets.get(kind, name, reach=reach)
     if asset.verdict == "refuse":
         raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
     if asset.verdict is None:
@@ -29,7 +30,7 @@ def usable(parts: Parts, kind: AssetKind, name: str) -> AssetView:
     return asset
 
 
-def with_neighbours(parts: Parts, options: Options) -> tuple[Options, Sequence[AssetView]]:
+def with_neighbours(parts: Parts, options: Options, reach: Reach = EVERYTHING) -> tuple[Options, Sequence[AssetView]]:
     """Options whose neighbours have the digests of the very files that the names stand for, and these neighbours.
 
     A digest that the request says itself, as one that was read from a job does, is kept.
@@ -37,7 +38,7 @@ def with_neighbours(parts: Parts, options: Options) -> tuple[Options, Sequence[A
     Raises:
         what `usable` raises; InputError where a name and a digest are of two objects.
     """
-    beside = [usable(parts, AssetKind.OBJECT, one.digest or one.object) for one in options.beside]
+    beside = [usable(parts, AssetKind.OBJECT, one.digest or one.object, reach) for one in options.beside]
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
             raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")

@@ -42,7 +42,8 @@ def publish_asset(
         InputError: `asset.json` is missing or wrong.
         ConflictError: the same content is known under another name.
     """
-    return record_asset(store, store_files(store, kind, name, files, builtin=builtin, created=created, owner=owner))
+    asset = store_files(store, kind, name, files, builtin=builtin, created=created, said={"owner": owner})
+    return record_asset(store, asset)
 
 
 def store_files(
@@ -53,16 +54,19 @@ def store_files(
     *,
     builtin: bool = False,
     created: str = "",
-    owner: str = "",
-    self_test: bool = False,
+    said: Mapping[str, object] | None = None,
 ) -> Asset:
     """The first half of `publish_asset`: the archive is there, and nothing counts it yet.
+
+    Args:
+        said: further fields of the record: `owner`, `project`, `shared`, `self_test`. Files that their project keeps
+            to itself hold its mark (`service.model.projects.marks_of`).
 
     Raises:
         InputError: `asset.json` is missing or wrong.
     """
     asset = describe(kind, name, files, created=created or timestamp(), builtin=builtin)
-    asset = asset.model_copy(update={"owner": owner, "self_test": self_test})
+    asset = asset.model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         store.put_file(names.asset_files(kind, asset.digest), archive)

@@ -32,6 +32,7 @@ class DatasetChanges:
             "cells": len(record.jobs),
             "created": record.created,
             "owner": record.owner,
+            "project": record.project,
             "cancelled": False,
             "events": 0,
             "applied": 0,
@@ -81,6 +82,7 @@ class DatasetChanges:
     def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
         """A version of a named set of objects."""
         row = {"name": found.name, "digest": found.digest, "objects": list(found.objects), "created": found.created}
+        row |= {"project": found.project}
         with self.database.writing(within) as connection:
             upsert(connection, object_sets, [row])
 

@@ -84,7 +84,9 @@ class Changes:
         return found
 
     def _add_manifests(self, connection: Connection, manifests: Sequence[ShardManifest]) -> dict[str, State]:
-        upsert(connection, shards, [shard_row(manifest) for manifest in manifests])
+        charged = self._askers(connection, [manifest.shard_id for manifest in manifests])
+        rows = [shard_row(manifest) | {"charged": charged.get(manifest.shard_id, "")} for manifest in manifests]
+        upsert(connection, shards, rows, keep=("charged",))
         upsert(connection, grasps, [row for manifest in manifests for row in grasp_rows(manifest)])
         touched: defaultdict[str, set[int]] = defaultdict(set)
         for some in chunks([manifest.shard_id for manifest in manifests]):
@@ -97,6 +99,16 @@ class Changes:
             for job, batch in connection.execute(done):
                 touched[job].add(batch)
         return settle_batches(connection, touched)
+
+    def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
+        """Project of the first job that asked for each shard, where it has one."""
+        found: dict[str, str] = {}
+        for some in chunks(ids):
+            query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
+            query = query.where(tasks.c.shard_id.in_(some)).order_by(jobs.c.created, jobs.c.id)
+            for shard, project in connection.execute(query):
+                found.setdefault(shard, project)
+        return found
 
     def _add_attempt(self, connection: Connection, attempt: AttemptRecord, not_before: float) -> State | None:
         if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:

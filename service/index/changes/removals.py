@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, delete, exists, or_, select
+from sqlalchemy import Connection, delete, exists, insert, or_, select, update
 
 from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
-from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
+from service.index.tables import assets, attempts, grasps, jobs, shards, spent, tasks
+from service.index.views import AssetView
 from service.model.domain import AssetKind, Lane, State
 from service.model.errors import NotFoundError
 
@@ -20,8 +21,9 @@ class Removals:
 
     database: Database
 
-    def user_of_asset(self, kind: AssetKind, name: str, digest: str, *, within: Connection) -> str:
+    def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
         """What needs a hand or object, in a few words; empty if nothing does."""
+        kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
         if job := within.scalar(select(jobs.c.id).where(jobs.c[column] == digest).limit(1)):
             return f"job {job}"
@@ -32,8 +34,10 @@ class Removals:
             if user := _user_of_neighbour(digest, within):
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
-            present = {row["name"]: row["objects"] for row in within.execute(newest).mappings()}
-            if found := next((of for of, objects in present.items() if name in objects), None):
+            rows = {row["name"]: row for row in within.execute(newest).mappings()}
+            # By the same name another project's set means another object, unless this one is shared.
+            near = [row for row in rows.values() if asset.shared or row["project"] == asset.project]
+            if found := next((row["name"] for row in near if asset.name in row["objects"]), None):
                 return f"the set of objects {found!r}"
         return ""
 
@@ -89,9 +93,25 @@ class Removals:
         """A shard with its grasps, unless a task needs it; whether it may go."""
         if within.scalar(select(tasks.c.id).where(tasks.c.shard_id == shard).limit(1)) is not None:
             return False
+        _remember_cost(shard, within)
         within.execute(delete(grasps).where(grasps.c.shard_id == shard))
         within.execute(delete(shards).where(shards.c.id == shard))
         return True
+
+
+def _remember_cost(shard: str, connection: Connection) -> None:
+    """Add what a shard that goes had cost to what its project spent on that day."""
+    row = connection.execute(select(shards).where(shards.c.id == shard)).mappings().first()
+    if row is None:
+        return
+    key = {"project": row["charged"], "day": row["created"][:10], "device": row["device"]}
+    is_base = row["kind"] == "base"
+    more = {"grasps": row["count"] if is_base else 0, "valid": row["valid"] if is_base else 0}
+    more |= {"tasks": 1, "seconds": row["seconds"]}
+    same = [spent.c[name] == value for name, value in key.items()]
+    sums = {name: spent.c[name] + value for name, value in more.items()}
+    if not connection.execute(update(spent).where(*same).values(**sums)).rowcount:
+        connection.execute(insert(spent).values(**key, **more))
 
 
 def _user_of_neighbour(digest: str, connection: Connection) -> str:

@@ -10,10 +10,12 @@ from sqlalchemy import Connection, and_, case, select, tuple_
 
 from service.index.database import Database, chunks
 from service.index.queries import cursors
+from service.index.reach import nearest_asset, seen_assets
 from service.index.tables import assets
 from service.index.views import AssetView, Page
 from service.model.domain import AssetKind
 from service.model.errors import NotFoundError
+from service.model.projects import EVERYTHING, Reach
 
 
 @dataclass(frozen=True)
@@ -22,10 +24,12 @@ class Assets:
 
     database: Database
 
-    def page(self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None) -> Page[AssetView]:
+    def page(
+        self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, reach: Reach = EVERYTHING
+    ) -> Page[AssetView]:
         """Hands or objects, all versions, newest first."""
         size = cursors.page_size(limit)
-        query = select(assets).where(assets.c.kind == kind.value)
+        query = select(assets).where(assets.c.kind == kind.value, *seen_assets(reach))
         query = query.order_by(assets.c.created.desc(), assets.c.digest.desc()).limit(size + 1)
         if cursor is not None:
             query = query.where(tuple_(assets.c.created, assets.c.digest) < cursors.decode(cursor, str, str))
@@ -35,8 +39,9 @@ class Assets:
         last = views[-1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last.created, last.digest))
 
-    def get(self, kind: AssetKind, name_or_digest: str) -> AssetView:
-        """A hand or object by its digest, or the newest of its name that was not refused.
+    def get(self, kind: AssetKind, name_or_digest: str, *, reach: Reach = EVERYTHING) -> AssetView:
+        """A hand or object by its digest, or the newest of its name that was not refused, those of the reach's own
+        project first.
 
         Raises:
             NotFoundError: there is none; the names that there are follow.
@@ -44,20 +49,28 @@ class Assets:
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
-        query = select(assets).where(named | by_digest)
-        query = query.order_by(refused_last, assets.c.created.desc(), assets.c.digest.desc()).limit(1)
+        query = select(assets).where(named | by_digest, *seen_assets(reach))
+        query = query.order_by(
+            refused_last, nearest_asset(reach), assets.c.created.desc(), assets.c.digest.desc()
+        ).limit(1)
         with self.database.reading() as connection:
             row = connection.execute(query).mappings().first()
             if row is None:
-                known = select(assets.c.name).where(assets.c.kind == kind.value).distinct().order_by(assets.c.name)
+                known = (
+                    select(assets.c.name)
+                    .where(assets.c.kind == kind.value, *seen_assets(reach))
+                    .distinct()
+                    .order_by(assets.c.name)
+                )
                 names = ", ".join(connection.scalars(known.limit(20)))
                 raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}; there are: {names or 'none yet'}")
         return _asset_view(row)
 
-    def sizes(self, kind: AssetKind, wanted: Collection[str]) -> dict[str, int]:
+    def sizes(self, kind: AssetKind, wanted: Collection[str], *, reach: Reach = EVERYTHING) -> dict[str, int]:
         """Bytes of the named hands or objects; those that are not known are left out."""
         names = set(wanted)
-        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value).order_by(assets.c.created)
+        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(reach))
+        query = query.order_by(assets.c.created)
         with self.database.reading() as connection:
             return {name: size for name, size in connection.execute(query) if name in names}
 

@@ -8,9 +8,11 @@ from typing import Final
 from sqlalchemy import select
 
 from service.index.database import Database
+from service.index.reach import seen_shards
 from service.index.tables import shards
 from service.model.domain import JobRequest, Stage
 from service.model.names import SHARD_KINDS
+from service.model.projects import EVERYTHING, Reach
 
 #: Batches looked at of each stage, the newest first: what a machine did long ago says less.
 _NEWEST: Final = 2000
@@ -42,12 +44,12 @@ class Costs:
 
     database: Database
 
-    def of_batches(self, stage: Stage) -> list[BatchCost]:
+    def of_batches(self, stage: Stage, *, reach: Reach = EVERYTHING) -> list[BatchCost]:
         """The newest finished batches of a stage."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.kind == SHARD_KINDS[stage])
+            .where(shards.c.kind == SHARD_KINDS[stage], *seen_shards(reach, shards.c.id))
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(_NEWEST)
         )

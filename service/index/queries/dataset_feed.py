@@ -25,6 +25,7 @@ class DatasetWork:
     events: int
     applied: int
     owner: str
+    project: str
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class DatasetFeed:
                     row["events"],
                     row["applied"],
                     row["owner"],
+                    row["project"],
                 )
                 for row in connection.execute(query).mappings()
             ]

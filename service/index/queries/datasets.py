@@ -13,12 +13,14 @@ from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets
 from service.index.dataset_views import CellView, DatasetView, SnapshotView
 from service.index.queries import cursors
+from service.index.reach import seen_datasets
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import Page
 from service.model.dataset_records import SnapshotShard
 from service.model.domain import BATCH_SIZE, JobOptions, Stage, State
 from service.model.errors import NotFoundError
 from service.model.planning import job_state, stages_of
+from service.model.projects import EVERYTHING, Reach
 
 _SHARE: Final[ColumnElement[float]] = case(
     (tasks.c.state == State.SUCCEEDED.value, 1.0),
@@ -34,10 +36,11 @@ class Datasets:
 
     database: Database
 
-    def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
+    def page(self, *, limit: int = 50, cursor: str | None = None, reach: Reach = EVERYTHING) -> Page[DatasetView]:
         """Datasets, newest first."""
         size = cursors.page_size(limit)
-        query = select(datasets).order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
+        query = select(datasets).where(*seen_datasets(reach))
+        query = query.order_by(datasets.c.created.desc(), datasets.c.name.desc()).limit(size + 1)
         if cursor is not None:
             query = query.where(tuple_(datasets.c.created, datasets.c.name) < cursors.decode(cursor, str, str))
         with self.database.reading() as connection:
@@ -46,10 +49,10 @@ class Datasets:
         last = views[-1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last.created, last.name))
 
-    def get(self, name: str) -> DatasetView:
+    def get(self, name: str, *, reach: Reach = EVERYTHING) -> DatasetView:
         """A dataset; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            return _dataset_view(connection, _dataset_row(connection, name))
+            return _dataset_view(connection, _dataset_row(connection, name, reach))
 
     def unfinished(self, names: Collection[str]) -> set[str]:
         """Of these names, those of a dataset that has not ended."""
@@ -59,12 +62,18 @@ class Datasets:
             return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
     def cells(
-        self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
+        self,
+        name: str,
+        *,
+        state: State | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+        reach: Reach = EVERYTHING,
     ) -> Page[CellView]:
         """Cells of a dataset by their position."""
         size = cursors.page_size(limit)
         with self.database.reading() as connection:
-            dataset = _dataset_row(connection, name)
+            dataset = _dataset_row(connection, name, reach)
             now = _cell_state(dataset["cancelled"])
             query = (
                 select(dataset_cells, now.label("state"), jobs.c.id.is_not(None).label("planned"), jobs.c.reason)
@@ -95,7 +104,9 @@ class Datasets:
             rows = connection.execute(query).mappings().all()
         return [SnapshotShard(**row) for row in rows]
 
-    def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
+    def snapshots(
+        self, name: str, *, limit: int = 50, cursor: str | None = None, reach: Reach = EVERYTHING
+    ) -> Page[SnapshotView]:
         """Snapshots of a dataset, newest first."""
         size = cursors.page_size(limit)
         key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
@@ -104,16 +115,17 @@ class Datasets:
         if cursor is not None:
             query = query.where(tuple_(*key) < cursors.decode(cursor, str, str))
         with self.database.reading() as connection:
-            _dataset_row(connection, name)
+            _dataset_row(connection, name, reach)
             views = [SnapshotView(**row) for row in connection.execute(query).mappings()]
         last = views[size - 1] if len(views) > size else None
         return Page(items=views[:size], next=last and cursors.encode(last.created, last.digest))
 
 
-def _dataset_row(connection: Connection, name: str) -> Any:
-    row = connection.execute(select(datasets).where(datasets.c.name == name)).mappings().first()
+def _dataset_row(connection: Connection, name: str, reach: Reach = EVERYTHING) -> Any:
+    query = select(datasets).where(datasets.c.name == name, *seen_datasets(reach))
+    row = connection.execute(query).mappings().first()
     if row is None:
-        known = select(datasets.c.name).order_by(datasets.c.created.desc()).limit(20)
+        known = select(datasets.c.name).where(*seen_datasets(reach)).order_by(datasets.c.created.desc()).limit(20)
         names = ", ".join(connection.scalars(known))
         raise NotFoundError(f"there is no dataset {name!r}; there are: {names or 'none yet'}")
     return row
@@ -136,7 +148,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     left = tasks_asked - work["share"]
     pace = made["seconds"] / work["done"] if work["done"] else None
     return DatasetView(
-        **{name: row[name] for name in ("name", "digest", "cells", "created", "owner", "cancelled")},
+        **{name: row[name] for name in ("name", "digest", "cells", "created", "owner", "project", "cancelled")},
         hands=[member["name"] for member in row["hands"]],
         objects=[member["name"] for member in row["objects"]],
         options=options,

@@ -14,7 +14,7 @@ from service.index.tables import assets, jobs, tasks
 from service.model.domain import AssetKind, Lane, Stage, State
 from service.model.planning import MAX_BACKOFF_S, PlannedTask
 from service.model.records import JobRecord
-from service.model.turns import Turns, WaitingJob, interleave
+from service.model.turns import Turns, WaitingJob, interleave, share_of
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,16 @@ class Feed:
         due = _due(tasks.c.not_before, now)
         waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
         query = (
-            select(jobs.c.id, jobs.c.origin)
+            select(jobs.c.id, jobs.c.origin, jobs.c.project)
             .where(jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.lane == lane.value, waiting)
             .order_by(jobs.c.created, jobs.c.id)
         )
         with self.database.reading() as connection:
-            return [WaitingJob(job, (origin or {}).get("key", "")) for job, origin in connection.execute(query)]
+            rows = connection.execute(query).all()
+        return [WaitingJob(row.id, share_of(row.project, (row.origin or {}).get("key", ""))) for row in rows]
 
     def ready_tasks(self, lane: Lane, turns: Turns, *, now: float, limit: int) -> list[ReadyTask]:
-        """At most `limit` tasks to be queued: in turn those of each key, and of each job of a key."""
+        """At most `limit` tasks to be queued: in turn those of each project or key, and of each job of it."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
         for job, share in turns.order(self.waiting_jobs(lane, now=now), limit):
             of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])

@@ -19,7 +19,7 @@ from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquer
 from sqlalchemy.sql.operators import in_op, is_
 
 from service.index.filters import GraspFilter, GraspSort
-from service.index.tables import grasps, shards, tasks
+from service.index.tables import grasps, jobs, shards, tasks
 from service.model.domain import Stage
 
 #: So many rows are fetched by an index and sorted in less time than all of a million are read.
@@ -56,6 +56,12 @@ def conditions(where: GraspFilter | None) -> list[Condition]:
     if where.job is not None:
         of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
         found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
+    if where.project is not None:
+        found.append(
+            Condition(
+                "project", grasps.c.shard_id, in_op, _of_project(where.project).with_only_columns(tasks.c.shard_id)
+            )
+        )
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
@@ -165,6 +171,8 @@ def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequ
         query = select(func.sum(tasks.c.count)).where(
             tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value
         )
+    elif group == "project":
+        query = _of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
     elif group == "pair":
         pair = {"hand": where.hand, "object": where.object}
         tests = [shards.c[name] == value for name, value in pair.items() if value is not None]
@@ -173,6 +181,12 @@ def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequ
         some = select(grasps.c[group]).where(*(c.sql(None) for c in wanted if c.group == group))
         return _count(connection, some.limit(SORTED_AT_ONCE + 1).subquery())
     return int(connection.scalar(query) or 0)
+
+
+def _of_project(project: str) -> Select[Any]:
+    """Tasks that make grasps for the jobs of a project."""
+    joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
+    return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
 
 
 def _count(connection: Connection, rows: Subquery) -> int:

@@ -10,9 +10,11 @@ from service.index.database import Database
 from service.index.filters import GraspFilter, GraspSort
 from service.index.queries import cursors
 from service.index.queries.grasp_search import search
+from service.index.reach import seen_shards
 from service.index.tables import grasps
 from service.index.views import GraspView, Page
 from service.model.errors import NotFoundError
+from service.model.projects import EVERYTHING, Reach
 
 _BEST_FIRST = GraspSort()
 
@@ -40,9 +42,10 @@ class Grasps:
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last[sort.by], last["shard_id"], last["row"]))
 
-    def get(self, shard_id: str, row: int) -> GraspView:
+    def get(self, shard_id: str, row: int, *, reach: Reach = EVERYTHING) -> GraspView:
         """One grasp by its shard and row; NotFoundError if there is none."""
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
+        query = query.where(*seen_shards(reach, grasps.c.shard_id))
         with self.database.reading() as connection:
             found = connection.execute(query).mappings().first()
         if found is None:

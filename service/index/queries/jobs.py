@@ -9,12 +9,14 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, select, tuple_
 
-from service.index.database import Database
+from service.index.database import Database, chunks
 from service.index.queries import cursors
+from service.index.reach import seen_jobs, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
 from service.model.domain import Stage, State
 from service.model.errors import NotFoundError
+from service.model.projects import EVERYTHING, Reach
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,11 @@ class Jobs:
         object: str | None = None,
         limit: int = 50,
         cursor: str | None = None,
+        reach: Reach = EVERYTHING,
     ) -> Page[JobView]:
         """Jobs, newest first."""
         size = cursors.page_size(limit)
-        query = select(jobs).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
+        query = select(jobs).where(*seen_jobs(reach)).order_by(jobs.c.created.desc(), jobs.c.id.desc()).limit(size + 1)
         for column, wanted in ((jobs.c.state, state), (jobs.c.hand, hand), (jobs.c.object, object)):
             if wanted is not None:
                 query = query.where(column == wanted)
@@ -46,10 +49,10 @@ class Jobs:
         last = cursors.encode(views[-1].created, views[-1].id) if len(rows) > size else None
         return Page(items=views, next=last)
 
-    def get(self, job_id: str) -> JobView:
+    def get(self, job_id: str, *, reach: Reach = EVERYTHING) -> JobView:
         """A job with its progress; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            rows = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().all()
+            rows = connection.execute(select(jobs).where(jobs.c.id == job_id, *seen_jobs(reach))).mappings().all()
             if not rows:
                 raise NotFoundError(f"there is no job {job_id!r}")
             return _job_views(connection, rows)[0]
@@ -87,13 +90,23 @@ class Jobs:
         last = rows[size - 1] if len(rows) > size else None
         return Page(items=views, next=last and cursors.encode(last["job_id"], last["batch"], last["position"]))
 
-    def task(self, task_id: str) -> TaskView:
+    def task(self, task_id: str, *, reach: Reach = EVERYTHING) -> TaskView:
         """A task; NotFoundError if there is none."""
         with self.database.reading() as connection:
-            row = connection.execute(select(tasks).where(tasks.c.id == task_id)).mappings().first()
+            row = connection.execute(select(tasks).where(tasks.c.id == task_id, *seen_tasks(reach))).mappings().first()
         if row is None:
             raise NotFoundError(f"there is no task {task_id!r}")
         return _task_view(row)
+
+    def out_of_reach(self, task_ids: Collection[str], reach: Reach) -> set[str]:
+        """Of these tasks, those of jobs that are not within reach."""
+        query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != reach.project)
+        with self.database.reading() as connection:
+            return {
+                task
+                for some in chunks(list(task_ids))
+                for task in connection.scalars(query.where(tasks.c.id.in_(some)))
+            }
 
     def attempts(self, *, job: str | None = None, task: str | None = None, limit: int = 50) -> list[AttemptView]:
         """Failed attempts of a job or a task, newest first."""

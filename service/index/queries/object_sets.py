@@ -9,7 +9,9 @@ from sqlalchemy import select
 from service.index.database import Database
 from service.index.dataset_tables import object_sets
 from service.index.dataset_views import ObjectSetView
+from service.index.reach import seen_sets
 from service.model.errors import NotFoundError
+from service.model.projects import EVERYTHING, Reach
 
 
 @dataclass(frozen=True)
@@ -18,16 +20,17 @@ class ObjectSets:
 
     database: Database
 
-    def newest(self) -> list[ObjectSetView]:
+    def newest(self, *, reach: Reach = EVERYTHING) -> list[ObjectSetView]:
         """The newest version of each set of objects, by name."""
-        query = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
+        query = select(object_sets).where(*seen_sets(reach))
+        query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         with self.database.reading() as connection:
             newest = {row["name"]: ObjectSetView(**row) for row in connection.execute(query).mappings()}
         return list(newest.values())
 
-    def get(self, name: str) -> ObjectSetView:
+    def get(self, name: str, *, reach: Reach = EVERYTHING) -> ObjectSetView:
         """The newest version of a set of objects; NotFoundError if there is none of that name."""
-        found = {view.name: view for view in self.newest()}
+        found = {view.name: view for view in self.newest(reach=reach)}
         if name not in found:
             known = ", ".join(list(found)[:20]) or "none yet"
             raise NotFoundError(f"there is no set of objects {name!r}; there are: {known}")

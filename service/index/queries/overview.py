@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from sqlalchemy import and_, case, func, select
+from sqlalchemy import ColumnElement, Select, and_, case, func, select
 
 from service.index.database import Database
 from service.index.queries import cursors
+from service.index.reach import seen_attempts, seen_jobs, seen_shards, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks, workers
 from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, WorkerView
 from service.model.domain import State
+from service.model.projects import EVERYTHING, Reach
 
 
 @dataclass(frozen=True)
@@ -29,16 +31,17 @@ class Overview:
             rows = connection.execute(query).mappings().all()
         return [WorkerView(**row) for row in rows]
 
-    def stats(self) -> Stats:
-        """The whole service in a few numbers."""
+    def stats(self, *, reach: Reach = EVERYTHING) -> Stats:
+        """All that is within reach in a few numbers."""
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
+        seen = seen_shards(reach, shards.c.id)
         with self.database.reading() as connection:
-            of_jobs = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
-            of_tasks = connection.execute(select(tasks.c.state, func.count()).group_by(tasks.c.state)).all()
+            of_jobs = connection.execute(_counted(jobs.c.state, *seen_jobs(reach))).all()
+            of_tasks = connection.execute(_counted(tasks.c.state, *seen_tasks(reach))).all()
             of_shards = {
                 kind: tuple(map(int, row))
-                for kind, *row in connection.execute(select(shards.c.kind, *sums).group_by(shards.c.kind))
+                for kind, *row in connection.execute(select(shards.c.kind, *sums).where(*seen).group_by(shards.c.kind))
             }
             living = connection.scalar(alive)
         _, made, valid, tried, _ = of_shards.get("base", (0, 0, 0, 0, 0))
@@ -53,12 +56,13 @@ class Overview:
             workers=int(living or 0),
         )
 
-    def throughput(self, *, since: str, bucket_s: int = 60) -> list[Throughput]:
+    def throughput(self, *, since: str, bucket_s: int = 60, reach: Reach = EVERYTHING) -> list[Throughput]:
         """What was made since a time, in intervals of `bucket_s`; intervals without a shard are left out."""
         # The database adds up by the finest unit of time that divides the interval; what is left is little.
         unit = func.substr(shards.c.created, 1, next(n for s, n in _UNITS if bucket_s % s == 0)).label("unit")
         sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
-        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since).group_by(unit, shards.c.kind)
+        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since, *seen_shards(reach, shards.c.id))
+        query = query.group_by(unit, shards.c.kind)
         made: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
         with self.database.reading() as connection:
             for start, kind, number, count, valid, seconds in connection.execute(query):
@@ -70,9 +74,10 @@ class Overview:
                     bucket["valid"] += int(valid)
         return [Throughput.model_validate({"start": start, **made[start]}) for start in sorted(made)]
 
-    def failures(self, *, limit: int = 20) -> list[FailureGroup]:
+    def failures(self, *, limit: int = 20, reach: Reach = EVERYTHING) -> list[FailureGroup]:
         """Failed attempts by stage and error, the most frequent first."""
         newest = func.max(attempts.c.ended)
+        seen = seen_attempts(reach)
         count = func.count()
         query = (
             select(
@@ -82,15 +87,18 @@ class Overview:
                 func.count(attempts.c.task_id.distinct()),
                 newest.label("seen"),
             )
+            .where(*seen)
             .group_by(attempts.c.stage, attempts.c.kind)
             .order_by(count.desc(), newest.desc())
             .limit(cursors.page_size(limit))
         )
         groups = []
         with self.database.reading() as connection:
-            for stage, kind, number, of_tasks, seen in connection.execute(query).all():
-                same = and_(attempts.c.stage == stage, attempts.c.kind == kind, attempts.c.ended == seen)
-                example = connection.execute(select(attempts.c.reason, attempts.c.task_id).where(same).limit(1)).one()
+            for stage, kind, number, of_tasks, last in connection.execute(query).all():
+                same = and_(attempts.c.stage == stage, attempts.c.kind == kind, attempts.c.ended == last)
+                example = connection.execute(
+                    select(attempts.c.reason, attempts.c.task_id).where(same, *seen).limit(1)
+                ).one()
                 groups.append(
                     FailureGroup(
                         stage=stage,
@@ -99,23 +107,24 @@ class Overview:
                         tasks=of_tasks,
                         example=example.reason,
                         task_id=example.task_id,
-                        last_seen=seen,
+                        last_seen=last,
                     )
                 )
         return groups
 
-    def matrix(self) -> list[MatrixCell]:
+    def matrix(self, *, reach: Reach = EVERYTHING) -> list[MatrixCell]:
         """Jobs, task states and yield of each hand x object."""
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.kind == "base")
+            .where(shards.c.kind == "base", *seen_shards(reach, shards.c.id))
             .group_by(shards.c.hand, shards.c.object)
         )
         cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.database.reading() as connection:
             pairs = {}
-            for job, *pair in connection.execute(select(jobs.c.id, jobs.c.hand, jobs.c.object)):
+            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*seen_jobs(reach))
+            for job, *pair in connection.execute(of_jobs):
                 cell = cells.setdefault((pair[0], pair[1]), dict.fromkeys(_CELL, 0))
                 cell["jobs"] += 1
                 pairs[job] = cell
@@ -133,6 +142,11 @@ _CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "tried
 _UNITS: Final = ((3600, 13), (60, 16), (1, 19))
 _REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
 _MADE = (func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.tried))
+
+
+def _counted(column: ColumnElement[Any], *tests: ColumnElement[bool]) -> Select[Any]:
+    """Rows of each value of a column."""
+    return select(column, func.count()).where(*tests).group_by(column)
 
 
 def _by_state(rows: Any) -> dict[State, int]:

@@ -13,6 +13,7 @@ from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snap
 from service.model.digests import digest_json
 from service.model.domain import AssetKind, JobOptions, State
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from service.model.projects import EVERYTHING, Reach
 from service.model.scene_options import NamedNeighbour, SceneDocument
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
@@ -23,11 +24,14 @@ from service.store.deletions import refuse_pending
 from service.store.records import put_record, read_record
 
 
-def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[DatasetView, bool]:
+def create(
+    parts: Parts, request: DatasetRequest, *, owner: str = "", reach: Reach = EVERYTHING
+) -> tuple[DatasetView, bool]:
     """Record a dataset; the keeper plans its jobs. The same hands, objects and options again are the same dataset.
 
     Args:
         owner: id of the API key that submits it; its jobs get the same.
+        reach: which hands and objects it may name, and the project that it and its jobs belong to.
 
     Returns:
         the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
@@ -39,16 +43,19 @@ def create(parts: Parts, request: DatasetRequest, *, owner: str = "") -> tuple[D
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
-    hands, objects = members(parts, request)
-    shared, beside = with_neighbours(parts, request.shared)
+    hands, objects = members(parts, request, reach)
+    shared, beside = with_neighbours(parts, request.shared, reach)
     parts.queue.ping()
     key = names.dataset_record(request.name)
     new = False
     # One that is there stays what it is: a later chart changes none of its fidelities.
     if not parts.store.exists(key):
-        found = describe(request.name, hands, objects, shared, Resolver(parts.store), owner)
+        found = describe(request.name, hands, objects, shared, Resolver(parts.store), owner, reach.project)
         new = put_record(parts.store, key, found)
     record = load_dataset(parts.store, request.name)
+    if record.project != reach.project:
+        # Nothing else of it is said: names are of the whole service.
+        raise ConflictError(f"the name {record.name!r} is taken; take another name")
     if not new:
         # Not by the digest: a newer graspd knows more options, whose defaults an older one meant as well.
         other = _difference(record, hands, objects, shared)
@@ -139,49 +146,55 @@ def add_object_set(
     objects: Iterable[str],
     *,
     owner: str = "",
-    may_follow: Callable[[str], None] = lambda owner: None,
+    reach: Reach = EVERYTHING,
+    may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
     """Give objects a name together. The same objects again change nothing; others make a new version.
 
     Args:
         owner: id of the API key that asks; a new version keeps the owner of the set.
-        may_follow: called with the owner of the set before it gets a new version; raises where that is refused.
+        reach: which objects it may name, and the project that a new set belongs to.
+        may_follow: called with owner and project of the set before it gets a new version; raises where that is refused.
 
     Raises:
         NotFoundError: unknown object.
         InputError: an object was refused when it was checked, or there is none.
         ConflictError: a check is still running.
     """
-    assets = [parts.index.assets.get(AssetKind.OBJECT, one) for one in objects]
+    assets = [parts.index.assets.get(AssetKind.OBJECT, one, reach=reach) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name some")
-    after = ""
+    after, project = "", reach.project
     with contextlib.suppress(NotFoundError):
         present = parts.index.object_sets.get(name)
+        if not reach.sees(present.project):
+            raise ConflictError(f"the name {name!r} is taken; take another name")
         if set(present.objects) == set(wanted):
             return present
         after = present.digest
-        owner = read_record(ObjectSet, parts.store, names.object_set(name, after)).owner
-        may_follow(owner)
-    found = object_set_of(name, wanted, after=after, owner=owner)
+        known = read_record(ObjectSet, parts.store, names.object_set(name, after))
+        owner, project = known.owner, known.project
+        may_follow(owner, project)
+    found = object_set_of(name, wanted, after=after, owner=owner, project=project)
     put_record(parts.store, names.object_set(name, found.digest), found)
     parts.index.write_dataset.add_object_set(found)
     return parts.index.object_sets.get(name)
 
 
-def members(parts: Parts, matrix: Matrix) -> tuple[list[Member], list[Member]]:
+def members(parts: Parts, matrix: Matrix, reach: Reach = EVERYTHING) -> tuple[list[Member], list[Member]]:
     """Hands and objects of a matrix as they are now, sets spelled out; errors as in `create`."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
-        objects |= dict.fromkeys(parts.index.object_sets.get(name).objects)
+        objects |= dict.fromkeys(parts.index.object_sets.get(name, reach=reach).objects)
     if len(matrix.hands) * len(objects) > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
-    return _members(parts, AssetKind.HAND, matrix.hands), _members(parts, AssetKind.OBJECT, objects)
+    hands = _members(parts, AssetKind.HAND, matrix.hands, reach)
+    return hands, _members(parts, AssetKind.OBJECT, objects, reach)
 
 
-def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str]) -> list[Member]:
-    assets = [usable(parts, kind, name) for name in wanted]
+def _members(parts: Parts, kind: AssetKind, wanted: Iterable[str], reach: Reach) -> list[Member]:
+    assets = [usable(parts, kind, name, reach) for name in wanted]
     found = [Member(name=asset.name, digest=asset.digest) for asset in assets]
     return list(dict.fromkeys(found))
 

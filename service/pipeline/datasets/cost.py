@@ -14,6 +14,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from service.index.index import Index
@@ -22,6 +23,7 @@ from service.model.dataset_records import request_of
 from service.model.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
 from service.model.errors import LimitError
 from service.model.planning import stages_of
+from service.model.projects import EVERYTHING, Reach
 from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from service.pipeline.datasets.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix
@@ -58,12 +60,14 @@ def estimate(
     resolve: Callable[[JobRequest], JobRequest] = _explicit,
     *,
     costs: Batches | None = None,
+    reach: Reach = EVERYTHING,
 ) -> Estimate:
     """The cost of a matrix. Hands and objects need not be known yet.
 
     Args:
         resolve: puts a fidelity in the place of `auto`; not needed where there is none.
         costs: gives the finished batches of a stage; None: they are read.
+        reach: which sets of objects the matrix may name, and whose measurements count.
 
     Raises:
         NotFoundError: unknown set.
@@ -72,13 +76,13 @@ def estimate(
     """
     objects = list(matrix.objects)
     for name in matrix.sets:
-        objects += [one for one in index.object_sets.get(name).objects if one not in objects]
+        objects += [one for one in index.object_sets.get(name, reach=reach).objects if one not in objects]
     cells = len(matrix.hands) * len(objects)
     if cells > MAX_CELLS:
         raise LimitError(f"{len(matrix.hands)} hands x {len(objects)} objects is over {MAX_CELLS} cells; split it")
     options = matrix.shared
     devices = {worker.device for worker in index.overview.workers() if worker.state != "lost"}
-    costs = costs or index.costs.of_batches
+    costs = costs or partial(index.costs.of_batches, reach=reach)
     batches = costs(Stage.SYNTHESIZE)
     rates: dict[str, Rates] = {}
     sums = _Sums()
@@ -90,7 +94,7 @@ def estimate(
             sums.machine = rates[chosen.knobs.name].machine
             _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
     later = _later_rates(costs, options, sums.machine)
-    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, _once(objects, options)))
+    return _estimate(options, cells, sums, later, _assets(index, matrix.hands, _once(objects, options), reach))
 
 
 def _once(objects: list[str], options: JobOptions) -> list[str]:
@@ -196,10 +200,10 @@ def _pictures(options: JobOptions) -> int:
     return options.scenes * options.views * (2 if options.stereo else 1)
 
 
-def _assets(index: Index, hands: Sequence[str], objects: Sequence[str]) -> tuple[float, list[str]]:
+def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], reach: Reach) -> tuple[float, list[str]]:
     """Bytes of hand and object over all cells; names that are not known."""
-    of_hands = index.assets.sizes(AssetKind.HAND, hands)
-    of_objects = index.assets.sizes(AssetKind.OBJECT, objects)
+    of_hands = index.assets.sizes(AssetKind.HAND, hands, reach=reach)
+    of_objects = index.assets.sizes(AssetKind.OBJECT, objects, reach=reach)
     unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]
     hand_bytes = sum(of_hands.get(name, _ASSET_BYTES) for name in hands) * len(objects)
     object_bytes = sum(of_objects.get(name, _ASSET_BYTES) for name in objects) * len(hands)

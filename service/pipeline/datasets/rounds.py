@@ -54,7 +54,7 @@ class DatasetRounds:
                 if self._clock() > deadline:
                     return False
                 job_actions.enter(
-                    self._parts, job_of(cell, work.options, work.revisions, work.owner), keeps_assets=True
+                    self._parts, job_of(cell, work.options, work.revisions, work.owner, work.project), keeps_assets=True
                 )
                 after = cell.position
             if not cells:

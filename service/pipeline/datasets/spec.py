@@ -59,7 +59,7 @@ class DatasetRequest(Matrix):
 
 def describe(
     name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions,
-    resolve: Callable[[JobRequest], JobRequest], owner: str = "",
+    resolve: Callable[[JobRequest], JobRequest], owner: str = "", project: str = "",
 ) -> DatasetRecord:  # fmt: skip
     """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
     name.
@@ -67,6 +67,7 @@ def describe(
     Args:
         resolve: puts a fidelity in the place of `auto`.
         owner: id of the API key that submits it; no part of the digest.
+        project: project of that key; its jobs belong to it.
 
     Raises:
         InputError: no fidelity meets the target on one of the cells.
@@ -87,10 +88,11 @@ def describe(
         objects=tuple(objects),
         options=options,
         revisions=dict(STAGE_REVISIONS),
-        jobs=tuple(job_id(request, hand.digest, obj.digest) for hand, obj, request in cells),
+        jobs=tuple(job_id(request, hand.digest, obj.digest, project) for hand, obj, request in cells),
         fidelities=fidelities,
         created=timestamp(),
         owner=owner,
+        project=project,
     )
 
 

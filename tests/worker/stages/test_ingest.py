@@ -89,7 +89,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
     files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
     untried = run(context.store, context, files, AssetKind.HAND)
     assert not tried and "self_test" not in untried["facts"]  # type: ignore[operator]
-    asset = store_files(context.store, AssetKind.HAND, "mine", {**files, "note.txt": b"x"}, self_test=True)
+    asset = store_files(context.store, AssetKind.HAND, "mine", {**files, "note.txt": b"x"}, said={"self_test": True})
     record_asset(context.store, asset)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
     ingest.run(message, context)
@@ -106,7 +106,7 @@ def test_a_hand_that_finds_no_grasp_is_taken_and_says_why(
 
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
     files = {"asset.json": b'{"file": "gripper.urdf"}', "gripper.urdf": gripper_urdf()}
-    asset = store_files(context.store, AssetKind.HAND, "mine", files, self_test=True)
+    asset = store_files(context.store, AssetKind.HAND, "mine", files, said={"self_test": True})
     record_asset(context.store, asset)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=asset.digest)
     ingest.run(message, context)

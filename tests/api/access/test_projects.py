@@ -1,0 +1,348 @@
+"""What a key of one project sees of another's: nothing, by any route. Each route of the application is walked, so one
+that is added later and forgets to ask fails here."""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.routing import APIRoute
+from starlette.testclient import TestClient
+
+from api.access.keys import Key, KeyFile, Scope
+from api.app import create_app
+from service.index.index import Index
+from service.index.rebuild import differences, rebuild
+from service.model import names
+from service.model.domain import AssetKind
+from service.model.errors import InputError
+from service.model.planning import plan
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.settings import Settings
+from service.store.records import read_record
+from service.store.store import open_store
+from tests.api.factories import add_worker, fail, finish_all
+from tests.memory_queue import MemoryQueue
+
+Headers = dict[str, str]
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32, "scenes": 1, "views": 1, "seed": 77}
+_BALL = b"solid ball\nendsolid ball\n"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator[World]:
+    """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data")
+    shutil.copytree(furnished, settings.data_dir)
+    parts = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
+    keys = KeyFile(settings.resolved_keys_file)
+    made = {
+        "ann": (Scope.SUBMIT, "red"),
+        "amy": (Scope.SUBMIT, "red"),
+        "bob": (Scope.SUBMIT, "blue"),
+        "eve": (Scope.READ, "blue"),
+        "old": (Scope.SUBMIT, ""),
+        "root": (Scope.ADMIN, ""),
+    }
+    people = {
+        name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
+        for name, (scope, project) in made.items()
+    }
+    with TestClient(create_app(settings, parts), base_url="https://graspd.example", follow_redirects=False) as client:
+        yield World(client, parts, people)
+    parts.close()
+
+
+@dataclass
+class World:
+    client: TestClient
+    parts: Parts
+    people: dict[str, Headers]
+    said: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        ann = self.people["ann"]
+        job = self.post("/v1/jobs", ann, json=JOB).json()["id"]
+        record = read_record(JobRecord, self.parts.store, names.job_record(job))
+        finish_all(self.parts, record)
+        shard = next(task.output for task in plan(record))
+        views = [task.output for task in plan(record)][-1]
+        failed = self.post("/v1/jobs", ann, json=JOB | {"seed": 78}).json()["id"]
+        fail(self.parts, read_record(JobRecord, self.parts.store, names.job_record(failed)), "red-secret broke")
+        waiting = self.post("/v1/jobs", ann, json=JOB | {"seed": 79}).json()["id"]
+        for kind, name in (("objects", "red-secret-ball"), ("hands", "red-secret-hand")):
+            file = ("ball.stl", _BALL) if kind == "objects" else ("hand.urdf", _URDF)
+            added = self.post(f"/v1/{kind}", ann, data={"name": name}, files={"file": file})
+            assert added.status_code == 202, added.text
+            self.said[f"{kind}_digest"] = added.json()["digest"]
+        self.post("/v1/object-sets", ann, json={"name": "red-secret-set", "objects": ["red-secret-ball", "mug"]})
+        matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
+        self.post("/v1/datasets", ann, json=matrix | {"scenes": 1, "views": 1, "seed": 77})
+        while DatasetRounds(self.parts).advance(10):
+            pass
+        snapshot = self.post("/v1/datasets/red-secret-data/snapshots", ann).json()["digest"]
+        add_worker(self.parts)
+        self.said |= {
+            "job_id": job, "failed": failed, "waiting": waiting, "shard_id": shard, "views": views,
+            "digest": snapshot,
+        }  # fmt: skip
+
+    def post(self, path: str, headers: Headers, **content: Any) -> Any:
+        return self.client.post(path, headers=headers, **content)
+
+    @property
+    def secrets(self) -> list[str]:
+        """What none but the project and an admin may read."""
+        named = [f"red-secret-{what}" for what in ("hand", "ball", "data", "set")]
+        return [*named, "red-secret broke", *self.said.values()]
+
+
+_URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="j" type="revolute"><parent link="base"/>
+<child link="tip"/><axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+#: For each parameter of a path: what of the project it may name.
+_VALUES = {
+    "job_id": ("job_id", "failed", "waiting"),
+    "shard_id": ("shard_id", "views"),
+    "digest": ("digest",),
+    "row": ("0",),
+    "number": ("0",),
+    "index": ("0",),
+    "channel": ("rgb",),
+    "slug": ("not-found",),
+    "action": ("cancel", "retry", "snapshot", "delete"),
+}
+_NAMES = {
+    "hands": ("red-secret-hand", "hands_digest"),
+    "objects": ("red-secret-ball", "objects_digest"),
+    "datasets": ("red-secret-data",),
+    "object-sets": ("red-secret-set",),
+}
+
+
+def _routes(world: World) -> list[tuple[str, str]]:
+    return sorted(
+        (method, route.path)
+        for route in world.client.app.routes  # type: ignore[attr-defined]
+        if isinstance(route, APIRoute)
+        for method in route.methods
+    )
+
+
+def _addresses(world: World, template: str) -> Iterator[str]:
+    """A route's addresses with everything of the project that could stand in them."""
+    parameter = re.search(r"{(\w+)(:\w+)?}", template)
+    if parameter is None:
+        yield template
+        return
+    name = parameter[1]
+    if name == "name":
+        section = next(part for part in template.split("/") if part in _NAMES)
+        values = _NAMES[section]
+    else:
+        assert name in _VALUES, f"say in this test what of a project {{{name}}} in {template} may name"
+        values = _VALUES[name]
+    for value in values:
+        filled = template[: parameter.start()] + world.said.get(value, value) + template[parameter.end() :]
+        yield from _addresses(world, filled)
+
+
+def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
+    """What may be sent there: nothing; or documents and forms that name things of the project."""
+    if method in ("GET", "HEAD", "DELETE"):
+        is_list = address.endswith(("/grasps", "/shards"))
+        return [{}, {"params": {"job": world.said["job_id"]}}] if is_list else [{}]
+    options = {"grasps": "32", "fidelity": "draft"}
+    cells = [world.said["job_id"], world.said["waiting"], "allegro|mug", "allegro|red-secret-ball"]
+    documents = [
+        {},
+        {"json": {}},
+        {"json": {"hand": "red-secret-hand", "object": "red-secret-ball"}},
+        {"json": {"hand": "allegro", "object": "mug", "neighbours": ["red-secret-ball"], "scene": "table"}},
+        {"json": {"name": "mine", "hands": ["red-secret-hand"], "objects": ["red-secret-ball"]}},
+        {"json": {"hands": ["allegro"], "objects": [], "sets": ["red-secret-set"], "name": "mine"}},
+        {"json": {"name": "mine", "objects": ["red-secret-ball"]}},
+    ]
+    forms = [
+        {"data": options | {"hand": "red-secret-hand", "object": "red-secret-ball"}},
+        {"data": options | {"hand": "allegro", "object_held": world.said["objects_digest"], "held_units": "mm"}},
+        {"data": options | {"name": "mine", "hands": "red-secret-hand", "objects": "red-secret-ball"}},
+        *({"data": options | {"action": action, "cell": cells}} for action in ("submit", "retry", "cancel")),
+    ]
+    return documents if address.startswith("/v1/") else forms
+
+
+def _leaks(world: World, sent: str, text: str) -> list[str]:
+    """Secrets in an answer that the request did not say itself."""
+    return [secret for secret in world.secrets if secret in text.replace(sent, "") and secret not in sent]
+
+
+@pytest.mark.parametrize("who", ["bob", "eve", "old"])
+def test_no_route_tells_or_changes_anything_of_another_project(world: World, who: str) -> None:
+    before = _state(world)
+    for method, template in _routes(world):
+        # One of them tries everything; of the others it is enough to look.
+        if template in _ENDLESS or (who != "bob" and method != "GET"):
+            continue
+        for address in _addresses(world, template):
+            for content in _bodies(world, method, address):
+                answer = world.client.request(method, address, headers=world.people[who], **content)
+                where = f"{method} {address} {content} -> {answer.status_code}"
+                assert answer.status_code < 500 or template == "/readyz", where
+                if template != address:
+                    # What a path names of another project is not there, whoever asks for it.
+                    assert answer.status_code in _NOT_THERE or template in _OF_EVERYBODY, where
+                sent = address + str(content)
+                assert not (found := _leaks(world, sent, answer.text)), f"{where}: {found}"
+    assert _state(world) == before
+
+
+#: Streams that end with their client; what they say is asked for in a test of its own.
+_ENDLESS = {"/events", "/v1/jobs/{job_id}/events", "/v1/events/stream"}
+_OF_EVERYBODY = {"/problems/{slug}"}
+#: A form may be refused before its address is looked up; a reader may submit nothing.
+_NOT_THERE = (403, 404, 405, 422)
+
+
+def _state(world: World) -> Any:
+    """All that belongs to the project, as an admin sees it."""
+    root = world.people["root"]
+    get = lambda path: world.client.get(path, headers=root).json()  # noqa: E731
+    jobs = {job["id"]: job["state"] for job in get("/v1/jobs?limit=200")["items"] if job["project"] == "red"}
+    data = get("/v1/datasets/red-secret-data")
+    return jobs, data["cancelled"], data["state"], get("/v1/object-sets/red-secret-set")["objects"]
+
+
+def test_the_streams_of_another_project_are_not_there(world: World) -> None:
+    answer = world.client.get(f"/v1/jobs/{world.said['waiting']}/events", headers=world.people["bob"])
+    assert answer.status_code == 404
+
+
+def test_what_is_not_within_reach_is_refused_as_if_it_were_not_there(world: World) -> None:
+    gone = "nothing-of-this-name"
+    for kind, hidden in {
+        "jobs": world.said["waiting"],
+        "datasets": "red-secret-data",
+        "objects": "red-secret-ball",
+        "shards": world.said["shard_id"],
+    }.items():
+        path = f"/v1/{kind}/{{}}"
+        answers = [world.client.get(path.format(one), headers=world.people["bob"]) for one in (hidden, gone)]
+        assert [answer.status_code for answer in answers] == [404, 404]
+        details = [
+            answer.json()["detail"].replace(one, "X") for answer, one in zip(answers, (hidden, gone), strict=True)
+        ]
+        assert details[0] == details[1]
+
+
+def test_the_project_itself_and_an_admin_see_all_of_it(world: World) -> None:
+    for who in ("ann", "amy", "root"):
+        get = lambda path, who=who: world.client.get(path, headers=world.people[who])  # noqa: E731
+        jobs = [job["id"] for job in get("/v1/jobs?limit=200").json()["items"]]
+        assert {world.said["job_id"], world.said["waiting"]} <= set(jobs)
+        assert get("/v1/datasets/red-secret-data").status_code == 200
+        assert get("/v1/hands/red-secret-hand").status_code == 200
+        assert get(f"/v1/shards/{world.said['shard_id']}/file").status_code == 200
+        assert get(f"/v1/grasps/{world.said['shard_id']}/0").status_code == 200
+        assert get(f"/v1/grasps?job={world.said['job_id']}").json()["items"]
+
+
+def test_lists_of_a_project_hold_what_is_its_own(world: World) -> None:
+    mine = world.post("/v1/jobs", world.people["bob"], json=JOB | {"seed": 500}).json()["id"]
+    jobs = world.client.get("/v1/jobs", headers=world.people["bob"]).json()["items"]
+    assert mine in [job["id"] for job in jobs] and {job["project"] for job in jobs} == {"blue"}
+    assert world.client.get("/v1/grasps", headers=world.people["old"]).json()["items"] == []
+
+
+def test_the_same_request_of_two_projects_is_two_jobs_whose_shards_are_made_once(world: World) -> None:
+    job = world.post("/v1/jobs", world.people["bob"], json=JOB).json()
+    assert job["id"] != world.said["job_id"] and job["state"] == "succeeded"
+    assert world.said["shard_id"] in [shard["id"] for shard in job["shards"]]
+    assert world.client.get(f"/v1/shards/{world.said['shard_id']}", headers=world.people["bob"]).status_code == 200
+    assert world.client.delete(f"/v1/jobs/{job['id']}", headers=world.people["bob"]).status_code == 204
+    assert world.client.get(f"/v1/shards/{world.said['shard_id']}", headers=world.people["bob"]).status_code == 404
+
+
+def test_keys_of_a_project_act_for_each_other(world: World) -> None:
+    job = world.post("/v1/jobs", world.people["ann"], json=JOB | {"seed": 80}).json()["id"]
+    assert world.post(f"/v1/jobs/{job}/cancel", world.people["amy"]).status_code == 202
+
+
+def test_the_same_file_of_two_projects_is_two_objects(world: World) -> None:
+    file = {"file": ("ball.stl", _BALL)}
+    own = world.post("/v1/objects", world.people["bob"], data={"name": "red-secret-ball"}, files=file).json()
+    assert own["digest"] != world.said["objects_digest"] and own["project"] == "blue"
+    found = world.client.get("/v1/objects/red-secret-ball", headers=world.people["bob"]).json()
+    assert found["digest"] == own["digest"]
+    assert world.client.delete("/v1/objects/red-secret-ball", headers=world.people["bob"]).status_code == 204
+    assert world.client.get("/v1/objects/red-secret-ball", headers=world.people["ann"]).status_code == 200
+
+
+def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: World) -> None:
+    data = {"name": "common", "shared": "true"}
+    file = {"file": ("common.stl", _BALL.replace(b"ball", b"common"))}
+    made = world.post("/v1/objects", world.people["ann"], data=data, files=file).json()
+    assert made["shared"] is True
+    for who in ("bob", "old"):
+        assert world.client.get("/v1/objects/common", headers=world.people[who]).json()["digest"] == made["digest"]
+    again = world.post("/v1/objects", world.people["bob"], data={"name": "common"}, files=file).json()
+    assert again["digest"] == made["digest"]
+    assert world.client.delete("/v1/objects/common", headers=world.people["bob"]).status_code == 403
+    assert world.client.delete("/v1/objects/common", headers=world.people["amy"]).status_code == 204
+
+
+def test_an_upload_that_brings_the_mark_of_a_project_is_not_that_projects_object(world: World) -> None:
+    made = world.parts.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
+    stored = world.parts.store.get(names.asset_files(AssetKind.OBJECT, made.digest))
+    with zipfile.ZipFile(io.BytesIO(stored)) as archive:
+        assert "graspd-project.txt" in archive.namelist()
+    for said in ({}, {"shared": "true"}):
+        file = {"file": ("ball.zip", stored)}
+        answer = world.post("/v1/objects", world.people["old"], data={"name": "forged"} | said, files=file)
+        assert answer.status_code != 202 or answer.json()["digest"] != made.digest
+        assert world.client.get(f"/v1/objects/{made.digest}", headers=world.people["old"]).status_code == 404
+        world.client.delete("/v1/objects/forged", headers=world.people["old"])
+
+
+def test_a_name_that_another_project_took_is_refused_without_a_word_of_it(world: World) -> None:
+    matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
+    answer = world.post("/v1/datasets", world.people["bob"], json=matrix)
+    assert answer.status_code == 409 and "bottle" not in answer.text and "another dataset" not in answer.text
+    objects = {"name": "red-secret-set", "objects": ["mug"]}
+    assert world.post("/v1/object-sets", world.people["bob"], json=objects).status_code == 409
+
+
+def test_projects_are_in_the_store_and_survive_a_lost_index(world: World) -> None:
+    told = differences(world.parts.index, world.parts.store)
+    assert [line for line in told if "project" in line or "shared" in line] == []
+    fresh = Index("sqlite://")
+    rebuild(fresh, world.parts.store)
+    try:
+        assert fresh.jobs.get(world.said["job_id"]).project == "red"
+        assert fresh.datasets.get("red-secret-data").project == "red"
+        assert fresh.assets.get(AssetKind.HAND, "red-secret-hand").project == "red"
+        assert fresh.object_sets.get("red-secret-set").project == "red"
+        cell = fresh.datasets.cells("red-secret-data").items[0].job_id
+        assert fresh.jobs.get(cell).project == "red"
+    finally:
+        fresh.close()
+
+
+def test_keys_and_records_of_before_there_were_projects_belong_to_the_one_without_a_name() -> None:
+    old = {"name": "ann", "scope": "submit", "sha256": "a" * 64, "created": "2026-01-01T00:00:00Z"}
+    assert Key.model_validate(old).project == ""
+
+
+@pytest.mark.parametrize("project", ["Red", "a b", "../x", "x" * 33, "-a"])
+def test_a_project_has_a_plain_name(tmp_path: Path, project: str) -> None:
+    with pytest.raises(InputError, match="no name of a project"):
+        KeyFile(tmp_path / "keys.json").add("ann", Scope.SUBMIT, project=project)

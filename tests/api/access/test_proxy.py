@@ -1,0 +1,131 @@
+"""People that a proxy has signed in, and those who only say so."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, Scope
+from api.access.proxy import Proxy
+from api.app import create_app
+from service.model.errors import InputError
+from service.pipeline.backends import Parts
+from service.settings import Settings
+
+SECRET = "correct horse battery staple"
+PROXY, STRANGER = ("10.1.2.3", 4000), ("203.0.113.9", 4000)
+GROUPS = {"ops": ":admin", "vision": "red:submit", "hands": "blue:submit", "*": ":read"}
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+
+
+def basic(user: str, secret: str = SECRET) -> str:
+    return "Basic " + base64.b64encode(f"{user}:{secret}".encode()).decode()
+
+
+def headers(user: str = "ann@lab.example", groups: str = "vision", secret: str = SECRET) -> dict[str, str]:
+    """What the proxy sends of somebody who is signed in."""
+    return {"Authorization": basic(user, secret), "X-Forwarded-Groups": groups}
+
+
+@pytest.fixture
+def behind(settings: Settings) -> Settings:
+    said = {"proxy_addresses": "10.1.0.0/16, ::1", "proxy_secret": SecretStr(SECRET), "proxy_groups": GROUPS}
+    return settings.model_copy(update=said)
+
+
+def client(settings: Settings, parts: Parts, address: tuple[str, int]) -> TestClient:
+    return TestClient(create_app(settings, parts), base_url="https://graspd.example", client=address)
+
+
+def test_whom_the_proxy_vouches_for_has_the_rights_of_the_group(behind: Settings, parts: Parts) -> None:
+    found = {}
+    for who, groups in {"ann": "vision", "bob": "hands", "ray": "others", "root": "vision,ops"}.items():
+        key = Proxy(behind).find(_scope(PROXY, headers(f"{who}@lab.example", groups)))
+        assert key is not None
+        found[who] = (key.name, key.project, key.scope)
+    assert found == {
+        "ann": ("ann@lab.example", "red", Scope.SUBMIT),
+        "bob": ("bob@lab.example", "blue", Scope.SUBMIT),
+        "ray": ("ray@lab.example", "", Scope.READ),
+        "root": ("root@lab.example", "", Scope.ADMIN),
+    }
+
+
+def test_people_of_a_project_find_their_jobs_and_not_those_of_another(behind: Settings, parts: Parts) -> None:
+    http = client(behind, parts, PROXY)
+    job = http.post("/v1/jobs", json=JOB, headers=headers()).json()["id"]
+    assert http.get(f"/v1/jobs/{job}", headers=headers("amy@lab.example")).json()["project"] == "red"
+    assert http.get(f"/v1/jobs/{job}", headers=headers("bob@lab.example", "hands")).status_code == 404
+    assert http.get("/", headers=headers()).status_code == 200
+    assert http.post("/v1/jobs", json=JOB, headers=headers("ray@lab.example", "")).status_code == 403
+
+
+@pytest.mark.parametrize(
+    ("address", "sent"),
+    [
+        (STRANGER, headers()),
+        (("127.0.0.1", 4000), headers()),
+        (("testclient", 1), headers()),
+        (PROXY, headers(secret="guessed")),
+        (PROXY, headers(secret="")),
+        (PROXY, {"X-Forwarded-User": "ann", "X-Forwarded-Email": "ann@lab.example", "X-Forwarded-Groups": "ops"}),
+        (PROXY, {"Authorization": "Basic !!!", "X-Forwarded-Groups": "ops"}),
+        (PROXY, headers(user="")),
+        (PROXY, headers(user="a\nb")),
+        (STRANGER, headers() | {"X-Forwarded-For": "10.1.2.3", "Forwarded": "for=10.1.2.3"}),
+    ],
+)
+def test_forged_headers_open_nothing(
+    behind: Settings, parts: Parts, address: tuple[str, int], sent: dict[str, str]
+) -> None:
+    http = client(behind, parts, address)
+    assert http.get("/v1/jobs", headers=sent).status_code == 401
+    assert http.get("/v1/jobs").status_code == 401
+
+
+def test_headers_that_came_twice_are_not_believed(behind: Settings) -> None:
+    twice = [(b"authorization", basic("ann").encode()), (b"x-forwarded-groups", b"ops"), (b"x-forwarded-groups", b"x")]
+    assert Proxy(behind).find({"type": "http", "client": PROXY, "headers": twice}) is None
+    users = [(b"authorization", basic(who).encode()) for who in ("ann", "bob")]
+    assert Proxy(behind).find({"type": "http", "client": PROXY, "headers": users}) is None
+
+
+def test_keys_go_on_opening_beside_the_proxy(behind: Settings, parts: Parts) -> None:
+    token = KeyFile(behind.resolved_keys_file).add("robot", Scope.SUBMIT, project="red")
+    http = client(behind, parts, STRANGER)
+    assert http.get("/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == 200
+
+
+def test_whose_group_has_no_rights_has_none(behind: Settings) -> None:
+    closed = behind.model_copy(update={"proxy_groups": {"ops": ":admin"}})
+    assert Proxy(closed).find(_scope(PROXY, headers(groups="vision"))) is None
+
+
+def test_nobody_makes_a_key_by_the_name_of_a_person(settings: Settings) -> None:
+    with pytest.raises(InputError, match="proxy signs in"):
+        KeyFile(settings.resolved_keys_file).add("ann@lab.example", Scope.ADMIN)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"proxy_addresses": "10.0.0.1"},
+        {"proxy_secret": SecretStr(SECRET)},
+        {"proxy_addresses": "10.0.0.1", "proxy_secret": SecretStr("short")},
+        {"proxy_addresses": "proxy.lan", "proxy_secret": SecretStr(SECRET)},
+        {"proxy_addresses": "::1", "proxy_secret": SecretStr(SECRET), "proxy_groups": {"a": "b:owner"}},
+        {"proxy_addresses": "::1", "proxy_secret": SecretStr(SECRET), "proxy_groups": {"a": "../b:read"}},
+    ],
+)
+def test_a_proxy_that_is_not_told_whole_is_refused(settings: Settings, said: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="GRASPD_PROXY"):
+        Proxy(settings.model_copy(update=said))
+
+
+def _scope(address: tuple[str, int], sent: dict[str, str]) -> dict[str, Any]:
+    raw = [(name.lower().encode(), value.encode()) for name, value in sent.items()]
+    return {"type": "http", "client": address, "headers": raw}
