@@ -48,6 +48,14 @@ class Settings(BaseSettings):
     )
     quota_grasps_in_flight: int = Field(0, ge=0, description="grasps in unfinished jobs of one key; 0: no limit")
     quota_jobs_per_day: int = Field(0, ge=0, description="new jobs of one key from midnight UTC on; 0: no limit")
+    webhook_secret: SecretStr | None = Field(
+        None,
+        min_length=16,
+        description="what the secrets of webhooks follow from, of API and keeper; unset: no webhooks",
+    )
+    webhook_networks: str | None = Field(
+        None, description="networks that webhooks may reach besides public addresses, with commas"
+    )
     device: str = Field("auto", description="Warp device of a worker: cpu, cuda:0, or auto")
     worker_number: int | None = Field(
         None, ge=0, description="of a worker among those of its machine: with device auto, number k takes the k-th GPU"

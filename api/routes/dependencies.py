@@ -19,6 +19,7 @@ from api.catalog.jobs import Jobs
 from api.catalog.overview import Overview
 from api.catalog.shards import Shards
 from api.catalog.usage import Usage
+from api.catalog.webhooks import Webhooks
 from service.pipeline.backends import Parts
 from service.queue.address import redis_url
 from service.queue.connection import connect
@@ -43,6 +44,7 @@ def provide(app: FastAPI, parts: Parts) -> None:
     state.jobs = Jobs(parts, quotas, Idempotency(redis), state.grasps, state.shards)
     state.datasets, state.assets = Datasets(parts, quotas), Assets(parts)
     state.overview, state.usage = Overview(parts, state.jobs), Usage(parts, state.keys)
+    state.webhooks = Webhooks(parts)
 
 
 def may_read(request: Request) -> None:
@@ -74,6 +76,7 @@ GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
 StoreOf = Annotated[Store, Depends(_provided("store"))]
 UsageOf = Annotated[Usage, Depends(_provided("usage"))]
+WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]

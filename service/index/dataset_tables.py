@@ -25,6 +25,8 @@ datasets: Final = Table(
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
     Column("planned", Boolean, nullable=False, default=False),
+    # Number of events for which its end was told; -1: it was not.
+    Column("told", Integer, nullable=False, server_default="-1"),
     Column("neighbours", String(300), nullable=False, server_default=""),
     Index("datasets_newest", "created", "name"),
 )

@@ -9,6 +9,7 @@ from service.index.changes.removals import Removals
 from service.index.damage import KnownDamage
 from service.index.database import Database
 from service.index.notes import Notes
+from service.index.outgoing import Outgoing
 from service.index.queries.assets import Assets
 from service.index.queries.costs import Costs
 from service.index.queries.dataset_feed import DatasetFeed
@@ -55,6 +56,7 @@ class Index:
         # What is both.
         self.notes = Notes(database)
         self.damage = KnownDamage(database)
+        self.outgoing = Outgoing(database)
 
     def close(self) -> None:
         """Give the connections back."""

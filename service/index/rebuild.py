@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import Connection, Table, delete, select
 from sqlalchemy.exc import DataError
 
+from service.index.changes.states import QUIET
 from service.index.index import Index
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
 from service.model import names
@@ -20,6 +21,7 @@ from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet
 from service.model.domain import State
 from service.model.errors import DamagedError, InputError, NotFoundError
 from service.model.records import AttemptRecord, JobEvent, JobRecord, Record
+from service.model.webhooks import Webhook
 from service.store.deletions import pending
 from service.store.library import load_asset, load_check, stored_assets
 from service.store.manifests import ShardManifest
@@ -47,14 +49,16 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         number of jobs, attempts, shards, assets, datasets, snapshots and object sets read, and of records left out.
     """
     with index.database.writing() as connection:
+        connection.execution_options(**{QUIET: True})
+        made = _Rebuild(index, store, connection, progress)
         for table in metadata.tables.values():
             if table.name not in LIVE_TABLES:
                 connection.execute(delete(table))
-        made = _Rebuild(index, store, connection, progress)
         made.assets()
         made.jobs()
         made.shards()
         made.datasets()
+        made.webhooks()
         index.notes.set_complete(made.left_out, within=connection)
     return {**made.counts, "left_out": len(made.left_out)}
 
@@ -69,6 +73,9 @@ class _Rebuild:
         self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
         self.left_out: list[str] = []
         self._gone = pending(store)
+        self._last = index.outgoing.last(within=connection)
+        self._seen = index.outgoing.seen(within=connection)
+        self._told = index.outgoing.told(within=connection)
 
     def assets(self) -> None:
         for kind, digest in stored_assets(self._store):
@@ -109,12 +116,21 @@ class _Rebuild:
                 self._index.write_dataset.add(record, within=self._connection)
                 if events := self._events(DatasetEvent, names.dataset_events(record.name)):
                     self._index.write_dataset.set_events(record.name, events, within=self._connection)
+        ended = self._index.datasets.ended(within=self._connection)
+        self._index.outgoing.set_told(ended | self._told, within=self._connection)
         for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
             with self._each(key, "snapshots"):
                 self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
         for key, data in self._read(names.OBJECT_SETS, lambda key: key.endswith(".json")):
             with self._each(key, "object_sets"):
                 self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
+
+    def webhooks(self) -> None:
+        for key, data in self._read(names.WEBHOOKS, lambda key: key.endswith(".json")):
+            with self._each(key):
+                hook = parse_record(Webhook, data, key)
+                seen = self._seen.get(hook.id, self._last)
+                self._index.outgoing.add(hook, seen=seen, within=self._connection)
 
     def _events(self, model: type[EventT], prefix: str) -> list[EventT]:
         found = []

@@ -243,6 +243,17 @@ damage: Final = Table(
 
 #: Columns of the present moment, and tables that hold nothing else: a rebuild starts them afresh.
 LIVE_COLUMNS: Final = frozenset(
-    {"queued", "not_before", "progress_done", "progress_total", "progress_message", "applied", "planned", "charged"}
+    {
+        "queued",
+        "not_before",
+        "progress_done",
+        "progress_total",
+        "progress_message",
+        "applied",
+        "planned",
+        "charged",
+        "told",
+        "seen",
+    }
 )
-LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent"})
+LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent", "ends", "deliveries"})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
@@ -225,6 +225,44 @@ class Throughput(View):
     valid: int
     tasks: int
     seconds: float
+
+
+class EndView(View):
+    """A job or a dataset that ended."""
+
+    seq: int = Field(description="later ends have larger numbers; `since` of the next request")
+    kind: Literal["job", "dataset"]
+    subject: str = Field(description="id of the job, or name of the dataset")
+    state: State = Field(description="succeeded, failed or cancelled")
+    at: str
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
+
+
+class WebhookView(View):
+    """An address that is told of ends."""
+
+    id: str
+    url: str
+    states: list[str] = Field(description="ends that it is told of: succeeded, failed, cancelled")
+    created: str
+    owner: str = Field("", description="id of the key that made it")
+    project: str = Field("", description="whose jobs and datasets it is told of")
+    seen: int = Field(0, description="ends up to this number have deliveries")
+
+
+class DeliveryView(View):
+    """What became of telling an address of an end."""
+
+    seq: int
+    kind: str
+    subject: str
+    ended: str = Field(description="succeeded, failed or cancelled")
+    state: str = Field(description="waiting, delivered or failed")
+    attempts: int
+    tried: str | None = Field(description="when it was tried last")
+    status: int | None = Field(description="HTTP status of the last answer")
+    detail: str = Field(description="how the last attempt ended")
 
 
 class UsageDay(View):

@@ -14,6 +14,7 @@ DATASETS: Final = "datasets"
 OBJECT_SETS: Final = "object_sets"
 DELETIONS: Final = "deletions"
 RELEASED: Final = "released"
+WEBHOOKS: Final = "webhooks"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -112,6 +113,11 @@ def dataset_snapshot(dataset: str, digest: str) -> str:
 def object_set(name: str, digest: str) -> str:
     """One version of a named set of objects."""
     return f"{OBJECT_SETS}/{name}/{digest}.json"
+
+
+def webhook(webhook: str) -> str:
+    """An address that is told of ends; removed when its owner takes it away."""
+    return f"{WEBHOOKS}/{webhook}.json"
 
 
 def deletion(what: str, name: str) -> str:

@@ -21,6 +21,7 @@ from service.model.planning import ingest_id, ingest_message
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts
+from service.pipeline.courier import Courier
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.indexer import Indexer
 from service.pipeline.job_actions import HELD_S, queue_tasks
@@ -85,7 +86,7 @@ class Keeper:
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
-        with self._scrubbing(stop):
+        with self._scrubbing(stop), self._telling(stop):
             self._run(stop)
 
     @contextmanager
@@ -95,6 +96,17 @@ class Keeper:
             yield
             return
         thread = threading.Thread(target=Scrubber(self._parts, stop).run, name="scrub", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join(_LAST_READ_S)
+
+    @contextmanager
+    def _telling(self, stop: threading.Event) -> Iterator[None]:
+        """Tells webhooks what ended, beside the rounds."""
+        thread = threading.Thread(target=Courier(self._parts, stop).run, name="webhooks", daemon=True)
         thread.start()
         try:
             yield

@@ -10,6 +10,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, exists, func, select, tuple_, update
 
 from service.index.database import chunks
+from service.index.outgoing import note_ends
 from service.index.tables import attempts, jobs, tasks
 from service.model.domain import State
 from service.model.errors import SceneError
@@ -28,6 +29,11 @@ _FACTS = (
     tasks.c.exhausted,
     tasks.c.retried_upto,
 )
+
+
+#: Option of a connection on which nothing that ends is told.
+QUIET: Final = "graspd_quiet"
+_WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
 def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
@@ -117,9 +123,10 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
     # Five probes of an index; to collect the distinct states would read every task of the job.
     of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
-    query = select(jobs.c.id, jobs.c.state.label("now"), jobs.c.finished, jobs.c.reason, *probes)
+    query = select(jobs.c.id, jobs.c.state.label("now"), jobs.c.finished, jobs.c.reason, *_WHOSE, *probes)
     known = {row["id"]: row for row in connection.execute(query.where(jobs.c.id.in_(ids))).mappings()}
     states: dict[str, State] = {}
+    ended: list[dict[str, Any]] = []
     for job in ids:
         row = known.get(job)
         found = [state for state in State if row is not None and row[state.value]]
@@ -135,4 +142,10 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
         # Most often a job goes on as it was: then its row is left alone.
         if values != {"state": row["now"], "finished": row["finished"], "reason": row["reason"]}:
             connection.execute(update(jobs).where(jobs.c.id == job).values(**values))
+            if state.is_final and state != row["now"]:
+                about = {"kind": "job", "subject": job, "state": state.value}
+                ended.append(about | {"project": row["project"], "owner": row["owner"]})
+    # A rebuild tells nobody of what ended long ago.
+    if not connection.get_execution_options().get(QUIET):
+        note_ends(connection, ended)
     return states

@@ -61,6 +61,11 @@ class Datasets:
             rows = connection.execute(query).mappings().all()
             return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
+    def ended(self, *, within: Connection) -> dict[str, int]:
+        """Datasets that have ended, with the number of their events."""
+        rows = within.execute(select(datasets)).mappings().all()
+        return {row["name"]: row["events"] for row in rows if _state(row, _states(within, row)).is_final}
+
     def cells(
         self,
         name: str,

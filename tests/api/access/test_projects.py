@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from fastapi.routing import APIRoute
+from pydantic import SecretStr
 from starlette.testclient import TestClient
 
 from api.access.keys import Key, KeyFile, Scope
@@ -41,7 +42,7 @@ _BALL = b"solid ball\nendsolid ball\n"
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator[World]:
     """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
-    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data")
+    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
     shutil.copytree(furnished, settings.data_dir)
     parts = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
     keys = KeyFile(settings.resolved_keys_file)
@@ -89,11 +90,12 @@ class World:
         self.post("/v1/datasets", ann, json=matrix | {"scenes": 1, "views": 1, "seed": 77})
         while DatasetRounds(self.parts).advance(10):
             pass
+        hook = self.post("/v1/webhooks", ann, json={"url": "https://red-secret.example/"}).json()
         snapshot = self.post("/v1/datasets/red-secret-data/snapshots", ann).json()["digest"]
         add_worker(self.parts)
         self.said |= {
             "job_id": job, "failed": failed, "waiting": waiting, "shard_id": shard, "views": views,
-            "digest": snapshot,
+            "digest": snapshot, "webhook": hook["id"], "webhook_secret": hook["secret"],
         }  # fmt: skip
 
     def post(self, path: str, headers: Headers, **content: Any) -> Any:
@@ -119,6 +121,7 @@ _VALUES = {
     "index": ("0",),
     "channel": ("rgb",),
     "slug": ("not-found",),
+    "webhook_id": ("webhook",),
     "action": ("cancel", "retry", "snapshot", "delete"),
 }
 _NAMES = {

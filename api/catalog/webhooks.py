@@ -1,0 +1,89 @@
+"""The feed of ends, and the addresses that are told of them."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+
+from api.access.auth import caller, caller_id, may_change, must_own, reach
+from service.index.views import DeliveryView, EndView, WebhookView
+from service.model import names
+from service.model.clock import timestamp
+from service.model.errors import ConflictError, LimitError
+from service.model.projects import Reach
+from service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
+from service.pipeline.backends import Parts
+from service.store.records import put_record
+
+log = logging.getLogger(__name__)
+
+
+class Webhooks:
+    """Webhooks of the caller's project, and what was delivered to them."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+
+    def ends(self, since: int, *, limit: int) -> list[EndView]:
+        """The next ends of jobs and datasets within reach, behind a number."""
+        return self._parts.index.outgoing.ends(since, limit=limit, reach=reach())
+
+    def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
+        """A webhook and its secret, which is told this once.
+
+        Raises:
+            InputError: the address is none that can be asked.
+            LimitError: the project has `MOST_HOOKS` of them.
+            ConflictError: the operator has not switched webhooks on.
+        """
+        master = self._parts.settings.webhook_secret
+        if master is None:
+            raise ConflictError("webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and keeper")
+        project = reach().project
+        if len(self._parts.index.outgoing.hooks(reach=Reach(project, everything=False))) >= MOST_HOOKS:
+            raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
+        hook = Webhook(
+            id=secrets.token_hex(16),
+            url=check_url(url),
+            states=tuple(dict.fromkeys(states)),
+            created=timestamp(),
+            owner=caller_id(),
+            project=project,
+        )
+        put_record(self._parts.store, names.webhook(hook.id), hook)
+        self._parts.index.outgoing.add(hook)
+        key = caller.get()
+        log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
+        return self._parts.index.outgoing.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
+
+    def all(self) -> list[WebhookView]:
+        """Webhooks that the caller may change: the addresses of others may hold words that let somebody in."""
+        return [hook for hook in self._parts.index.outgoing.hooks(reach=reach()) if self._is_theirs(hook)]
+
+    def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
+        """Deliveries of a webhook, the newest first.
+
+        Raises:
+            NotYours: another key made it.
+        """
+        return self._parts.index.outgoing.log(self._owned(webhook).id, limit=limit)
+
+    def delete(self, webhook: str) -> None:
+        """Take a webhook away; what waits for it is not sent.
+
+        Raises:
+            NotYours: another key made it.
+        """
+        hook = self._owned(webhook)
+        # The record first: what is left of a broken-off deletion is a row that a rebuild drops.
+        self._parts.store.delete(names.webhook(hook.id))
+        self._parts.index.outgoing.remove(hook.id)
+        log.info("webhook %s deleted", hook.id)
+
+    def _owned(self, webhook: str) -> WebhookView:
+        hook = self._parts.index.outgoing.hook(webhook, reach=reach())
+        must_own(hook.owner, f"webhook {webhook}", hook.project)
+        return hook
+
+    def _is_theirs(self, hook: WebhookView) -> bool:
+        return may_change(hook.owner, hook.project)

@@ -1,0 +1,76 @@
+"""`graspd webhooks`: addresses that are told when jobs and datasets end."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from api.client.reports import UrlOption, open_client, say_deleted
+from service.cli import JsonFlag, emit, reporting_errors
+
+app = typer.Typer(no_args_is_help=True, help="Addresses that are told when jobs and datasets end.")
+
+IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Of the webhook: `graspd webhooks list`.")]
+
+
+@app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
+@reporting_errors
+def add_webhook(
+    address: Annotated[str, typer.Argument(help="Where to POST: https://host/path.")],
+    on: Annotated[str, typer.Option(help="Ends to tell, with commas.")] = "succeeded,failed,cancelled",
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Tell an address of ends from now on, and show the secret that signs what is sent, this once."""
+    states = [one.strip() for one in on.split(",") if one.strip()]
+    with open_client(url) as client:
+        made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
+    if json:
+        emit(made)
+        return
+    typer.echo(made["secret"])
+    typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
+
+
+@app.command("list", epilog="graspd webhooks list")
+@reporting_errors
+def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Webhooks that the key may change."""
+    with open_client(url) as client:
+        found = client.send("GET", "/v1/webhooks").json()
+    if json:
+        emit({"webhooks": found})
+        return
+    table = Table("id", "address", "on", "since", box=None, header_style="bold")
+    for one in found:
+        table.add_row(one["id"], one["url"], ", ".join(one["states"]), one["created"][:16])
+    Console().print(table if found else "no webhook yet; `graspd webhooks add URL` makes one")
+
+
+@app.command("log", epilog="graspd webhooks log 1a2b3c")
+@reporting_errors
+def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """What became of telling it, the newest first."""
+    with open_client(url) as client:
+        found = client.send("GET", f"/v1/webhooks/{webhook}/deliveries").json()
+    if json:
+        emit({"deliveries": found})
+        return
+    table = Table("what", "ended", "delivery", "attempts", "last", "", box=None, header_style="bold")
+    for one in found:
+        what = f"{one['kind']} {one['subject'][:16]}"
+        tried = (one["tried"] or "")[:19]
+        table.add_row(what, one["ended"], one["state"], str(one["attempts"]), tried, one["detail"])
+    Console().print(table if found else "nothing was to be told yet")
+
+
+@app.command("delete", epilog="graspd webhooks delete 1a2b3c")
+@reporting_errors
+def delete_webhook(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+    """Tell it nothing any more."""
+    with open_client(url) as client:
+        client.delete(f"/v1/webhooks/{webhook}")
+    say_deleted("webhook", webhook, json=json)

@@ -1,0 +1,231 @@
+"""What is told to others: the ends of jobs and datasets in their order, webhooks, and their deliveries."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sqlalchemy import Connection, delete, func, select, update
+
+from service.index.bulk import upsert
+from service.index.database import Database
+from service.index.dataset_tables import datasets
+from service.index.event_tables import deliveries, ends, webhooks
+from service.index.views import DeliveryView, EndView, WebhookView
+from service.model.clock import timestamp
+from service.model.errors import NotFoundError
+from service.model.projects import EVERYTHING, Reach
+from service.model.webhooks import MOST_WAITING, Webhook
+
+#: Ends and deliveries older than this are forgotten [s].
+KEPT_S: Final = 30 * 86400.0
+_AT_ONCE: Final = 500
+
+
+@dataclass(frozen=True)
+class Due:
+    """A delivery that shall be tried now."""
+
+    hook: WebhookView
+    end: EndView
+    attempts: int
+
+
+def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
+    """Append ends to the feed, within a transaction: writers take turns, so numbers are seen in their order.
+
+    A number is the time in milliseconds, or the next one after the last: so those of an index that was lost and begun
+    anew are behind those that readers have seen.
+    """
+    if rows:
+        last = connection.scalar(select(func.max(ends.c.seq))) or 0
+        first = max(int(last) + 1, int(time.time() * 1000))
+        numbered = [{"seq": first + place, "at": timestamp(), **row} for place, row in enumerate(rows)]
+        upsert(connection, ends, numbered)
+
+
+@dataclass(frozen=True)
+class Outgoing:
+    """Reads and writes of the feed and of webhooks."""
+
+    database: Database
+
+    def ends(self, since: int, *, limit: int, reach: Reach = EVERYTHING) -> list[EndView]:
+        """The next ends behind a number."""
+        query = select(ends).where(ends.c.seq > since).order_by(ends.c.seq).limit(limit)
+        if not reach.everything:
+            query = query.where(ends.c.project == reach.project)
+        with self.database.reading() as connection:
+            return [EndView(**row) for row in connection.execute(query).mappings()]
+
+    def untold_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
+        """Datasets whose end has not been told since their last event, with the number of their events."""
+        query = select(datasets.c.name, datasets.c.events).where(
+            datasets.c.planned.is_(True), datasets.c.applied >= datasets.c.events, datasets.c.told < datasets.c.events
+        )
+        with self.database.reading() as connection:
+            return [(name, events) for name, events in connection.execute(query.limit(limit))]
+
+    def tell_dataset(self, name: str, events: int, row: dict[str, Any]) -> None:
+        """Append the end of a dataset, once for each number of events."""
+        with self.database.writing() as connection:
+            untold = (datasets.c.name == name, datasets.c.told < events)
+            if connection.execute(update(datasets).where(*untold).values(told=events)).rowcount:
+                note_ends(connection, [row])
+
+    def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
+        """A webhook; it is told of what ends from now on.
+
+        Args:
+            seen: ends up to here are told to nobody; None: all that there are.
+        """
+        with self.database.writing(within) as connection:
+            last = seen if seen is not None else self.last(within=connection)
+            row = {
+                "id": hook.id,
+                "url": hook.url,
+                "states": list(hook.states),
+                "created": hook.created,
+                "owner": hook.owner,
+                "project": hook.project,
+                "seen": last,
+            }
+            upsert(connection, webhooks, [row], keep=("seen",))
+
+    def last(self, *, within: Connection) -> int:
+        """Number of the last end."""
+        return int(within.scalar(select(func.max(ends.c.seq))) or 0)
+
+    def seen(self, *, within: Connection) -> dict[str, int]:
+        """Up to which end each webhook has deliveries."""
+        return {row.id: row.seen for row in within.execute(select(webhooks.c.id, webhooks.c.seen))}
+
+    def told(self, *, within: Connection) -> dict[str, int]:
+        """Number of events for which the end of each dataset was told."""
+        return {row.name: row.told for row in within.execute(select(datasets.c.name, datasets.c.told))}
+
+    def set_told(self, told: dict[str, int], *, within: Connection) -> None:
+        """Put back what `told` said."""
+        for name, events in told.items():
+            within.execute(update(datasets).where(datasets.c.name == name).values(told=events))
+
+    def hooks(self, *, reach: Reach = EVERYTHING) -> list[WebhookView]:
+        """Webhooks, the oldest first."""
+        query = select(webhooks).order_by(webhooks.c.created, webhooks.c.id)
+        if not reach.everything:
+            query = query.where(webhooks.c.project == reach.project)
+        with self.database.reading() as connection:
+            return [_hook(row) for row in connection.execute(query).mappings()]
+
+    def hook(self, webhook: str, *, reach: Reach = EVERYTHING) -> WebhookView:
+        """A webhook; NotFoundError if there is none."""
+        for one in self.hooks(reach=reach):
+            if one.id == webhook:
+                return one
+        raise NotFoundError(f"there is no webhook {webhook!r}")
+
+    def remove(self, webhook: str) -> None:
+        """A webhook with its log."""
+        with self.database.writing() as connection:
+            connection.execute(delete(deliveries).where(deliveries.c.webhook == webhook))
+            connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
+
+    def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
+        """Deliveries of a webhook, the newest first."""
+        query = (
+            select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
+            .join(ends, ends.c.seq == deliveries.c.seq)
+            .where(deliveries.c.webhook == webhook)
+            .order_by(deliveries.c.seq.desc())
+            .limit(limit)
+        )
+        with self.database.reading() as connection:
+            return [
+                DeliveryView(**{name: row[name] for name in DeliveryView.model_fields})
+                for row in connection.execute(query).mappings()
+            ]
+
+    def plan(self) -> None:
+        """Make deliveries of what ended since the last call; a webhook that is far behind misses the oldest."""
+        for hook in self.hooks():
+            mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
+            query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)
+            with self.database.reading() as connection:
+                found = connection.execute(query).all()
+            if not found:
+                continue
+            with self.database.writing() as connection:
+                waiting = select(func.count()).where(deliveries.c.webhook == hook.id, deliveries.c.state == "waiting")
+                room = MOST_WAITING - int(connection.scalar(waiting) or 0)
+                wanted = [row.seq for row in found if row.state in hook.states]
+                rows = [
+                    {"webhook": hook.id, "seq": seq, "state": "waiting", "attempts": 0, "due": 0.0, "detail": ""}
+                    if place < room
+                    else {
+                        "webhook": hook.id,
+                        "seq": seq,
+                        "state": "failed",
+                        "attempts": 0,
+                        "due": 0.0,
+                        "detail": f"{MOST_WAITING} deliveries wait already",
+                    }
+                    for place, seq in enumerate(wanted)
+                ]
+                upsert(connection, deliveries, rows, keep=("state", "attempts", "due", "detail"))
+                seen = update(webhooks).where(webhooks.c.id == hook.id).values(seen=found[-1].seq)
+                connection.execute(seen)
+
+    def due(self, now: float, *, limit: int) -> list[Due]:
+        """Deliveries to try now, the oldest of each webhook."""
+        hooks = {hook.id: hook for hook in self.hooks()}
+        first = (
+            select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
+            .where(deliveries.c.state == "waiting", deliveries.c.due <= now)
+            .group_by(deliveries.c.webhook)
+            .limit(limit)
+            .subquery()
+        )
+        query = (
+            select(ends, deliveries.c.webhook, deliveries.c.attempts)
+            .join(first, first.c.seq == ends.c.seq)
+            .join(deliveries, (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook))
+        )
+        with self.database.reading() as connection:
+            rows = connection.execute(query).mappings().all()
+        return [
+            Due(hooks[row["webhook"]], EndView(**{name: row[name] for name in EndView.model_fields}), row["attempts"])
+            for row in rows
+            if row["webhook"] in hooks
+        ]
+
+    def settle(self, due: Due, *, status: int | None, detail: str, wait_s: float | None, done: bool) -> None:
+        """How an attempt ended.
+
+        Args:
+            wait_s: until the next attempt [s]; None: there is none.
+        """
+        state = "delivered" if done else "waiting" if wait_s is not None else "failed"
+        values = {
+            "state": state,
+            "attempts": due.attempts + 1,
+            "due": time.time() + (wait_s or 0.0),
+            "tried": timestamp(),
+            "status": status,
+            "detail": detail[:300].replace("\0", ""),
+        }
+        same = (deliveries.c.webhook == due.hook.id, deliveries.c.seq == due.end.seq)
+        with self.database.writing() as connection:
+            connection.execute(update(deliveries).where(*same).values(**values))
+
+    def forget_old(self) -> None:
+        """Take away ends and deliveries that are older than `KEPT_S`."""
+        oldest = int((time.time() - KEPT_S) * 1000)
+        with self.database.writing() as connection:
+            connection.execute(delete(deliveries).where(deliveries.c.seq < oldest))
+            connection.execute(delete(ends).where(ends.c.seq < oldest))
+
+
+def _hook(row: Any) -> WebhookView:
+    return WebhookView(**{name: row[name] for name in WebhookView.model_fields})

@@ -1,0 +1,149 @@
+"""POST to an address that a stranger named: to public machines only, within bounds of time and bytes.
+
+The name is resolved here, every address that it has is looked at, and the connection goes to one of these very
+addresses: a name that means another machine a moment later (DNS rebinding) changes nothing. Redirects are not followed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import ipaddress
+import socket
+import ssl
+import threading
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlsplit
+
+from service.model.errors import InputError
+
+#: For the whole exchange [s].
+PATIENCE_S: Final = 10.0
+#: Of the answer no more is read than its status line, its headers and so many bytes.
+_READ_BYTES: Final = 1024
+_NAT64: Final = ipaddress.ip_network("64:ff9b::/96")
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+Networks = tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
+
+
+class Refused(InputError):
+    """The address names a machine that webhooks may not reach."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back: a status, and in a few words why there is none."""
+
+    status: int | None
+    detail: str = ""
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether the other side took it: any 2xx."""
+        return self.status is not None and 200 <= self.status < 300
+
+
+def networks(text: str) -> Networks:
+    """Networks of a setting, with commas or spaces between; InputError if one cannot be read."""
+    try:
+        return tuple(ipaddress.ip_network(one) for one in text.replace(",", " ").split())
+    except ValueError as error:
+        raise InputError(f"GRASPD_WEBHOOK_NETWORKS: {error}; write 10.0.0.0/8") from None
+
+
+def is_public(address: Address) -> bool:
+    """Whether an address is one of the internet: not loopback, private, link-local, shared, multicast or reserved, nor
+    an IPv6 address that stands for such an IPv4 one."""
+    if isinstance(address, ipaddress.IPv6Address):
+        inner = address.ipv4_mapped or address.sixtofour or (address.teredo[1] if address.teredo else None)
+        if address in _NAT64:
+            inner = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+        if inner is not None:
+            return is_public(inner)
+        if address.is_site_local:
+            return False
+    return address.is_global and not address.is_multicast and not address.is_reserved
+
+
+def reachable(host: str, port: int, allowed: Networks) -> list[str]:
+    """The addresses of a host, once all of them may be reached.
+
+    Args:
+        allowed: networks that the operator lets webhooks reach besides public addresses.
+
+    Raises:
+        Refused: one of them may not.
+        OSError: it has none.
+    """
+    found = list(dict.fromkeys(str(info[4][0]) for info in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
+    for one in found:
+        address = ipaddress.ip_address(one.partition("%")[0])
+        if not is_public(address) and not any(address in network for network in allowed):
+            raise Refused(
+                f"{host} is at {one}, which is no public address; the operator may allow it: GRASPD_WEBHOOK_NETWORKS"
+            )
+    return found
+
+
+def post(
+    url: str, body: bytes, headers: Mapping[str, str], *, allowed: Networks = (), patience_s: float = PATIENCE_S
+) -> Answer:
+    """Send a body and tell the status of the answer. Never raises for what the other side does."""
+    parts = urlsplit(url)
+    host = parts.hostname or ""
+    port = parts.port or (443 if parts.scheme == "https" else 80)
+    path = parts.path or "/"
+    try:
+        addresses = reachable(host, port, allowed)
+        connection = _connection(parts.scheme, host, port, addresses, patience_s)
+    except Refused as error:
+        return Answer(None, str(error))
+    except (OSError, ValueError) as error:
+        return Answer(None, f"{host} has no address: {error}")
+    # The time-out of a socket begins anew with each byte; this ends the whole.
+    end = threading.Timer(patience_s, _cut, [connection])
+    end.daemon = True
+    end.start()
+    try:
+        connection.request("POST", f"{path}?{parts.query}" if parts.query else path, body=body, headers=dict(headers))
+        answer = connection.getresponse()
+        answer.read(_READ_BYTES)
+        moved = "; redirects are not followed" if 300 <= answer.status < 400 else ""
+        return Answer(answer.status, f"answered {answer.status}{moved}")
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        return Answer(None, f"{type(error).__name__}: {str(error)[:150]}" if str(error) else "no answer in time")
+    finally:
+        end.cancel()
+        connection.close()
+
+
+def _cut(connection: http.client.HTTPConnection) -> None:
+    with contextlib.suppress(OSError):
+        if connection.sock is not None:
+            connection.sock.shutdown(socket.SHUT_RDWR)
+
+
+def _connection(
+    scheme: str, host: str, port: int, addresses: Iterable[str], patience_s: float
+) -> http.client.HTTPConnection:
+    if scheme == "https":
+        made: http.client.HTTPConnection = http.client.HTTPSConnection(
+            host, port, timeout=patience_s, context=ssl.create_default_context()
+        )
+    else:
+        made = http.client.HTTPConnection(host, port, timeout=patience_s)
+    # Where the library would resolve the name again, the addresses that were looked at.
+    made._create_connection = lambda *_, **__: _dial(addresses, port, patience_s)  # type: ignore[attr-defined]
+    return made
+
+
+def _dial(addresses: Iterable[str], port: int, patience_s: float) -> socket.socket:
+    last: OSError = OSError("no address")
+    for address in addresses:
+        try:
+            return socket.create_connection((address, port), timeout=patience_s)
+        except OSError as error:
+            last = error
+    raise last

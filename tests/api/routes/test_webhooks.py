@@ -1,0 +1,207 @@
+"""The feed of ends, and webhooks: who is told what, signed how, and tried how often."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, Scope
+from api.app import create_app
+from service.index.index import Index
+from service.index.rebuild import rebuild
+from service.model.webhooks import MOST_HOOKS, WAITS_S
+from service.pipeline.backends import Parts
+from service.pipeline.courier import Courier
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.posting import Answer
+from service.settings import Settings
+from tests.api.factories import add_job, finish_all
+
+ADDRESS = "https://ci.example.org/graspd"
+MASTER = "a secret of the operator's"
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+
+
+@pytest.fixture
+def settings(settings: Settings) -> Settings:
+    return settings.model_copy(update={"webhook_secret": SecretStr(MASTER)})
+
+
+class Ear:
+    """Stands for the address: notes what is sent there, and answers as it is told."""
+
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self.heard: list[tuple[str, bytes, dict[str, str]]] = []
+        self.answer = Answer(200)
+        self.courier = Courier(parts, threading.Event(), send=self.send)
+
+    def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Answer:
+        self.heard.append((url, body, headers))
+        return self.answer
+
+    def round(self, later_s: float = 0.0) -> int:
+        self.courier.tell_datasets()
+        return self.courier.deliver(now=time.time() + later_s)
+
+
+@pytest.fixture
+def ear(parts: Parts) -> Ear:
+    return Ear(parts)
+
+
+def add(http: TestClient, **said: Any) -> dict[str, Any]:
+    answer = http.post("/v1/webhooks", json={"url": ADDRESS, **said})
+    assert answer.status_code == 201, answer.text
+    return dict(answer.json())
+
+
+def end_a_job(parts: Parts, **fields: Any) -> str:
+    record = add_job(parts, **fields)
+    finish_all(parts, record)
+    return record.id
+
+
+def test_the_feed_tells_of_each_end_once_and_in_order(http: TestClient, parts: Parts) -> None:
+    jobs = [end_a_job(parts, seed=seed) for seed in (1, 2)]
+    page = http.get("/v1/events").json()
+    assert [(one["subject"], one["state"]) for one in page["items"]] == [(job, "succeeded") for job in jobs]
+    assert http.get(f"/v1/events?since={page['next']}").json() == {"items": [], "next": page["next"]}
+    assert [one["subject"] for one in http.get(f"/v1/events?since={page['items'][0]['seq']}").json()["items"]] == jobs[
+        1:
+    ]
+
+
+def test_a_job_that_is_retried_and_cancelled_again_ends_twice(http: TestClient) -> None:
+    job = http.post("/v1/jobs", json=JOB).json()["id"]
+    for action in ("cancel", "retry", "cancel"):
+        assert http.post(f"/v1/jobs/{job}/{action}").status_code == 202
+    assert [one["state"] for one in http.get("/v1/events").json()["items"]] == ["cancelled", "cancelled"]
+
+
+def test_a_dataset_that_ended_is_told_once(http: TestClient, parts: Parts, ear: Ear) -> None:
+    http.post("/v1/datasets", json={"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32})
+    ear.round()
+    http.post("/v1/datasets/d/cancel")
+    while DatasetRounds(parts).advance(10):
+        pass
+    ear.round()
+    ear.round()
+    told = [one for one in http.get("/v1/events").json()["items"] if one["kind"] == "dataset"]
+    assert [(one["subject"], one["state"]) for one in told] == [("d", "cancelled")]
+
+
+def test_what_is_sent_is_signed_with_the_time(http: TestClient, parts: Parts, ear: Ear) -> None:
+    hook = add(http)
+    job = end_a_job(parts)
+    assert ear.round() == 1
+    url, body, headers = ear.heard[0]
+    said = dict(part.split("=") for part in headers["X-Graspd-Signature"].split(","))
+    expected = hmac.new(hook["secret"].encode(), said["t"].encode() + b"." + body, hashlib.sha256).hexdigest()
+    assert hmac.compare_digest(said["v1"], expected) and abs(int(said["t"]) - time.time()) < 120
+    assert url == ADDRESS and json.loads(body)["subject"] == job
+    assert MASTER not in str(headers) + hook["secret"] + str(body)
+
+
+def test_what_is_not_taken_is_tried_again_with_longer_waits_and_then_given_up(
+    http: TestClient, parts: Parts, ear: Ear
+) -> None:
+    hook = add(http)
+    end_a_job(parts)
+    ear.answer = Answer(500, "answered 500")
+    assert ear.round() == 1 and ear.round() == 0
+    for wait in WAITS_S:
+        assert ear.round(wait + 1) == 1
+    assert ear.round(10 * WAITS_S[-1]) == 0
+    (log,) = http.get(f"/v1/webhooks/{hook['id']}/deliveries").json()
+    assert (log["state"], log["attempts"], log["status"]) == ("failed", len(WAITS_S) + 1, 500)
+    # Each attempt has the same number, so who has taken it may know it again.
+    assert len({headers["X-Graspd-Delivery"] for _, _, headers in ear.heard}) == 1
+
+
+def test_a_webhook_is_told_of_the_ends_it_asked_for_from_then_on(http: TestClient, parts: Parts, ear: Ear) -> None:
+    end_a_job(parts, seed=1)
+    add(http, states=["failed"])
+    end_a_job(parts, seed=2)
+    assert ear.round() == 0
+
+
+def test_one_that_is_deleted_is_told_nothing(http: TestClient, parts: Parts, ear: Ear) -> None:
+    hook = add(http)
+    end_a_job(parts)
+    assert http.delete(f"/v1/webhooks/{hook['id']}").status_code == 204
+    assert ear.round() == 0 and http.get("/v1/webhooks").json() == []
+
+
+def test_webhooks_are_in_the_store_and_tell_nothing_old_after_a_rebuild(
+    http: TestClient, parts: Parts, ear: Ear
+) -> None:
+    hook = add(http)
+    end_a_job(parts)
+    ear.round()
+    fresh = Index("sqlite://")
+    try:
+        rebuild(fresh, parts.store)
+        assert [one.id for one in fresh.outgoing.hooks()] == [hook["id"]]
+        fresh.outgoing.plan()
+        assert fresh.outgoing.due(time.time(), limit=10) == []
+    finally:
+        fresh.close()
+    rebuild(parts.index, parts.store)
+    ear.round()
+    assert len(ear.heard) == 1
+
+
+def test_there_are_only_so_many_webhooks(http: TestClient) -> None:
+    for _ in range(MOST_HOOKS):
+        add(http)
+    assert http.post("/v1/webhooks", json={"url": ADDRESS}).status_code == 413
+
+
+@pytest.mark.parametrize("url", ["ftp://a.example", "https://me:pw@a.example/", "nonsense"])
+def test_what_is_no_address_is_refused(http: TestClient, url: str) -> None:
+    assert http.post("/v1/webhooks", json={"url": url}).status_code in (400, 422)
+
+
+def test_without_a_secret_of_the_operators_there_are_none(parts: Parts) -> None:
+    bare = parts.settings.model_copy(update={"webhook_secret": None})
+    app = create_app(bare, Parts(bare, parts.store, parts.index, parts.queue))
+    with TestClient(app, base_url="http://127.0.0.1:8000") as http:
+        assert http.post("/v1/webhooks", json={"url": ADDRESS}).status_code == 409
+
+
+@pytest.fixture
+def two(settings: Settings, parts: Parts) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
+    keys = KeyFile(settings.resolved_keys_file)
+    people = {
+        name: {"Authorization": f"Bearer {keys.add(name, Scope.SUBMIT, project=project)}"}
+        for name, project in {"ann": "red", "bob": "blue"}.items()
+    }
+    with TestClient(create_app(settings, parts), base_url="https://graspd.example") as client:
+        yield client, people
+
+
+def test_a_project_is_told_of_its_own_ends_alone(
+    two: tuple[TestClient, dict[str, dict[str, str]]], parts: Parts
+) -> None:
+    client, people = two
+    ear = Ear(parts)
+    hook = client.post("/v1/webhooks", json={"url": ADDRESS}, headers=people["bob"]).json()
+    for who in people:
+        job = client.post("/v1/jobs", json=JOB, headers=people[who]).json()["id"]
+        client.post(f"/v1/jobs/{job}/cancel", headers=people[who])
+    assert ear.round() == 1 and json.loads(ear.heard[0][1])["subject"] == job
+    assert [one["subject"] for one in client.get("/v1/events", headers=people["bob"]).json()["items"]] == [job]
+    address = f"/v1/webhooks/{hook['id']}"
+    assert client.get("/v1/webhooks", headers=people["ann"]).json() == []
+    assert client.get(f"{address}/deliveries", headers=people["ann"]).status_code == 404
+    assert client.delete(address, headers=people["ann"]).status_code == 404

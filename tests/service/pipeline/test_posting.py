@@ -1,0 +1,133 @@
+"""POST to addresses of strangers: which machines it reaches, and what an answer may do."""
+
+from __future__ import annotations
+
+import http.server
+import ipaddress
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from service.model.errors import InputError
+from service.model.webhooks import check_url
+from service.pipeline import posting
+from service.pipeline.posting import is_public, networks, post
+
+LOOPBACK = networks("127.0.0.0/8")
+
+
+class Ear(http.server.BaseHTTPRequestHandler):
+    """Notes what it is sent; answers as the path says."""
+
+    heard: list[tuple[str, bytes, dict[str, str]]]
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.heard.append((self.path, body, dict(self.headers)))
+        status = int(self.path.rpartition("/")[2])
+        self.send_response(status)
+        if 300 <= status < 400:
+            self.send_header("Location", f"http://127.0.0.1:{self.server.server_address[1]}/stolen/200")
+        self.send_header("Content-Length", "2000000000")
+        self.end_headers()
+        self.wfile.write(b"x" * 5000)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def ear() -> Iterator[tuple[str, list[Any]]]:
+    Ear.heard = []
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Ear) as server:
+        server.daemon_threads = True
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}", Ear.heard
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("address", "public"),
+    [
+        ("8.8.8.8", True), ("2606:4700::1111", True),
+        ("127.0.0.1", False), ("127.9.9.9", False), ("0.0.0.0", False), ("10.0.0.1", False), ("172.16.3.4", False),
+        ("192.168.1.1", False), ("169.254.169.254", False), ("100.64.0.1", False), ("224.0.0.1", False),
+        ("255.255.255.255", False), ("192.0.2.1", False), ("240.0.0.1", False),
+        ("::1", False), ("::", False), ("fe80::1", False), ("fd00::1", False), ("fec0::1", False), ("ff02::1", False),
+        ("::ffff:127.0.0.1", False), ("::ffff:169.254.169.254", False), ("2002:7f00:1::", False),
+        ("64:ff9b::a9fe:a9fe", False), ("2001:0:1::1", False),
+    ],
+)  # fmt: skip
+def test_only_machines_of_the_internet_are_public(address: str, public: bool) -> None:
+    assert is_public(ipaddress.ip_address(address)) is public
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]", "[::ffff:127.0.0.1]", "localhost", "2130706433", "0x7f.1"])
+def test_no_way_of_writing_this_machine_reaches_it(ear: tuple[str, list[Any]], host: str) -> None:
+    port = ear[0].rpartition(":")[2]
+    answer = post(f"http://{host}:{port}/in/200", b"{}", {}, patience_s=5)
+    assert answer.status is None and not ear[1]
+
+
+def test_a_name_is_looked_at_once_and_asked_where_it_was_then(
+    ear: tuple[str, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = int(ear[0].rpartition(":")[2])
+    answers = iter(["93.184.216.34", "127.0.0.1"])
+    dialled: list[Any] = []
+
+    def resolve(host: str, *_: Any, **__: Any) -> Any:
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (next(answers), port))]
+
+    def dial(address: Any, **_: Any) -> Any:
+        dialled.append(address)
+        raise OSError("no way there in a test")
+
+    monkeypatch.setattr(posting.socket, "getaddrinfo", resolve)
+    monkeypatch.setattr(posting.socket, "create_connection", dial)
+    assert post(f"http://rebound.example:{port}/in/200", b"{}", {}).status is None
+    assert dialled == [("93.184.216.34", port)] and not ear[1]
+
+
+def test_a_name_of_which_one_address_is_private_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [(socket.AF_INET, 1, 6, "", (one, 80)) for one in ("93.184.216.34", "10.0.0.7")]
+    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: found)
+    answer = post("http://both.example/", b"{}", {})
+    assert answer.status is None and "GRASPD_WEBHOOK_NETWORKS" in answer.detail
+
+
+def test_where_the_operator_allows_it_the_body_arrives(ear: tuple[str, list[Any]]) -> None:
+    answer = post(f"{ear[0]}/in/200", b"body", {"X-Mine": "yes"}, allowed=LOOPBACK)
+    assert answer.is_taken
+    path, body, headers = ear[1][0]
+    assert (path, body, headers["X-Mine"]) == ("/in/200", b"body", "yes")
+
+
+@pytest.mark.parametrize("status", [301, 302, 307, 308])
+def test_redirects_are_not_followed(ear: tuple[str, list[Any]], status: int) -> None:
+    answer = post(f"{ear[0]}/in/{status}", b"body", {}, allowed=LOOPBACK)
+    assert not answer.is_taken and "not followed" in answer.detail
+    assert [path for path, _, _ in ear[1]] == [f"/in/{status}"]
+
+
+def test_an_address_that_never_answers_is_given_up() -> None:
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        answer = post(f"http://127.0.0.1:{silent.getsockname()[1]}/", b"{}", {}, allowed=LOOPBACK, patience_s=0.2)
+    assert answer.status is None and not answer.is_taken
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["ftp://a.example/", "file:///etc/passwd", "https://", "https://me:pw@a.example/", "https://a.example/\r\nX: y",
+     "https://a.example:99999/", "https://" + "a" * 600, "https://[::1", "https://ä.example/"],
+)  # fmt: skip
+def test_what_is_no_address_is_refused_when_it_is_made(url: str) -> None:
+    with pytest.raises(InputError):
+        check_url(url)
