@@ -31,8 +31,9 @@ from __future__ import annotations
 import re
 from typing import ClassVar, Final
 
-#: Control characters and every line or paragraph separator that `str.splitlines` knows.
-_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+#: Line breaks with the space around them, all that `str.splitlines` knows; control characters.
+_BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class GraspdError(Exception):
@@ -47,7 +48,9 @@ class GraspdError(Exception):
         # A quoted key, file name or message of a library may carry line breaks and escapes: they would forge lines in
         # logs and terminals. What a printable text holds stays as it is.
         text = super().__str__()
-        return text if text.isprintable() else _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
+        if text.isprintable():
+            return text
+        return _CONTROL.sub(lambda found: repr(found[0])[1:-1], _BREAK.sub(" ", text))
 
 
 class InputError(GraspdError):

@@ -61,6 +61,8 @@ def test_each_version_of_worker_takes_what_it_can_and_the_keeper_holds_back_the_
         return house.parts.index.jobs.get(job).state
 
     older_worker(house, tmp_path / "previous")
+    # While there is no worker, those of this version are expected.
+    house.until(house.parts.queue.workers, "the older worker says that it is there")
     before = submit(1, revision=OLD)
     house.start("keeper", sys.executable, "-c", MAKES.format(NEW) + "from graspd.cli import main; main()", "keeper")
     house.until(lambda: state(before) is State.SUCCEEDED, "the older worker does what was planned before the upgrade")

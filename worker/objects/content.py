@@ -32,7 +32,11 @@ def content_of(model: Any) -> str:
 def _told(model: Any) -> dict[str, Any]:
     """Fields of a dataclass that say something."""
     values = {f: getattr(model, f.name) for f in fields(model)}
-    return {f.name: value for f, value in values.items() if not (f.metadata.get("told_if_set") and value == f.default)}
+    return {
+        f.name: value
+        for f, value in values.items()
+        if not (f.metadata.get("told_if_set") and type(value) is type(f.default) and value == f.default)
+    }
 
 
 def _parts(value: Any) -> Iterator[bytes]:

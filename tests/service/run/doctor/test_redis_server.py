@@ -70,7 +70,7 @@ def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(own: Settings, clien
 
 
 def test_a_full_memory_is_bad(own: Settings, client: Redis) -> None:
-    client.config_set("maxmemory", "1mb")
+    client.config_set("maxmemory", str(client.info("memory")["used_memory"]))
     found = redis(own)
     assert not found.ok
     assert "MiB are used" in found.message
