@@ -123,7 +123,7 @@ class Bench:
 def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     lines = [
         "# Shadow grasps in a foreign model", "",
-        "`python -m benchmarks.foreign DATA --sources /tmp/hands --out docs/results/foreign --objects ...`: "
+        "`python -m benchmarks.foreign DATA --sources SOURCES --out docs/results/foreign --objects ...`: "
         f"{facts['grasps']} raw standard grasps on each object, seed {facts['seed']}, planned with the URDF, "
         "judged by the certificate in it (*nominal*) and in robopianist's MJCF (*foreign*), fingertips within "
         f"{facts['fingertips_mm']:.2f} mm. Counts: grasps that hold nominally and, of these, in the foreign model.", "",
