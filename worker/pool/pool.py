@@ -215,7 +215,8 @@ class _Place:
     def do(self, piece: _Piece) -> Any:
         """The result of a piece of work; raises ProcessLost, or what the work raised."""
         try:
-            if self.process is None or self.process.poll() is not None:
+            if self._is_gone():
+                self._stop()
                 self.start()
             assert self._connection is not None
             self._connection.send_bytes(pickle.dumps(self._order(piece)))
@@ -232,6 +233,13 @@ class _Place:
         if not succeeded:
             raise made
         return made
+
+    def _is_gone(self) -> bool:
+        """Whether there is no process, or it ended while it waited: one that waits sends nothing but the end of its
+        connection, which is there before the system tells that it ended."""
+        if self.process is None or self._connection is None or self.process.poll() is not None:
+            return True
+        return self._connection.poll()
 
     def _order(self, piece: _Piece) -> Order:
         asked, forget = piece.asked, list[str]()
