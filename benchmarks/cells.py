@@ -6,10 +6,11 @@ on where it was, and two studies share their grasps and verdicts. Another folder
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -119,6 +120,17 @@ def write_json(file: Path, value: object) -> None:
     partial = file.with_suffix(f".{os.getpid()}.tmp")
     partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
     partial.replace(file)
+
+
+def cell_parser(doc: str | None, *, objects: Sequence[str] | None = None, grasps: int = 64) -> argparse.ArgumentParser:
+    """What a study of cells is told: `data`, `--work`, `--hands`, `--objects`, `--grasps`, with these defaults."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    parser.add_argument("--objects", nargs="+", default=objects)
+    parser.add_argument("--grasps", type=int, default=grasps, help="raw grasps of each hand on each object")
+    return parser
 
 
 def cells(data: Path, work: Path, hand_name: str, count: int, objects: list[str] | None = None) -> Iterator[Cell]:

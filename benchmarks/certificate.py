@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import HANDS, cells, write_json
+from cells import cell_parser, cells, write_json
 
 from worker.quality.intervals import wilson
 
@@ -70,12 +70,7 @@ def lines(one: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=64)
+    parser = cell_parser(__doc__)
     parser.add_argument("--hard", action="store_true", help="the hard protocol too")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import HANDS, Cell, cells, write_json
+from cells import Cell, cell_parser, cells, write_json
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -132,12 +132,7 @@ def legend(found: dict[str, Any]) -> list[Line2D]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=64)
+    parser = cell_parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     args = parser.parse_args()
     found = collect(args)

@@ -6,13 +6,11 @@ DATA_DIR holds hands/ and objects/. Prints Markdown. Stopped runs go on, grasps 
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
-from cells import HANDS, Cell, cells
+from cells import Cell, cell_parser, cells
 
 from service.model.diversity import CELLS, GraspType, entropy_bits
 from worker.quality.diversity import distances, hand_points
@@ -39,12 +37,7 @@ def line(cell: Cell) -> tuple[str, list[int]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=64)
+    parser = cell_parser(__doc__)
     args = parser.parse_args()
     sys.stdout.write(
         f"| hand | object | nearest, mm | {' | '.join(f'< {n} mm' for n in NEAR_MM)} | power | precision | lateral "

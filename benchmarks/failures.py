@@ -7,7 +7,6 @@ Writes failures.md, failures.json and a picture for each of the worst objects un
 
 from __future__ import annotations
 
-import argparse
 import io
 import sys
 from collections import Counter
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import HANDS, SEED, Cell, cells, write_json
+from cells import SEED, Cell, cell_parser, cells, write_json
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -131,12 +130,7 @@ def picture(cell: Cell, found: dict[str, Any], file: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=64)
+    parser = cell_parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     args = parser.parse_args()
     lines = [

@@ -10,7 +10,6 @@ runs go on (see cells.py); the first judge's own verdicts are made anew.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import HANDS, Cell, cells, write_json
+from cells import Cell, cell_parser, cells, write_json
 
 from worker.engines.devices import Device, cpu_name
 from worker.engines.mujoco_warp import mujoco_warp
@@ -140,13 +139,8 @@ def speed_line(r: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
+    parser = cell_parser(__doc__, objects=list(OBJECTS), grasps=48)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+", default=list(OBJECTS))
-    parser.add_argument("--grasps", type=int, default=48)
     parser.add_argument("--speed", nargs="*", type=int, default=[])
     parser.add_argument("--worlds", nargs="+", type=int, default=[256])
     parser.add_argument("--no-agreement", action="store_true", help="speed alone")

@@ -7,13 +7,12 @@ cell (hand, object) is kept under `--work` (see cells.py); a whole run takes som
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import HANDS, SEED, Cell, cells, write_json
+from cells import SEED, Cell, cell_parser, cells, write_json
 
 from service.model.version import PACKAGE_VERSION
 from worker.quality.contact import contact_distance_consistency_mm
@@ -132,12 +131,7 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=64)
+    parser = cell_parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     args = parser.parse_args()
     for hand in args.hands:

@@ -8,7 +8,6 @@ robust.json and robust.md. Stopped runs go on (see cells.py).
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections import Counter
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import HANDS, Cell, cells, write_json
+from cells import Cell, cell_parser, cells, write_json
 
 from service.model.robust import MEANINGS, MODELS, Axis
 from worker.quality.intervals import wilson
@@ -162,12 +161,7 @@ def _cell(counts: list[int] | None) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+", default=OBJECTS)
-    parser.add_argument("--grasps", type=int, default=16, help="raw grasps of each hand on each object")
+    parser = cell_parser(__doc__, objects=OBJECTS, grasps=16)
     parser.add_argument("--draws", type=int, default=2, help="models of each axis for each grasp")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()

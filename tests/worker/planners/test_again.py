@@ -24,10 +24,10 @@ def parts(count: int, threads: int = 1) -> planner.Part:
 
 
 def test_what_balances_poorly_sets_out_once_more_and_the_better_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner, "POOR", np.inf)
+    monkeypatch.setattr(planner, "SET_OUT_AGAIN", np.inf)
     once = parts(6)
     limit = float(np.median(once.merit))
-    monkeypatch.setattr(planner, "POOR", limit)
+    monkeypatch.setattr(planner, "SET_OUT_AGAIN", limit)
     twice = parts(6)
     poor = once.merit > limit
     assert poor.sum() == 3

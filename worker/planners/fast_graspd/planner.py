@@ -44,7 +44,7 @@ CHUNK: Final = 10
 #: Fewest grasps worth a thread of their own.
 PART: Final = 4
 #: A grasp whose merit is above this sets out once more: of such grasps a fifth (Shadow) to a half hold, of others most.
-POOR: Final = 0.05
+SET_OUT_AGAIN: Final = 0.05
 
 
 @dataclass
@@ -251,7 +251,7 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
 
 def _tried_again(launch: _Launch, part: Part) -> Part:
     """Grasps of free objects that balance poorly set out once more; of both the better one stays."""
-    poor = np.flatnonzero(part.merit > POOR)
+    poor = np.flatnonzero(part.merit > SET_OUT_AGAIN)
     if launch.batches.placed is not None or not len(poor):
         return part
     begun = _set_out(launch, part.rows[poor], attempt=1)
