@@ -28,7 +28,7 @@ def figures(cell: Trial) -> dict[str, Any]:
     seconds, batch = np.array(cell.seconds), cell.setting.batch
     draws = _draws(cell)
     row: dict[str, Any] = {
-        "seconds": [round(s, 4) for s in cell.seconds],
+        "seconds": [round(s, 6) for s in cell.seconds],
         "processor_seconds_per_grasp": sum(cell.processor_seconds) / len(held),
         "grasps": len(held),
         "valid": int(held.sum()),
