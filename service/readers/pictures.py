@@ -97,7 +97,11 @@ class Pictures(Sequence[dict[str, Any]]):
         with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
             # Grasps that were planned in their scenes bring these along in their base shard.
-            scene_shard = str(opened.attrs.get("base_shard") or opened.attrs["scene_shard"])
+            scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
+            if not scene_shard:
+                raise InputError(
+                    f"shard {file.id} does not say which shard has its scenes; take the pictures again: graspd render"
+                )
             if absent := [name for name in self.columns if name not in opened]:
                 raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")
         held = self._scenes_of(scene_shard)

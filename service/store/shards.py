@@ -122,6 +122,9 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "verdict by the letter of the protocol: 1 held, 0 dropped, -1 not audited",
             optional=True,
         ),
+        "quality/published": Column(
+            "N", "i1", "bool", "none", "imported grasps: verdict that came with them: 1 held, 0 dropped, -1 none", True
+        ),
         **_measured(optional=True),
         "quality/robust_weakest": Column(
             "N",

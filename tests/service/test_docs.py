@@ -23,7 +23,7 @@ def test_every_part_stands_on_some_page() -> None:
 
 
 def test_settings_named_in_the_docs_exist() -> None:
-    pages = [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md"), REPOSITORY / "Makefile"]
+    pages = [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), REPOSITORY / "Makefile"]
     known = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
     for page in pages:
         named = set(re.findall(r"GRASPD_[A-Z][A-Z_]*[A-Z]", page.read_text()))
@@ -31,6 +31,6 @@ def test_settings_named_in_the_docs_exist() -> None:
 
 
 def test_local_links_of_the_docs_lead_somewhere() -> None:
-    for page in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/*.md")]:
+    for page in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md")]:
         for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"

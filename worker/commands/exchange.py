@@ -20,14 +20,16 @@ app = typer.Typer(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first of them goes by two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
-EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *ROBOTS)
-IMPORTS: Final = ("dexgraspbench", "dexgraspnet", "multidex", "ddgc", "reference")
+#: Formats that a network is trained on: they take a folder of shards.
+TRAINING: Final = ("dexlearn",)
+EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
+IMPORTS: Final = ("dexgraspbench", "dexlearn", "dexgraspnet", "multidex", "ddgc", "reference")
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
 @reporting_errors
 def export(
-    source: Annotated[Path, typer.Argument(help="A shard, or for webdataset a folder of shards.")],
+    source: Annotated[Path, typer.Argument(help="A shard, or for webdataset and training a folder of shards.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
     hand: Annotated[str | None, typer.Option(help="The shard's hand; default: found by its digest.")] = None,
     object_: Annotated[
@@ -52,6 +54,7 @@ def export(
     mount_pose: Annotated[
         str | None, typer.Option(help="The hand's root link in the mount: x y z qw qx qy qz.")
     ] = None,
+    held_out: Annotated[float, typer.Option(help="For training: share of the objects that are held out.")] = 0.2,
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
@@ -66,6 +69,11 @@ def export(
 
         wishes = Wishes(hand, object_, unjudged, every, best, tool, speed, arm, mount, base, mount_pose)
         done = export_grasps(source, format_, wishes, output)
+        written, notes = done.counts, done.notes
+    elif format_ in TRAINING:
+        from worker.files.training_export import TrainingWishes, export_training
+
+        done = export_training(source, format_, TrainingWishes(hand, object_, unjudged, every, held_out), output)
         written, notes = done.counts, done.notes
     elif format_ == "webdataset":
         written = _webdataset(source, output, unjudged=unjudged, every=every)
@@ -125,7 +133,7 @@ def import_(
         return
     for one in found:
         judged = "nobody judged them" if referee == "none" else f"{one['valid']} valid at level {referee}"
-        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['sound']} sound, {judged}")
+        typer.echo(f"{one['file']}: {one['grasps']} grasps, {one['sound']} sound, {judged}{_compared(one)}")
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
@@ -144,7 +152,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         return reference.read(source, hand=hand, obj=obj)
     if hand is None or obj is None:
         raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
-    if format_ == "dexgraspbench":
+    if format_ in ("dexgraspbench", "dexlearn"):
         return dexgraspbench.read(source, hand=hand, obj=obj)
     if format_ == "dexgraspnet":
         return dexgraspnet.read(source, hand=hand, obj=obj)
@@ -189,10 +197,21 @@ def _bench(
     return {"grasps": len(written), "files": len(written)}
 
 
+def _compared(one: dict[str, Any]) -> str:
+    """How the verdicts that came with imported grasps agree with ours."""
+    if not one["published"]:
+        return ""
+    words = f"; {one['published']} came with a verdict"
+    return words if one["agreement_published"] is None else f"{words}, {one['agreement_published']:.0%} of them as ours"
+
+
 def _summary(file: Path) -> dict[str, Any]:
     shard = read_shard(file, kind="base")
     valid, sound = standing.valid(shard.arrays), standing.sound(shard.arrays)
+    said = np.asarray(shard.arrays.get("quality/published", np.full(len(valid), -1)))
+    both = (said >= 0) & standing.judged(shard.arrays)
+    agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
     return {
         "file": str(file), "object": shard.attributes["object"], "grasps": len(valid), "valid": int(valid.sum()),
-        "sound": int(sound.sum()),
+        "sound": int(sound.sum()), "published": int((said >= 0).sum()), "agreement_published": agree,
     }  # fmt: skip

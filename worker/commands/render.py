@@ -22,7 +22,7 @@ from service.store.shards import Shard, read_shard, write_shard
 from worker.commands.grasp_sheet import GraspSheet
 from worker.engines.devices import Device
 from worker.files.choice import EveryOption, UnjudgedOption, choose
-from worker.files.of_shard import INHERITED, hand_of_shard, neighbours_of_shard, object_of_shard
+from worker.files.of_shard import INHERITED, hand_of_shard, id_of_columns, made_of, neighbours_of_shard, object_of_shard
 from worker.rendering.camera_file import SAMPLED, read_cameras
 from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
@@ -95,9 +95,8 @@ def render(
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
     kept = {key: scene.attributes[key] for key in (*inherited, "scene") if key in scene.attributes}
-    output.write_bytes(
-        write_shard("views", result, {**kept, "seed": number, "device": used, "seconds": round(seconds, 4)})
-    )
+    kept |= made_of(scene) | {"seed": number, "device": used, "seconds": round(seconds, 4)}
+    output.write_bytes(write_shard("views", result, {**kept, "shard_id": id_of_columns(result)}))
     count = len(result["image/rgb"])
     if page is not None:
         title = f"Views of {scene.attributes.get('object', 'the object')}"

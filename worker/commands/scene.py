@@ -11,7 +11,15 @@ import typer
 from service.cli import JsonFlag, emit, reporting_errors
 from service.store.attributes import Attribute
 from service.store.shards import read_shard, write_shard
-from worker.files.of_shard import INHERITED, NEIGHBOUR_FACE_ERROR_M, beside_attributes, hand_of_shard, object_of_shard
+from worker.files.of_shard import (
+    INHERITED,
+    NEIGHBOUR_FACE_ERROR_M,
+    beside_attributes,
+    hand_of_shard,
+    id_of_columns,
+    made_of,
+    object_of_shard,
+)
 from worker.grasps import Posture
 from worker.objects.prepare import object_from_path
 from worker.scenes.clearance import count_rejections, transfer
@@ -51,7 +59,7 @@ def scene(
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
-    attributes |= beside_attributes(others, with_ or [])
+    attributes |= beside_attributes(others, with_ or []) | made_of(base) | {"shard_id": id_of_columns(result)}
     output.write_bytes(write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     reasons = count_rejections(result["grasp/rejection"])

@@ -21,6 +21,7 @@ from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
 from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
 from service.store.shards import write_shard
+from worker.files.of_shard import id_of_columns
 from worker.files.synthesis import chosen_fidelity, synthesized
 from worker.planners import PLANNERS
 from worker.planners.registry import parsed_options
@@ -109,7 +110,7 @@ def synth(
             hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
             first_judge=settings.first_judge, join=join, processes=settings.processes, progress=progress,
         )  # fmt: skip
-    out.write_bytes(write_shard("base", made.arrays, made.attributes))
+    out.write_bytes(write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)}))
     found = {"file": str(out), **made.summary()}
     if json:
         emit(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,6 +18,7 @@ from service.readers.ways import scene_spec_of
 from service.store.attributes import Attribute
 from service.store.shards import Shard
 from worker.files.origin import Found, Sought, at, find, options_of
+from worker.grasps import Columns
 from worker.hands.load import files_from_path, hand_from_path, load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -156,6 +158,21 @@ def _check(shard: Shard, kind: str, digest: str, given: str | None) -> None:
             f"the {shard.kind} shard was made with the {kind} of digest {expected[:12]}, but {name!r} has "
             f"{digest[:12]}; give the file it was made with as --{kind}"
         )
+
+
+def id_of_columns(columns: Columns) -> str:
+    """Id of a shard that no job made: a digest of its columns, so that later shards can name it."""
+    found = hashlib.sha256()
+    for name in sorted(columns):
+        array = np.ascontiguousarray(columns[name])
+        found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
+def made_of(source: Shard) -> dict[str, Attribute]:
+    """What a later shard says of the shard whose scenes or grasps it is made of."""
+    return {f"{source.kind}_shard": str(source.attributes.get("shard_id") or id_of_columns(source.arrays))}
 
 
 #: What every later shard says about the job it comes from.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +15,7 @@ from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
 from worker.files.choice import choose
 from worker.files.exchange.robots.bundle import Bundle, Carrier
+from worker.files.exchange.written import Written
 from worker.files.of_shard import hand_files_of_shard
 from worker.hands.description import Description, describe
 from worker.quality.referee.decomposition import decompose
@@ -49,15 +50,6 @@ class Wishes:
     mount: str | None = None
     base: str | None = None
     mount_pose: str | None = None
-
-
-@dataclass
-class Written:
-    """What came of an export."""
-
-    counts: dict[str, Any]
-    notes: list[str] = field(default_factory=list)
-    """Lines for the user: what was assumed, what was left out and why."""
 
 
 def export_grasps(source: Path, format_: str, wishes: Wishes, folder: Path, run: Run = ALONE) -> Written:

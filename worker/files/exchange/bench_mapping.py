@@ -20,9 +20,11 @@ Floats = NDArray[np.float64]
 
 #: Folder of the grasps of an experiment; the mapping lies beside it.
 GRASPS: Final = "graspdata"
+#: Folder of grasps that were collected for training.
+COLLECTED: Final = "succ_collect"
 FILE: Final = "hand_mapping.json"
-#: Folders that the evaluator makes beside the grasps, of files with the same fields.
-_FOLDERS: Final = (GRASPS, "evaluation", "succgrasp")
+#: Folders of files with the same fields: grasps, and what the evaluator makes of them.
+_FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
 
 @dataclass(frozen=True)

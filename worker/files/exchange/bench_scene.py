@@ -8,6 +8,7 @@ Besides the fields of every grasp: `approach_qpos` (W, 7 + J) from the standoff 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
-from service.model.transforms import compose, invert
+from service.model.transforms import IDENTITY_POSE, compose, invert
 from worker.files.exchange.bench_mapping import HandMapping
+from worker.files.exchange.pickles import load_npy
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.scenes.kinds import supports_of
@@ -67,6 +69,33 @@ def placed_of(obj_pose: Floats) -> Placed:
     number = np.empty(len(order), np.intp)
     number[order] = np.arange(len(order))
     return Placed(supports_of(SceneSpec(kind="table")), obj_pose[first[order]], number[index.reshape(-1)])
+
+
+def object_of_scene(file: Path, scene_path: str) -> Row:
+    """`obj_pose` and `obj_scale` of the object that a scene is about.
+
+    Args:
+        file: a grasp's file that names the scene.
+        scene_path: relative to a folder above `file`, and below its `assets`.
+
+    Raises:
+        InputError: it leads elsewhere, there is no such file, or it is no scene.
+    """
+    place = PurePosixPath(scene_path)
+    if place.is_absolute() or ".." in place.parts or place.parts[:1] != ("assets",):
+        raise InputError(f"{file} names the scene {scene_path!r}; a scene lies below assets/")
+    path = next((above / place for above in file.resolve().parents if (above / place).is_file()), None)
+    if path is None:
+        raise InputError(f"{file} names the scene {scene_path}, which is in no folder above; keep assets/ whole")
+    found = load_npy(path)
+    try:
+        thing = found["scene"][found["task"]["obj_name"]]
+        pose, scale = np.ravel(thing["pose"]).astype(float), np.ravel(thing["scale"]).astype(float)
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise InputError(f"{path} is no scene with a task and its object") from None
+    if pose.shape != IDENTITY_POSE.shape or not len(scale) or np.ptp(scale) > SAME:
+        raise InputError(f"{path}: the object has a pose of {pose.size} numbers and the scale {scale.tolist()}")
+    return {"obj_pose": pose, "obj_scale": float(scale[0])}
 
 
 def with_way(

@@ -22,7 +22,15 @@ from service.model.transforms import IDENTITY_POSE, compose, invert
 from worker.files.exchange.bench_hand import joint_order, write_hand
 from worker.files.exchange.bench_mapping import GRASPS, HandMapping, link_names, mapping_of, of_the_benchmark
 from worker.files.exchange.bench_object import SCALE, write_object, write_table
-from worker.files.exchange.bench_scene import TABLETOP, check_table, is_tabletop, placed_of, tabletop_fields, with_way
+from worker.files.exchange.bench_scene import (
+    TABLETOP,
+    check_table,
+    is_tabletop,
+    object_of_scene,
+    placed_of,
+    tabletop_fields,
+    with_way,
+)
 from worker.files.exchange.imported import Imported, plain_name
 from worker.files.exchange.objects import scaled_object
 from worker.files.exchange.pickles import load_npy
@@ -61,8 +69,8 @@ def read(path: Path, *, hand: str, obj: str) -> list[Imported]:
         raise InputError(f"{path} holds grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
     sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
     for file in files:
-        row = _row(file)
-        sets[_scale(row), is_tabletop(row)].append(row)
+        for row in _rows(file):
+            sets[_scale(row), is_tabletop(row)].append(row)
     model, mapping = hand_from_path(hand), mappings.pop()
     return [
         _set(path, model, scaled_object(obj, scale), rows, scale, mapping, on_table=on_table)
@@ -89,14 +97,8 @@ def write(
     """
     if placed is not None:
         check_table(placed)
-    name, config = plain_name(obj.name), f"{NAME}_{plain_name(hand.name)}"
+    name = plain_name(obj.name)
     obj_path, scene = write_object(obj, name, folder)
-    model = write_hand(hand, config, folder)
-    order = joint_order(folder / model)
-    ours = HandMapping(
-        hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), tuple((j, j) for j in order),
-        link_names(hand),
-    )  # fmt: skip
     scenes = {0: (IDENTITY_POSE, scene)}
     number = np.zeros(len(grasps), np.intp)
     if placed is not None:
@@ -104,8 +106,8 @@ def write(
         poses = np.asarray(placed.object_pose, float)
         scenes = {k: (poses[k], write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))}
     paths: list[Path] = []
-    for mapping in filter(None, (ours, of_the_benchmark(hand))):
-        out = folder / "output" / f"{NAME if placed is None else f'{NAME}_{TABLETOP}'}_{mapping.config}"
+    for mapping in models_of(hand, folder):
+        out = folder / "output" / f"{experiment(placed)}_{mapping.config}"
         out.mkdir(parents=True, exist_ok=True)
         mapping.write(out)
         written = [out / GRASPS / name / f"{SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
@@ -115,30 +117,74 @@ def write(
                 "obj_path": obj_path.as_posix(), "obj_scale": 1.0, "obj_pose": pose.copy(),
                 "scene_path": path.as_posix(),
             }  # fmt: skip
-            record |= _postures(mapping, hand, grasps, row, None if placed is None else pose)
+            record |= postures(mapping, hand, grasps, row, None if placed is None else pose)
+            if placed is not None:
+                record |= tabletop_fields(mapping, hand, grasps, row, pose)
             file.parent.mkdir(parents=True, exist_ok=True)
             np.save(file, np.array(record, dtype=object), allow_pickle=True)
         paths = paths or written
     return paths
 
 
-def _postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
+def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
+    """How the hand lies in each model that grasps are written for: our own, which is written below `folder`, and the
+    benchmark's where it has the hand."""
+    config = f"{NAME}_{plain_name(hand.name)}"
+    model = write_hand(hand, config, folder)
+    order = joint_order(folder / model)
+    ours = HandMapping(
+        hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), tuple((j, j) for j in order),
+        link_names(hand),
+    )  # fmt: skip
+    return [ours, *filter(None, [of_the_benchmark(hand)])]
+
+
+def experiment(placed: Placed | None) -> str:
+    """Name of the experiment: free grasps and grasps on tables are two."""
+    return NAME if placed is None else f"{NAME}_{TABLETOP}"
+
+
+def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
     """The `..._qpos` of a grasp: around the origin, or where the object stands at `pose` (7,) on a table."""
     record: Row = {}
     for name in POSTURES:
         found: Posture = getattr(grasps, name)
         root = found.hand_pose[row] if pose is None else compose(pose, found.hand_pose[row])
         record[f"{name}_qpos"] = mapping.qpos(hand, root, found.joint_positions[row])
-    return record if pose is None else record | tabletop_fields(mapping, hand, grasps, row, pose)
+    return record
 
 
-def _row(file: Path) -> Row:
+def _rows(file: Path) -> list[Row]:
+    """The grasps of a file: one, or, where `..._qpos` have an axis more, as many as that is long.
+
+    A file that does not say where its object stands names a scene that does.
+    """
     found = load_npy(file)
     if not isinstance(found, dict):
         raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
     if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
         raise InputError(f"{file} has no {missing[0]}")
-    return found
+    if "obj_pose" not in found and "scene_path" in found:
+        found |= object_of_scene(file, str(found["scene_path"]))
+    count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}
+    if count == {0}:
+        return [_scaled(found)]
+    if len(count) > 1 or 0 in count:
+        raise InputError(f"{file}: pregrasp, grasp and squeeze are not as many as one another")
+    return [_scaled({key: _part(value, k, count) for key, value in found.items()}) for k in range(min(count))]
+
+
+def _part(value: Any, k: int, count: set[int]) -> Any:
+    """Of what a file has for each of its grasps that of grasp k; of them all what it has once."""
+    each = isinstance(value, np.ndarray) and value.ndim > 0 and {len(value)} == count and value.dtype != object
+    return value[k] if each else value
+
+
+def _scaled(row: Row) -> Row:
+    """With `scene_scale` put on the object's scale."""
+    if "scene_scale" not in row:
+        return row
+    return row | {"obj_scale": _scale(row) * float(np.ravel(row["scene_scale"])[0])}
 
 
 def _scale(row: Row) -> float:

@@ -68,6 +68,8 @@ def write_scored(
     }  # fmt: skip
     attributes |= base_attributes(found.hand, request, tried=made.tried, verdict_key=made.verdict_key)
     arrays = {**made.grasps.to_columns(), **made.columns}
+    if found.published is not None and (found.published >= 0).any():
+        arrays["quality/published"] = found.published
     if scenes is not None:
         # A table is the only scene that other formats have.
         attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
