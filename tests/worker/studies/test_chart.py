@@ -51,7 +51,8 @@ def test_every_run_has_the_keys_of_the_contract(made: tuple[dict[str, Any], Path
 def test_valid_grasps_per_second_are_those_that_held_over_the_seconds(made: tuple[dict[str, Any], Path]) -> None:
     for run in made[0]["runs"]:
         used = sum(run["seconds"])
-        rounded = 0.5e-6 * len(run["seconds"]) / used  # seconds are printed to the microsecond, the rate is not rounded so
+        # Seconds are printed to the microsecond, the rate is not rounded so.
+        rounded = 0.5e-6 * len(run["seconds"]) / used
         assert run["valid_per_second"] == pytest.approx(run["valid"] / used, rel=1e-5 + rounded)
         assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"])
         assert run["gsr_low"] <= run["gsr"] <= run["gsr_high"]

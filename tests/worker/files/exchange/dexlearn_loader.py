@@ -89,7 +89,7 @@ class Data:
 
 
 def _glob(pattern: str) -> list[str]:
-    return glob(pattern, recursive=True)  # noqa: PTH207: its pattern `**.npy` is none for pathlib
+    return glob(pattern, recursive=True)  # noqa: PTH207 (its pattern `**.npy` is none for pathlib)
 
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
