@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= 2
 
-.PHONY: clusters dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins audit clean
+.PHONY: clusters results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins audit clean
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
 
@@ -48,6 +48,11 @@ screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/dashb
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
+	$(BIN)/python -m benchmarks.results --pages
+
+results: $(STAMP) ## every figure and picture of the docs again, resumable (DATA=, SOURCES=, BEFORE=; QUICK=1: 20 minutes)
+	$(BIN)/python -m benchmarks.results $(if $(QUICK),--quick) $(if $(DATA),--data $(DATA)) \
+		$(if $(SOURCES),--sources $(SOURCES)) $(if $(BEFORE),--before $(BEFORE))
 
 gpu-check: $(STAMP) ## every kernel compiled for CUDA: registers, stack, spills (no GPU needed)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,gpu-check]'

@@ -1,7 +1,8 @@
 """What the studies of quality share: raw grasps of a hand on an object and what is found out about them, kept on disk.
 
-A cell is one (hand, object). What a cell has found once is read again from its folder, so a study that was stopped goes
-on where it was, and two studies share their grasps and verdicts. Another folder begins anew.
+A cell is one (hand, object) with a number of grasps. What a cell has found once is read again from its folder, so a
+study that was stopped goes on where it was, and two studies of as many grasps share them and their verdicts. Another
+folder begins anew.
 """
 
 from __future__ import annotations
@@ -122,12 +123,19 @@ def write_json(file: Path, value: object) -> None:
     partial.replace(file)
 
 
-def cell_parser(doc: str | None, *, objects: Sequence[str] | None = None, grasps: int = 64) -> argparse.ArgumentParser:
-    """What a study of cells is told: `data`, `--work`, `--hands`, `--objects`, `--grasps`, with these defaults."""
+def cell_parser(
+    doc: str | None, *, objects: Sequence[str] | None = None, grasps: int = 64, hands: bool = True
+) -> argparse.ArgumentParser:
+    """What a study of cells is told: `data`, `--work`, `--hands`, `--objects`, `--grasps`, with these defaults.
+
+    Args:
+        hands: whether it may be told which of `HANDS`.
+    """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--work", type=Path, default=Path("quality-work"))
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
+    if hands:
+        parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
     parser.add_argument("--objects", nargs="+", default=objects)
     parser.add_argument("--grasps", type=int, default=grasps, help="raw grasps of each hand on each object")
     return parser
@@ -139,4 +147,4 @@ def cells(data: Path, work: Path, hand_name: str, count: int, objects: list[str]
     for mesh in sorted((data / "objects").glob("*/clean.stl")):
         name = mesh.parent.name
         if not objects or name in objects:
-            yield Cell(work / hand_name / name, hand_name, name, hand, mesh, count)
+            yield Cell(work / f"{hand_name}-{count}" / name, hand_name, name, hand, mesh, count)

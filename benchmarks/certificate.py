@@ -1,6 +1,6 @@
 """What the cheap levels of the referee cost and how often they say what the letter of the protocol says.
 
-usage: python benchmarks/certificate.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FILE]
+usage: python -m benchmarks.certificate DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FILE]
 DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` gets the same as JSON. Stopped runs go on (see cells.py).
 Certified per second are those of both cores: held grasps over half the CPU time, which other programs disturb less
 than wall time.
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import cell_parser, cells, write_json
 
+from benchmarks.cells import cell_parser, cells, write_json
 from worker.quality.intervals import wilson
 
 CORES = 2

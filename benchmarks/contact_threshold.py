@@ -1,6 +1,6 @@
 """Figure 3 of the Fast-Grasp'D paper with our grasps: epsilon, wrench volume and contact area by contact threshold.
 
-usage: python benchmarks/contact_threshold.py DATA_DIR [--work DIR] [--hands allegro ...] [--out DIR]
+usage: python -m benchmarks.contact_threshold DATA_DIR [--work DIR] [--hands allegro ...] [--out DIR]
 DATA_DIR holds hands/ and objects/. Writes contact-threshold.json and contact-threshold.png to `--out`. Values are means
 over the 10 best grasps by epsilon (5 mm, friction 1) of each object; grasps come from the cells of `--work` (cells.py).
 """
@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import Cell, cell_parser, cells, write_json
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from results_tables import PAPER, TOP, metrics
 
+from benchmarks.cells import Cell, cell_parser, cells, write_json
+from benchmarks.results_tables import PAPER, TOP, metrics
 from worker.grasps import GraspSet, Posture
 from worker.quality.table import measure
 

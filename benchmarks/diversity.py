@@ -1,6 +1,6 @@
 """How different raw standard grasps are: near pairs, types, directions of approach.
 
-usage: python benchmarks/diversity.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--grasps 64]
+usage: python -m benchmarks.diversity DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--grasps 64]
 DATA_DIR holds hands/ and objects/. Prints Markdown. Stopped runs go on, grasps of other studies serve (see cells.py).
 """
 
@@ -10,8 +10,8 @@ import sys
 from collections import Counter
 
 import numpy as np
-from cells import Cell, cell_parser, cells
 
+from benchmarks.cells import Cell, cell_parser, cells
 from service.model.diversity import CELLS, GraspType, entropy_bits
 from worker.quality.diversity import distances, hand_points
 from worker.quality.table import measure

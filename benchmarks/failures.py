@@ -1,6 +1,6 @@
 """The failures that are left: the worst objects of each hand, what became of their grasps, and pictures of some.
 
-usage: python benchmarks/failures.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
+usage: python -m benchmarks.failures DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
 DATA_DIR holds hands/ and objects/. Raw standard grasps are judged at level certificate; stopped runs go on (cells.py).
 Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
 """
@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import SEED, Cell, cell_parser, cells, write_json
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
 from service.model.version import STAGE_REVISIONS
 from worker.hands.oppositions import oppositions_of
 from worker.quality.contact import contact_distance_consistency_mm
@@ -137,7 +137,7 @@ def main() -> None:
         "# The failures left\n",
         f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, judged at level `certificate` (revision "
         f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand the {WORST} objects on which least hold, of "
-        f"{len(args.objects or []) or 'all'} objects. Made by `python benchmarks/failures.py DATA --objects ...`; a "
+        f"{len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
         "margin is the worst motion over its limit. The pictures show the moment of contact: the first three fail, the "
         "last one holds. What is said of a pair are medians over its lost grasps.\n",
     ]

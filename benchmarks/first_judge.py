@@ -1,6 +1,6 @@
 """How often the first judge says what the certificate says, and how many grasps it judges a second.
 
-usage: python benchmarks/first_judge.py DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
+usage: python -m benchmarks.first_judge DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
            [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/first-judge]
 DATA_DIR holds hands/ and objects/. The first judge and the certificate judge the same raw grasps; agreement is that of
 the first judge's clear verdicts. `--speed N` times N grasps (those of the first cell of each hand, moved at random by
@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import Cell, cell_parser, cells, write_json
 
+from benchmarks.cells import Cell, cell_parser, cells, write_json
 from worker.engines.devices import Device, cpu_name
 from worker.engines.mujoco_warp import mujoco_warp
 from worker.grasps import GraspSet, Posture

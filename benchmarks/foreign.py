@@ -11,7 +11,6 @@ An object that is done is kept under `--work`, so a broken run goes on where it 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.cells import cell_parser
 from service.model.domain import FIDELITIES
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -57,21 +57,17 @@ Flags = NDArray[np.bool_]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
+    parser = cell_parser(__doc__, grasps=16, hands=False)
     parser.add_argument("--sources", type=Path, required=True, help="where robopianist was installed to")
-    parser.add_argument("--work", type=Path, default=Path("work-foreign"))
-    parser.add_argument("--grasps", type=int, default=16)
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--objects", nargs="*", help="default: all of DATA")
     parser.add_argument("--out", type=Path, required=True, help="OUT.json and OUT.md")
     asked = parser.parse_args()
-    asked.work.mkdir(parents=True, exist_ok=True)
+    (asked.work / "foreign").mkdir(parents=True, exist_ok=True)
     bench = Bench(asked.data / HAND, asked.sources / OTHER)
     names = asked.objects or sorted(path.parent.name for path in (asked.data / "objects").glob("*/clean.stl"))
     rows: dict[str, Any] = {}
     for name in names:
-        kept = asked.work / f"{name}-{asked.seed}-{asked.grasps}.json"
+        kept = asked.work / "foreign" / f"{name}-{asked.seed}-{asked.grasps}.json"
         if not kept.is_file():
             obj = object_from_path(
                 asked.data / "objects" / name / "clean.stl", face_error_m=FIDELITIES["standard"].face_error_m

@@ -4,8 +4,9 @@
     python -m benchmarks.gallery --sources /tmp/hands
 
 Nothing of the packages is run: their files are read as a user's folder is. Each hand goes through
-`graspd hands check`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content, so
-a broken run goes on where it was, and a hand that is read in another way is tried anew.
+`graspd hands check`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content and
+the planner's revision, so a broken run goes on where it was, and a hand that is read in another way, or that another
+planner would try, is tried anew. `--out FOLDER` takes another folder than docs/.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from PIL import Image
 
 from service.model.errors import GraspdError
+from service.model.version import STAGE_REVISIONS
 from worker.hands.jaws import jaws_of
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -29,9 +31,8 @@ from worker.rendering.pages.pictures import grasp_pictures
 from worker.stages.hand_self_test import GRASPS, READY, Best, failed, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
-RESULTS = Path("docs/results/hands-gallery.json")
-PAGE = Path("docs/hands-gallery.md")
-PICTURES = Path("docs/images/hands-gallery")
+#: Under the folder of the docs.
+RESULTS, PAGE, PICTURES = "results/hands-gallery.json", "hands-gallery.md", "images/hands-gallery"
 #: Two sides of the best grasp [px, rad].
 EDGE, SIDES = 220, (-0.6, 2.6)
 
@@ -113,25 +114,28 @@ def main() -> None:
     parser.add_argument("--sources", type=Path, required=True, help="where the packages were installed to")
     parser.add_argument("--only", help="names of hands, comma-separated")
     parser.add_argument("--grasps", type=int, default=GRASPS)
+    parser.add_argument("--out", type=Path, default=Path("docs"))
     asked = parser.parse_args()
     wanted = asked.only.split(",") if asked.only else [entry.name for entry in HANDS]
-    done: dict[str, Any] = json.loads(RESULTS.read_text())["hands"] if RESULTS.is_file() else {}
-    PICTURES.mkdir(parents=True, exist_ok=True)
+    results, pictures = asked.out / RESULTS, asked.out / PICTURES
+    done: dict[str, Any] = json.loads(results.read_text())["hands"] if results.is_file() else {}
+    pictures.mkdir(parents=True, exist_ok=True)
+    results.parent.mkdir(parents=True, exist_ok=True)
     for entry in HANDS:
         if entry.name in wanted:
-            row = tried(entry, asked.sources, asked.grasps, done.get(entry.name))
+            picture = pictures / f"{entry.name}.png"
+            row = tried(entry, asked.sources, asked.grasps, done.get(entry.name), picture)
             done[entry.name] = row
             sys.stderr.write(f"{entry.title}: {row['self_test']['says']}\n")
-            keep(done)
-    PAGE.write_text(page(done))
+            keep(done, results)
+    (asked.out / PAGE).write_text(page(done))
 
 
-def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | None) -> dict[str, Any]:
-    """The row of a hand: from before where it is the same hand and has a picture."""
-    picture = PICTURES / f"{entry.name}.png"
+def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | None, picture: Path) -> dict[str, Any]:
+    """The row of a hand: from before where hand and planner are the same and it has a picture."""
     try:
         hand = hand_from_path(sources / entry.path if entry.path else entry.name, entry.options)
-        key = f"{hand.content[:16]}-{grasps}"
+        key = f"{hand.content[:16]}-{grasps}-{STAGE_REVISIONS['synthesize']}"
         if before and before.get("key") == key and (picture.is_file() or not before["self_test"]["gsr"]):
             return before
         found = self_test(hand, grasps=grasps)
@@ -158,10 +162,10 @@ def draw(hand: HandModel, best: Best, picture: Path) -> None:
     picture.write_bytes(data.getvalue())
 
 
-def keep(done: dict[str, Any]) -> None:
+def keep(done: dict[str, Any], results: Path) -> None:
     order = [entry.name for entry in HANDS]
     rows = dict(sorted(done.items(), key=lambda item: order.index(item[0]) if item[0] in order else len(order)))
-    RESULTS.write_text(json.dumps({"ready": READY, "hands": rows}, indent=1) + "\n")
+    results.write_text(json.dumps({"ready": READY, "hands": rows}, indent=1) + "\n")
 
 
 def page(done: dict[str, Any]) -> str:

@@ -3,7 +3,8 @@
     python -m benchmarks.grippers DATA --sources /tmp/hands
 
 DATA holds objects/ (YCB and others); the sources are those of `benchmarks.gallery`. A cell that is done is kept in
-`docs/results/grippers.json` under the gripper's content, so a broken run goes on where it was.
+`docs/results/grippers.json` under the gripper's content and the planner's revision, so a broken run goes on where it
+was. `--out FOLDER` takes another folder than docs/results/.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from benchmarks.gallery import HANDS
 from service.model.domain import JobOptions
 from service.model.errors import InputError
+from service.model.version import STAGE_REVISIONS
 from worker.certified import certified_grasps
 from worker.hands.jaws import jaws_of
 from worker.hands.load import hand_from_path
@@ -28,7 +30,6 @@ from worker.objects.prepare import object_from_path
 GRIPPERS = ("franka", "robotiq-2f-85", "schunk-egk40", "umi", "robotiq-2f-140", "rethink", "robotiq-3f")
 #: Not a seed that any setting was chosen with.
 SEED = 404
-RESULTS, PAGE = Path("docs/results/grippers.json"), Path("docs/results/grippers.md")
 
 
 def main() -> None:
@@ -37,14 +38,17 @@ def main() -> None:
     parser.add_argument("--sources", type=Path, required=True)
     parser.add_argument("--grasps", type=int, default=12)
     parser.add_argument("--only", help="names of grippers, comma-separated")
+    parser.add_argument("--out", type=Path, default=Path("docs/results"))
     asked = parser.parse_args()
-    done: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+    asked.out.mkdir(parents=True, exist_ok=True)
+    results = asked.out / "grippers.json"
+    done: dict[str, Any] = json.loads(results.read_text()) if results.is_file() else {}
     entries = {entry.name: entry for entry in HANDS}
     objects = sorted(asked.data.glob("objects/*/clean.stl"))
     for name in asked.only.split(",") if asked.only else GRIPPERS:
         entry = entries[name]
         hand = hand_from_path(asked.sources / entry.path, entry.options)
-        key = f"{hand.content[:16]}-{asked.grasps}-{SEED}"
+        key = f"{hand.content[:16]}-{asked.grasps}-{SEED}-{STAGE_REVISIONS['synthesize']}"
         if done.get(name, {}).get("key") != key:
             jaws = jaws_of(hand)
             done[name] = {
@@ -56,8 +60,8 @@ def main() -> None:
             if mesh.parent.name not in cells:
                 cells[mesh.parent.name] = cell(hand, mesh, asked.grasps)
                 sys.stderr.write(f"{name} {mesh.parent.name} {cells[mesh.parent.name]}\n")
-                RESULTS.write_text(json.dumps(done, indent=1) + "\n")
-    PAGE.write_text(page(done))
+                results.write_text(json.dumps(done, indent=1) + "\n")
+    (asked.out / "grippers.md").write_text(page(done))
 
 
 def cell(hand: HandModel, mesh: Path, grasps: int) -> float | str:

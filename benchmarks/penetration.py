@@ -1,6 +1,6 @@
 """Penetration, contact and variety of the planner's grasps with and without the final projection, as Markdown.
 
-usage: python benchmarks/penetration.py DATA_DIR     DATA_DIR holds hands/ and objects/ (YCB) and bad/
+usage: python -m benchmarks.penetration DATA_DIR     DATA_DIR holds hands/ and objects/ (YCB) and bad/
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Published picks of an Allegro hand, judged by the six pushes, by the lift, and on terms ever nearer to the published
 ones; and holds that are none, which the pushes must refuse.
 
-usage: python benchmarks/published_picks.py DATA_DIR [--work DIR] [--objects NAME ...] [--out STEM]
+usage: python -m benchmarks.published_picks DATA_DIR [--work DIR] [--objects NAME ...] [--out STEM]
 DATA_DIR/reference_grasps has the grasps published with FRoGGeR (IROS 2023) and whether each was picked. Their pick, as
 its authors' program has it (facts, MIT): the hand starts at the grasp itself around an object of 150 kg/m^3 on a table;
 contact forces follow from a QP over the measured pose of the object, at least 1 N a finger, friction 0.5; 10 cm up in
@@ -24,10 +24,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from cells import write_json
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
+from benchmarks.cells import write_json
 from service.model.digests import digest_json
 from service.model.transforms import quat_rotate
 from worker.engines.mujoco_warnings import void

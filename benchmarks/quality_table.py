@@ -1,6 +1,6 @@
 """How long the quality table of 1,000 grasps takes, and what its parts cost.
 
-usage: python benchmarks/quality_table.py [HAND] [OBJECT] [--grasps 1000]     files, or built-in names
+usage: python -m benchmarks.quality_table [HAND] [OBJECT] [--grasps 1000]     files, or built-in names
 The grasps are made first and do not count. Prints wall and CPU seconds of the table at three contact thresholds.
 """
 

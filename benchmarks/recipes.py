@@ -1,6 +1,6 @@
 """What parts of the recipe buy: success of Allegro grasps with one thing changed at a time, as Markdown.
 
-usage: python benchmarks/recipes.py DATA_DIR     DATA_DIR holds hands/ and objects/
+usage: python -m benchmarks.recipes DATA_DIR     DATA_DIR holds hands/ and objects/
 """
 
 from __future__ import annotations

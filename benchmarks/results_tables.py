@@ -1,6 +1,6 @@
 """Quality of raw standard grasps of the three hands on all objects, by the letter of the referee's protocol.
 
-usage: python benchmarks/results_tables.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
+usage: python -m benchmarks.results_tables DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
 DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. Stopped runs go on: every
 cell (hand, object) is kept under `--work` (see cells.py); a whole run takes some hours of one core.
 """
@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import SEED, Cell, cell_parser, cells, write_json
 
+from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
 from service.model.version import PACKAGE_VERSION
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
@@ -140,7 +140,7 @@ def main() -> None:
             rows.append(row(cell))
             sys.stderr.write(f"{hand} {cell.object_name}: GSR {rows[-1]['gsr']:.2f}, hard {rows[-1]['gsr_hard']:.2f}\n")
         total = whole(rows)
-        command = f"python benchmarks/results_tables.py DATA --hands {hand}"
+        command = f"python -m benchmarks.results_tables DATA --hands {hand}"
         write_json(args.out / f"quality-{hand}.json", {"hand": hand, "all": total, "objects": rows, "command": command})
         (args.out / f"quality-{hand}.md").write_text(markdown(hand, rows, total, command))
 

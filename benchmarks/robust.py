@@ -1,6 +1,6 @@
 """How far a verdict can be trusted: what each way in which a hand's model may be wrong costs in success.
 
-usage: python benchmarks/robust.py DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
+usage: python -m benchmarks.robust DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
 DATA_DIR holds hands/ and objects/. Raw standard grasps are judged by the certificate; those that hold are judged again
 in models that differ along one axis (`--draws` for each), along all axes at once, and as a job does it. `--out` gets
 robust.json and robust.md. Stopped runs go on (see cells.py).
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import Cell, cell_parser, cells, write_json
 
+from benchmarks.cells import Cell, cell_parser, cells, write_json
 from service.model.robust import MEANINGS, MODELS, Axis
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import decompose
@@ -115,7 +115,7 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines = [
         "# How far a verdict can be trusted",
         "",
-        f"Made by `benchmarks/robust.py`. Raw standard grasps on {', '.join(objects)}, "
+        f"Made by `python -m benchmarks.robust`. Raw standard grasps on {', '.join(objects)}, "
         f"{done[0]['raw'] // len(objects)} on each; those that the certificate holds in the nominal model ({held}) "
         f"were judged again in models that differ in one thing, {draws} draws of each for every grasp "
         "(collision shapes and couplings: each kind once). A hundred percent would be a verdict that no such "

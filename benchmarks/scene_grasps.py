@@ -1,6 +1,6 @@
 """Grasps planned in scenes against grasps planned around free objects and filtered, per hand and object.
 
-usage: python -m benchmarks.scene_grasps DATA_DIR --work W [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
+usage: python -m benchmarks.scene_grasps DATA_DIR [--work W] [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
            [--per-face 0] [--filtered 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
        DATA_DIR holds hands/ and objects/
 
@@ -13,7 +13,6 @@ lies under W: a run that was stopped goes on, and several may run beside one ano
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cells import HANDS
+from benchmarks.cells import HANDS, cell_parser
 from service.model.domain import FIDELITIES
 from service.model.scene_spec import TOUCH, SceneSpec
 from service.model.version import PACKAGE_VERSION
@@ -200,12 +199,7 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--hands", nargs="+", default=list(HANDS), choices=list(HANDS))
-    parser.add_argument("--objects", nargs="+")
-    parser.add_argument("--grasps", type=int, default=32)
+    parser = cell_parser(__doc__, grasps=32)
     parser.add_argument("--per-face", type=int, default=0)
     parser.add_argument("--filtered", type=int, default=0, help="free grasps a pair that are filtered, at least")
     parser.add_argument("--touch", type=float, default=TOUCH, help="mm that fingertips keep from the table")
@@ -221,7 +215,7 @@ def main() -> None:
             if said.objects and mesh.parent.name not in said.objects:
                 continue
             terms = f"{said.grasps}-{said.per_face}-{said.filtered}-{said.touch:g}-{said.seed}"
-            kept = said.work / f"{name}-{mesh.parent.name}-{terms}.json"
+            kept = said.work / "scene-grasps" / f"{name}-{mesh.parent.name}-{terms}.json"
             if not kept.exists():
                 obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
                 found = study(

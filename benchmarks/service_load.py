@@ -190,7 +190,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.what == "api":
         if given.data_dir is None:
-            parser.error("`api` needs --data-dir with a filled index: see benchmarks/large_index.py")
+            parser.error("`api` needs --data-dir with a filled index: see benchmarks.large_index")
         api(given.data_dir, given.index_url)
     elif given.what == "indexer":
         indexer(given.index_url)

@@ -1,6 +1,6 @@
 """Success of the planner's grasps in the independent engine and their quality, per hand and object, as Markdown.
 
-usage: python benchmarks/success.py DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
+usage: python -m benchmarks.success DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
 The referee is MuJoCo with the DexGraspBench protocol, level `certificate` (see worker/quality/referee).
 """
 

@@ -15,7 +15,7 @@ from worker.quality.referee.protocol import Outcome
 Floats = NDArray[np.float64]
 
 #: A verdict is clear where the worst motion that was seen is below the first share of its limit, or above the second.
-#: Both engines' margins of a grasp that holds differ by 0.11 at the 99th percentile (benchmarks/first_judge.py).
+#: Both engines' margins of a grasp that holds differ by 0.11 at the 99th percentile (benchmarks.first_judge).
 BAND: Final = (0.8, 1.2)
 #: Ticks of a push that breaks a limit until it is clear; what is still in the band then is not.
 PATIENCE: Final = 5

@@ -1,0 +1,130 @@
+"""`MANIFEST.json`: of each study what command made its files, when, where, from which revision, with their digests."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.results.studies import BY_NAME, STUDIES, Study, files_of
+from service.model.version import STAGE_REVISIONS
+
+REPOSITORY: Final = Path(__file__).resolve().parents[2]
+DOCS: Final = REPOSITORY / "docs"
+#: Under the folder of the docs; what says what is there is not itself a figure.
+MANIFEST, INDEX = "results/MANIFEST.json", "results/README.md"
+_REVISIONS: Final = re.compile(r"STAGE_REVISIONS[^=]*= (\{[^}]*\})")
+
+Manifest = dict[str, dict[str, Any]]
+
+
+def load(docs: Path) -> Manifest:
+    """Records by name of the study; none where there is no manifest."""
+    file = docs / MANIFEST
+    return json.loads(file.read_text())["studies"] if file.is_file() else {}
+
+
+def save(docs: Path, records: Manifest) -> None:
+    """Write the records in the order of the list."""
+    order = list(BY_NAME)
+    known = sorted(records, key=lambda name: order.index(name) if name in order else len(order))
+    ordered = {name: records[name] for name in known}
+    write(docs / MANIFEST, json.dumps({"studies": ordered}, indent=1, allow_nan=False) + "\n")
+
+
+def write(file: Path, text: str) -> None:
+    """Write so that a run that is killed leaves no half file."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(".part")
+    partial.write_text(text)
+    partial.replace(file)
+
+
+def digests(study: Study, docs: Path) -> dict[str, str]:
+    """SHA-256 of each file of a study, by its path under the folder of the docs."""
+    return {str(file.relative_to(docs)): _sha256(file) for file in files_of(study, docs)}
+
+
+def faults(docs: Path, records: Mapping[str, dict[str, Any]]) -> list[str]:
+    """What does not agree: files that no record holds, digests that differ, files that are gone."""
+    held = {path: digest for record in records.values() for path, digest in record["files"].items()}
+    found = [f"{path}: not held" for path in sorted(there(docs) - held.keys())]
+    for path, digest in held.items():
+        if not (docs / path).is_file():
+            found.append(f"{path}: gone")
+        elif _sha256(docs / path) != digest:
+            found.append(f"{path}: changed since it was recorded")
+    return found + [f"{name}: no such study" for name in records if name not in BY_NAME]
+
+
+def there(docs: Path) -> set[str]:
+    """All figures and pictures under a folder of the docs, and what else the studies write there."""
+    files = [file for place in ("results", "images") for file in (docs / place).rglob("*") if file.is_file()]
+    files += [file for study in STUDIES for file in files_of(study, docs)]
+    return {str(file.relative_to(docs)) for file in files} - {MANIFEST, INDEX}
+
+
+def staleness(study: Study, record: Mapping[str, Any] | None) -> str:
+    """Why a study should be made again; empty where its record is of the revisions of today."""
+    if record is None:
+        return "not made yet"
+    made = record["stage_revisions"]
+    if study.stages and made is None:
+        return "of an unknown revision"
+    older = [f"{stage} {made.get(stage)}" for stage in study.stages if made.get(stage) != STAGE_REVISIONS[stage]]
+    return f"of {', '.join(older)}" if older else ""
+
+
+def entered(study: Study, docs: Path) -> dict[str, Any]:
+    """A record of files as they lie there, from what they and the history tell; what nobody tells is null.
+
+    The revision is the oldest of the commits that last changed one of the files: they were made at that one or earlier.
+    """
+    files = digests(study, docs)
+    commits = [_git("log", "-1", "--format=%cI %h", "--", f"docs/{path}") for path in files]
+    changed = [path for path in files if _git("status", "--porcelain", "--", f"docs/{path}")]
+    date, _, revision = ("", "", _git("rev-parse", "--short", "HEAD")) if changed else min(commits).partition(" ")
+    said = _said_by(docs / path for path in files)
+    return {
+        "told_by": "files and history", "command": said.get("command"), "revision": revision,
+        "stage_revisions": dict(STAGE_REVISIONS) if changed else stage_revisions_at(revision), "seeds": None,
+        "machine": said.get("device"), "versions": said.get("versions"),
+        "date": str(said.get("created") or said.get("card_made") or said.get("date") or date)[:10] or None,
+        "seconds": None, "files": files,
+    }  # fmt: skip
+
+
+def stage_revisions_at(revision: str) -> dict[str, int] | None:
+    """`STAGE_REVISIONS` as a commit has them; None where it has none or is not there."""
+    text = _git("grep", "-h", "-A4", "STAGE_REVISIONS.*= {", revision, "--", "*.py", check=False)
+    found = _REVISIONS.search(text)
+    return json.loads(found[1].replace(",}", "}").replace("'", '"')) if found else None
+
+
+def _said_by(files: Any) -> dict[str, Any]:
+    """What the first of some JSON files that tells of its making says."""
+    for file in files:
+        if file.suffix == ".json":
+            found = json.loads(file.read_text())
+            if isinstance(found, dict) and {"command", "created", "card_made", "date"} & found.keys():
+                return found
+    return {}
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _git(*arguments: str, check: bool = True) -> str:
+    done = subprocess.run(["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=check)
+    return done.stdout.strip()
+
+
+def revision_of_today() -> str:
+    """The commit that stands there, with `+` where files differ from it."""
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":!docs")
+    return _git("rev-parse", "--short", "HEAD") + ("+" if changed else "")

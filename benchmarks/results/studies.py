@@ -1,0 +1,349 @@
+"""What makes the figures and pictures of the docs: the studies, their commands and the files that they write.
+
+In a command `DATA` is a folder with hands/ and objects/ (real URDFs, YCB meshes), `SOURCES` one with the packages of
+`benchmarks.gallery`, `BEFORE` a checkout to compare with, `WORK` a folder that keeps what a study has found so far and
+`OUT` the folder of the docs (docs/, or another one for quick runs).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+PLANS: Final = ("synthesize",)
+IN_SCENES: Final = ("synthesize", "scene")
+ALL: Final = ("synthesize", "scene", "render")
+#: Beside DATA, SOURCES and BEFORE: what a study may need.
+SERVICE, BROWSER, GPU, TORCH, FIRST_JUDGE = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
+
+_ALLEGRO = "DATA/hands/allegro/allegro_hand_right.urdf"
+_BARRETT = "DATA/hands/barrett_bh280/bh280.urdf"
+_SHADOW = "DATA/hands/shadow/shadow_hand_right.urdf"
+_EIGHT = (
+    "003_cracker_box 005_tomato_soup_can 006_mustard_bottle 011_banana 024_bowl 025_mug 035_power_drill 037_scissors"
+)
+_SEVEN = (
+    "056_tennis_ball 061_foam_brick 077_rubiks_cube 005_tomato_soup_can 003_cracker_box 006_mustard_bottle "
+    "035_power_drill"
+)
+_LITTLE = "--hands barrett --objects 077_rubiks_cube --grasps 4"
+
+
+def _mesh(name: str) -> str:
+    return f"DATA/objects/{name}/clean.stl"
+
+
+def _on_its_way(hand: str, obj: str, scene: str) -> tuple[str, str]:
+    return (
+        f"graspd synth --hand {hand} --object {obj} --scene {scene} --scenes 2 -n 8 -o WORK/way.h5",
+        f"graspd pictures WORK/way.h5 --way -n 2 --size 240 --palette -o OUT/images/scenes/{Path(scene).stem}.png",
+    )
+
+
+@dataclass(frozen=True)
+class Study:
+    """One entry of the list: `files` are globs under the folder of the docs.
+
+    A study without `quick` has no little run; one without `run` is a page that somebody writes from another's figures.
+
+    `stages` are those whose revision its figures follow from; times follow from all code and have none.
+    """
+
+    name: str
+    about: str
+    files: tuple[str, ...]
+    run: tuple[str, ...]
+    quick: tuple[str, ...] = ()
+    stages: tuple[str, ...] = PLANS
+    seeds: tuple[int, ...] = ()
+    needs: tuple[str, ...] = ()
+    prints: str = ""
+    """File under the folder of the docs that gets what the commands print."""
+
+    def wants(self) -> list[str]:
+        """Everything that must be there: what the commands name, then `needs`."""
+        words = " ".join(self.run)
+        return [name for name in ("DATA", "SOURCES", "BEFORE") if name in words] + list(self.needs)
+
+
+STUDIES: Final = (
+    Study(
+        "bench", "grasps per second of the planner", ("results/bench.*",),
+        (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity draft --fidelity standard "
+         "--fidelity fine --batch 1 --batch 8 --batch 32 --batch 128 --threads 1 --threads 2 --out OUT/results",),
+        ("graspd bench --fidelity draft --batch 4 --threads 2 --repeats 1 --out OUT/results",),
+        stages=(),
+    ),
+    Study(
+        "chart", "speed against accuracy: methods, fidelities, knobs",
+        ("results/chart.*", "results/sweeps.png"),
+        (f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
+         f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --peer-batch 8 --repeats 2 --sweep "
+         "--out OUT/results",),
+        ("graspd chart --quick --hands barrett --objects block --out OUT/results",),
+    ),
+    Study(
+        "scenes-chart", "planned in a scene, or filtered", ("results/scenes-chart/*",),
+        (f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
+         f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --peer-batch 8 --threads 1 "
+         "--work WORK/scenes-chart --out OUT/results/scenes-chart",),
+        ("graspd chart --scene table --quick --hands barrett --objects block --work WORK/scenes-chart "
+         "--out OUT/results/scenes-chart",),
+        IN_SCENES,
+    ),
+    Study(
+        "stability", "where integrators, gradients, starts and rates break", ("results/stability/*",),
+        ("graspd stability --only time_step --only stiffness --only contact_count --only gradient --only shapes "
+         "--only starts --only rates --only length --long --out OUT/results/stability",),
+        ("graspd stability --quick --only time_step --only gradient --only shapes --out OUT/results/stability",),
+    ),
+    Study(
+        "scenes-stability", "where planning in scenes breaks", ("results/scenes-stability/*",),
+        ("graspd stability --only scene_height --only scene_wall --only scene_neighbours --only scene_size "
+         "--out OUT/results/scenes-stability",),
+        ("graspd stability --quick --only scene_height --hand barrett --out OUT/results/scenes-stability",),
+        IN_SCENES,
+    ),
+    Study(
+        "quality", "every metric of raw grasps, by the letter of the protocol", ("results/quality-*",),
+        ("python -m benchmarks.results_tables DATA --work WORK/cells --out OUT/results",),
+        (f"python -m benchmarks.results_tables DATA --work WORK/cells {_LITTLE} --out OUT/results",),
+        seeds=(7001,),
+    ),
+    Study(
+        "certificate", "what the referee's cheap levels cost and say", ("results/certificate.*",),
+        (f"python -m benchmarks.certificate DATA --work WORK/cells --objects {_EIGHT} "
+         "--out OUT/results/certificate.json",),
+        (f"python -m benchmarks.certificate DATA --work WORK/cells {_LITTLE} --out OUT/results/certificate.json",),
+        seeds=(7001,), prints="results/certificate.md",
+    ),
+    Study(
+        "first-judge", "what the first judge says beside the certificate", ("results/first-judge.*",),
+        ("python -m benchmarks.first_judge DATA --work WORK/cells --out OUT/results/first-judge",),
+        (f"python -m benchmarks.first_judge DATA --work WORK/cells {_LITTLE} --out OUT/results/first-judge",),
+        seeds=(7001,), needs=(FIRST_JUDGE,),
+    ),
+    Study(
+        "robust", "verdicts in hands that differ from the nominal one", ("results/robust.*",),
+        ("python -m benchmarks.robust DATA --work WORK/cells --out OUT/results",),
+        (f"python -m benchmarks.robust DATA --work WORK/cells {_LITTLE} --draws 1 --out OUT/results",),
+        seeds=(7001, 9102),
+    ),
+    Study(
+        "foreign", "planned with one model of a hand, judged in another", ("results/foreign.*",),
+        (f"python -m benchmarks.foreign DATA --sources SOURCES --work WORK --objects {_SEVEN} "
+         "--out OUT/results/foreign",),
+        ("python -m benchmarks.foreign DATA --sources SOURCES --work WORK --grasps 2 --objects 056_tennis_ball "
+         "--out OUT/results/foreign",),
+        seeds=(7020,),
+    ),
+    Study(
+        "success", "success and quality by hand and object, in one table", ("results/success.md",),
+        ("python -m benchmarks.success DATA 32",), ("python -m benchmarks.success DATA 1 Barrett",),
+        seeds=(101,), prints="results/success.md",
+    ),
+    Study(
+        "failures", "the failures that are left, with pictures", ("results/failures.*", "results/failures/*"),
+        (f"python -m benchmarks.failures DATA --work WORK/cells --objects {_EIGHT} --out OUT/results",),
+        (f"python -m benchmarks.failures DATA --work WORK/cells {_LITTLE} --out OUT/results",),
+        seeds=(7001,),
+    ),
+    Study(
+        "diversity", "how different raw grasps are", ("results/diversity.md",),
+        (f"python -m benchmarks.diversity DATA --work WORK/cells --objects {_EIGHT}",),
+        (f"python -m benchmarks.diversity DATA --work WORK/cells {_LITTLE}",),
+        seeds=(7001,), prints="results/diversity.md",
+    ),
+    Study(
+        "contact-threshold", "quality against the contact threshold", ("results/contact-threshold.*",),
+        ("python -m benchmarks.contact_threshold DATA --work WORK/cells --out OUT/results",),
+        (f"python -m benchmarks.contact_threshold DATA --work WORK/cells {_LITTLE} --out OUT/results",),
+        seeds=(7001,),
+    ),
+    Study(
+        "published-picks", "published picks beside our verdicts", ("results/published-picks.*",),
+        ("python -m benchmarks.published_picks DATA --work WORK/picks --out OUT/results/published-picks",),
+        stages=(),
+    ),
+    Study(
+        "scenes-grasps", "planned in scenes, by hand and object", ("results/scenes-grasps.*",),
+        ("python -m benchmarks.scene_grasps DATA --work WORK --grasps 16 --per-face 2 --filtered 96 "
+         "--page OUT/results/scenes-grasps.md --json OUT/results/scenes-grasps.json",),
+        (f"python -m benchmarks.scene_grasps DATA --work WORK {_LITTLE} "
+         "--page OUT/results/scenes-grasps.md --json OUT/results/scenes-grasps.json",),
+        IN_SCENES, seeds=(404,),
+    ),
+    Study(
+        "clutter", "grasps of a target among neighbours, within a time", ("results/clutter.*",),
+        ("python -m benchmarks.clutter DATA --json OUT/results/clutter.json",),
+        ("python -m benchmarks.clutter DATA --hand barrett --targets 077_rubiks_cube --scenes 1 --neighbours 1 "
+         "--seconds 5 --json OUT/results/clutter.json",),
+        IN_SCENES, prints="results/clutter.md",
+    ),
+    Study(
+        "chain", "what a valid grasp costs, stage by stage", ("results/chain.*",),
+        ("python -m benchmarks.chain BEFORE . DATA --json OUT/results/chain.json",),
+        ("python -m benchmarks.chain BEFORE . DATA --grasps 32 --pairs allegro:mug --json OUT/results/chain.json",),
+        stages=(), prints="results/chain.md",
+    ),
+    Study(
+        "cold-start", "how long the first grasp takes", ("results/cold-start.md",),
+        ("python -m benchmarks.cold_start .",), ("python -m benchmarks.cold_start . --runs 1 --no-service",),
+        stages=(), prints="results/cold-start.md",
+    ),
+    Study(
+        "weight", "what an install weighs and how long imports take", ("results/weight.*",),
+        ("python -m benchmarks.weight --json OUT/results/weight.json",),
+        ("python -m benchmarks.weight --json OUT/results/weight.json --runs 1 --no-wheel",),
+        stages=(), prints="results/weight.md",
+    ),
+    Study(
+        "fleet", "how many workers one keeper serves", ("results/fleet.*",),
+        ("python -m benchmarks.fleet --seconds 8 --tasks 4000 --json OUT/results/fleet.json",),
+        ("python -m benchmarks.fleet --workers 8 --seconds 2 --tasks 100 --sqlite --json OUT/results/fleet.json",),
+        stages=(), prints="results/fleet.md",
+    ),
+    Study(
+        "week", "a week of a thousand nodes that come and go", ("results/week.*",),
+        ("python -m benchmarks.week --json OUT/results/week.json",),
+        ("python -m benchmarks.week --nodes 20 --days 1 --json OUT/results/week.json",),
+        stages=(), seeds=(0,), prints="results/week.md",
+    ),
+    Study(
+        "cost-model", "what a million grasps cost", ("results/cost-model.md",),
+        ("python -m benchmarks.cost_model",), ("python -m benchmarks.cost_model",),
+        stages=(), prints="results/cost-model.md",
+    ),
+    Study(
+        "service", "what the service costs around the engine", ("results/service-tables.md",),
+        ("python -m benchmarks.large_index --data-dir WORK/large-index",
+         "python -m benchmarks.service_load api --data-dir WORK/large-index",
+         *(f"python -m benchmarks.service_load {what}" for what in ("queue", "workers", "indexer"))),
+        stages=(), prints="results/service-tables.md",
+    ),
+    Study(
+        "service-page", "the same with its conditions", ("results/service.md",), (), stages=(),
+    ),
+    Study(
+        "matrix", "four hands on fourteen objects, killed in the middle", ("results/matrix.md",),
+        ("python -m benchmarks.matrix DATA --data-dir WORK/matrix --out OUT/results/matrix.md",),
+    ),
+    Study(
+        "predictor", "networks that learned from grasps",
+        ("results/predictor.json", "results/predictor.png", "results/predictor-tables.md"),
+        ("graspd datasets create train-graspd --hands barrett --objects DATA/objects -n 96 --scenes 4 --views 6 "
+         "--width 200 --height 150 --yes --wait",
+         "graspd datasets create train-graspit --hands barrett --objects "
+         "003_cracker_box,005_tomato_soup_can,011_banana,024_bowl,037_scissors,048_hammer,056_tennis_ball,"
+         "077_rubiks_cube,koala,spot --method graspit --want raw -n 64 --scenes 4 --views 6 --width 200 --height 150 "
+         "--yes --wait",
+         "graspd datasets export train-graspd -o WORK/train-graspd",
+         "graspd datasets export train-graspit -o WORK/train-graspit",
+         "python -m examples.train_grasp_predictor --source fast_graspd=WORK/train-graspd "
+         "--source graspit=WORK/train-graspit --held-out 006_mustard_bottle,025_mug,035_power_drill,061_foam_brick "
+         "--meshes DATA/objects --grasps 64 --sheet OUT/results/predictor.png -o OUT/results/predictor.json"),
+        stages=ALL, needs=(SERVICE, TORCH), prints="results/predictor-tables.md",
+    ),
+    Study(
+        "predictor-page", "the same with its conditions", ("results/predictor.md",), (), stages=ALL,
+    ),
+    Study(
+        "modelling", "what graspd leaves out: its cost and its effect", ("results/modelling.json",),
+        ("python -m benchmarks.modelling --data DATA --out OUT/results",),
+        ("python -m benchmarks.modelling --only drops --grasps 2 --out OUT/results",),
+        ALL,
+    ),
+    Study(
+        "scene-ways", "what stands in the way of grasps in scenes", ("results/scene-ways.md",),
+        ("python -m benchmarks.scene_ways",), ("python -m benchmarks.scene_ways --count 1",),
+        IN_SCENES, prints="results/scene-ways.md",
+    ),
+    Study(
+        "grippers", "what grippers hold of objects that fit", ("results/grippers.*",),
+        ("python -m benchmarks.grippers DATA --sources SOURCES --out OUT/results",),
+        ("python -m benchmarks.grippers DATA --sources SOURCES --only robotiq-2f-85 --grasps 1 --out OUT/results",),
+        seeds=(404,),
+    ),
+    Study(
+        "hands-gallery", "published hands, each tried on plain objects",
+        ("results/hands-gallery.json", "hands-gallery.md", "images/hands-gallery/*"),
+        ("python -m benchmarks.gallery --sources SOURCES --out OUT",),
+        ("python -m benchmarks.gallery --sources SOURCES --only robotiq-2f-85 --grasps 3 --out OUT",),
+    ),
+    Study(
+        "pilot", "the card of a dataset of 10,080 grasps",
+        ("results/pilot/README.md", "results/pilot/card.json", "results/pilot/checksums.sha256", "results/pilot/*.png",
+         "results/pilot/*.jpg"),
+        ("graspd datasets create pilot --spec examples/million/million.toml --objects DATA/objects -n 240 --yes --wait",
+         "graspd datasets snapshot pilot",
+         "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0 --assets docs/results/pilot/assets.json"),
+        ("graspd datasets create pilot --hands barrett --objects block -n 4 --fidelity draft --yes --wait",
+         "graspd datasets snapshot pilot", "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0"),
+        ALL, seeds=(0,), needs=(SERVICE,),
+    ),
+    Study(
+        "pilot-assets", "licences and sources of the pilot's objects", ("results/pilot/assets.json",), (), stages=(),
+    ),
+    Study(
+        "gpu", "speed and accuracy on a GPU", ("results/gpu.*",),
+        ("python -m benchmarks.on_gpu DATA --batches 32 256 1024 4096 --grasps 32 --json OUT/results/gpu.json "
+         "--page OUT/results/gpu.md",),
+        needs=(GPU,),
+    ),
+    Study(
+        "chart-gpu", "speed against accuracy on a GPU", ("results/chart-gpu/*",),
+        (f"graspd chart --methods fast_graspd --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
+         f"{_mesh('006_mustard_bottle')} --fidelities draft,standard,fine --batch 256 --repeats 1 --device cuda:0 "
+         "--out OUT/results/chart-gpu",),
+        needs=(GPU,),
+    ),
+    Study(
+        "demo", "the pictures of README", ("images/demo-*.png",),
+        ("graspd demo --out WORK/demo", "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
+         "cp WORK/demo/views.png OUT/images/demo-views.png"),
+        ("graspd demo --out WORK/demo --hand barrett --object block -n 4 --scenes 1 --views 1 --fidelity draft",
+         "cp WORK/demo/grasps.png OUT/images/demo-grasps.png"),
+        ALL, seeds=(0,),
+    ),
+    Study(
+        "grasp-pictures", "grasps of all kinds of objects", ("images/grasps/*",),
+        ("bash benchmarks/grasp_gallery.sh DATA OUT/images/grasps",),
+        seeds=(4,),
+    ),
+    Study(
+        "scene-pictures", "scenes, hands on their way, neighbours", ("images/scenes/*",),
+        (*_on_its_way("shadow", "bottle", "table"), *_on_its_way("allegro", "mug", "bin"),
+         *_on_its_way("barrett", "mug", "shelf"),
+         *_on_its_way("allegro", "block", "examples/scenes/beside_a_box.yaml"),
+         "graspd gallery --object mug --object bottle --object block "
+         f"--object mustard={_mesh('006_mustard_bottle')} --object soup_can={_mesh('005_tomato_soup_can')} "
+         f"--object drill={_mesh('035_power_drill')} -o OUT/images/scenes"),
+        ("graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/way.h5",
+         "graspd pictures WORK/way.h5 --way -n 1 --size 120 --palette -o OUT/images/scenes/table.png"),
+        ALL,
+    ),
+    Study(
+        "asset-pictures", "hands and objects as they are checked",
+        ("images/hands-*.png", "images/objects-*.png"),
+        (f"graspd hands check {_ALLEGRO} --no-self-test --picture OUT/images/hands-guess.png",
+         f"graspd hands check {_SHADOW} --no-self-test --picture OUT/images/hands-shadow.png",
+         f"graspd hands check {_SHADOW} --root world --no-self-test --picture OUT/images/hands-forearm.png",
+         f"graspd objects check {_mesh('011_banana')} --density 950 --picture OUT/images/objects-banana.png",
+         f"graspd objects check {_mesh('koala')} --scale-to 0.14 --picture OUT/images/objects-koala.png"),
+        (f"graspd objects check {_mesh('011_banana')} --picture OUT/images/objects-banana.png",),
+        stages=(),
+    ),
+    Study(
+        "dashboard", "the pages of the dashboard", ("images/dashboard-*.png",),
+        ("python -m tests.browser.screenshots --out OUT/images",),
+        ("python -m tests.browser.screenshots --out OUT/images",),
+        needs=(BROWSER,),
+    ),
+)  # fmt: skip
+BY_NAME: Final = {study.name: study for study in STUDIES}
+
+
+def files_of(study: Study, docs: Path) -> list[Path]:
+    """What there is of a study's files under a folder of the docs."""
+    return sorted({file for glob in study.files for file in docs.glob(glob) if file.is_file()})

@@ -1,0 +1,140 @@
+"""What an install weighs and how long its imports take; prints Markdown.
+
+usage: python -m benchmarks.weight [--runs 5] [--no-wheel] [--json OUT]
+
+Sizes are those of the files of this environment: of an extra, its packages with all that they require. Times are
+processor seconds of a fresh process, the least of the runs; its parts come from `python -X importtime`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any, Final
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+REPOSITORY: Final = Path(__file__).resolve().parent.parent
+EXTRAS: Final = ("", "api", "worker", "all", "dev")
+LARGEST: Final = 6
+#: What somebody waits for, and what does it.
+STARTS: Final = {
+    "Python alone": "pass",
+    "`import graspd`": "import graspd",
+    "`graspd --help`": "import sys; sys.argv = ['graspd', '--help']; import graspd.cli; graspd.cli.main()",
+    "a client's command": "import api.client.commands",
+    "the API": "import api.app",
+    "planning grasps": "import worker.certified",
+    "a worker": "import worker.process.main",
+}
+
+
+def closure(extra: str) -> set[str]:
+    """Names of the installed packages that `graspd[extra]` requires, directly or not."""
+    seen: set[tuple[str, str]] = set()
+    waiting = [("graspd", extra)]
+    while waiting:
+        name, wanted = one = waiting.pop()
+        if one in seen or not _installed(name):
+            continue
+        seen.add(one)
+        needs = (Requirement(text) for text in distribution(name).requires or [])
+        for need in needs:
+            if need.marker is None or need.marker.evaluate({"extra": wanted}):
+                waiting += [(canonicalize_name(need.name), inner) for inner in ("", *need.extras)]
+    return {name for name, _ in seen} - {"graspd"}
+
+
+def size_mb(name: str) -> float:
+    """Bytes of a package's files, compiled ones too [MB]."""
+    files = distribution(name).files or []
+    paths = (Path(str(file.locate())) for file in files)
+    return sum(path.stat().st_size for path in paths if path.is_file()) / 1e6
+
+
+def import_seconds(code: str, runs: int) -> float:
+    """Processor seconds of a fresh process that runs some code: the least of the runs, after one that counts not."""
+    times = []
+    for _ in range(runs + 1):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        times.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(times[1:])
+
+
+def parts_ms(code: str) -> list[tuple[str, float]]:
+    """Milliseconds that a start spends in the modules of each package, most first."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", code], cwd=REPOSITORY, check=True, capture_output=True, text=True
+    )
+    spent: Counter[str] = Counter()
+    for us, module in re.findall(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)", done.stderr):
+        spent[module.partition(".")[0]] += int(us)
+    return [(name, us / 1e3) for name, us in spent.most_common(LARGEST)]
+
+
+def wheel_kb() -> float | None:
+    """Size of the wheel [kB]; None where nothing can build one."""
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(
+            [sys.executable, str(REPOSITORY / "docker" / "dist.py"), folder], capture_output=True, check=False
+        )
+        wheels = list(Path(folder).glob("*.whl"))
+        return wheels[0].stat().st_size / 1e3 if not done.returncode and wheels else None
+
+
+def lines(found: dict[str, Any]) -> Iterator[str]:
+    """The tables."""
+    yield "| install | packages | MB | largest, MB |\n| --- | --: | --: | --- |"
+    for extra, told in found["installs"].items():
+        largest = ", ".join(f"{name} {mb:.0f}" for name, mb in told["largest"])
+        yield f"| {extra} | {told['packages']} | {told['mb']:.0f} | {largest} |"
+    wheel = found["wheel_kb"]
+    yield f"\nThe wheel: {f'{wheel:.0f} kB' if wheel else 'not built here'}.\n"
+    yield "| start | processor s | most of it in, ms |\n| --- | --: | --- |"
+    for name, told in found["starts"].items():
+        parts = ", ".join(f"{package} {ms:.0f}" for package, ms in told["parts_ms"])
+        yield f"| {name} | {told['seconds']:.2f} | {parts} |"
+
+
+def _installed(name: str) -> bool:
+    try:
+        distribution(name)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--no-wheel", action="store_true", help="do not build the wheel")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    found: dict[str, Any] = {"installs": {}, "wheel_kb": None if given.no_wheel else wheel_kb(), "starts": {}}
+    for extra in EXTRAS:
+        sizes = sorted(((size_mb(name), name) for name in closure(extra)), reverse=True)
+        found["installs"][f"graspd[{extra}]" if extra else "graspd"] = {
+            "packages": len(sizes), "mb": sum(mb for mb, _ in sizes),
+            "largest": [(name, mb) for mb, name in sizes[:LARGEST]],
+        }  # fmt: skip
+    for name, code in STARTS.items():
+        found["starts"][name] = {"seconds": import_seconds(code, given.runs), "parts_ms": parts_ms(code)}
+    sys.stdout.write("\n".join(lines(found)) + "\n")
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Figures and pictures of the docs: each is held by the manifest, each command of the list is one that there is."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import graspd.cli
+from benchmarks.results import manifest, page
+from benchmarks.results.__main__ import main
+from benchmarks.results.manifest import DOCS, INDEX, digests, entered, faults, load, staleness, there
+from benchmarks.results.running import Runner
+from benchmarks.results.studies import BY_NAME, STUDIES, Study
+from service.model.version import STAGE_REVISIONS
+from tests.conftest import REPOSITORY
+
+ADD = Study(
+    "add", "a sum", ("results/sum.json",),
+    ("python -c \"import sys; open(sys.argv[1], 'w').write(str(1 + 1)); print('done')\" OUT/results/sum.json",),
+    prints="results/sum.md",
+)  # fmt: skip
+
+
+def runner(folder: Path, **options: bool) -> Runner:
+    return Runner(folder / "docs", folder / "work", **options)
+
+
+def test_the_manifest_holds_every_figure_and_picture_as_it_is() -> None:
+    """After a change by hand: python -m benchmarks.results --enter NAME."""
+    assert faults(DOCS, load(DOCS)) == []
+
+
+def test_each_file_belongs_to_one_study() -> None:
+    held = [path for study in STUDIES for path in digests(study, DOCS)]
+    assert len(held) == len(set(held))
+    assert set(held) == there(DOCS)
+
+
+@pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
+def test_what_a_page_cites_is_held(path: Path) -> None:
+    held = {name for record in load(DOCS).values() for name in record["files"]} | {INDEX, manifest.MANIFEST}
+    folders = {str(parent) for name in held for parent in Path(name).parents}
+    assert set(page.cited(path)) <= held | folders
+
+
+@pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
+def test_tables_of_a_page_are_those_of_the_figures(path: Path) -> None:
+    text = path.read_text()
+    assert page.renewed(text, DOCS) == text, "run: make docs"
+
+
+def test_the_index_says_what_the_manifest_says() -> None:
+    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
+
+
+def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
+    study = BY_NAME["robust"]
+    record = entered(study, DOCS) | {"stage_revisions": STAGE_REVISIONS | {"synthesize": 1}}
+    assert staleness(study, record) == "of synthesize 1"
+    assert "| **stale**: of synthesize 1 |" in page.index({"robust": record})
+    assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
+
+
+def test_every_command_of_the_list_is_there() -> None:
+    commands = {name for name, *_ in graspd.cli.COMMANDS}
+    for line in (line for study in STUDIES for line in (*study.run, *study.quick)):
+        program, *words = shlex.split(line)
+        if program == "graspd":
+            assert words[0] in commands, line
+        elif program == "python":
+            assert find_spec(words[1]), line
+        elif program == "bash":
+            assert (REPOSITORY / words[0]).is_file(), line
+        else:
+            assert program == "cp", line
+
+
+def test_a_study_that_holds_is_not_run_again(tmp_path: Path) -> None:
+    assert runner(tmp_path).run(ADD).startswith("made")
+    assert (tmp_path / "docs/results/sum.json").read_text() == "2"
+    assert (tmp_path / "docs/results/sum.md").read_text().endswith("done\n")
+    assert runner(tmp_path).run(ADD) == "holds"
+    (tmp_path / "docs/results/sum.json").write_text("3")
+    assert runner(tmp_path).run(ADD).startswith("made")
+    assert (tmp_path / "docs/results/sum.json").read_text() == "2"
+
+
+def test_older_algorithms_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runner(tmp_path).run(ADD)
+    monkeypatch.setitem(STAGE_REVISIONS, "synthesize", STAGE_REVISIONS["synthesize"] + 1)
+    assert not runner(tmp_path).holds(ADD)
+
+
+def test_a_study_that_fails_leaves_no_record_and_says_which_command(tmp_path: Path) -> None:
+    fails = Study("add", "a sum", ADD.files, (*ADD.run, "python -c 'raise SystemExit(3)'"))
+    assert "`python -c 'raise SystemExit(3)'` ended with 3" in runner(tmp_path).run(fails)
+    assert load(tmp_path / "docs") == {}
+
+
+def test_what_a_study_lacks_is_said(tmp_path: Path) -> None:
+    assert runner(tmp_path).run(BY_NAME["foreign"]) == "left out: needs DATA, SOURCES"
+    assert runner(tmp_path).run(BY_NAME["predictor-page"]) == "left out: a page written by hand"
+    assert runner(tmp_path, quick=True).run(BY_NAME["matrix"]) == "left out: has no little run"
+
+
+def test_folders_of_this_machine_are_not_in_the_figures(tmp_path: Path) -> None:
+    tells = "import sys, json; json.dump(sys.argv[1:], open(sys.argv[2], 'w'))"
+    says = Study("add", "a sum", ("results/where.json",), (f'python -c "{tells}" DATA/hands OUT/results/where.json',))
+    made = runner(tmp_path)
+    made.places["DATA"] = tmp_path / "data"
+    made.run(says)
+    assert json.loads((tmp_path / "docs/results/where.json").read_text()) == ["DATA/hands", "docs/results/where.json"]
+
+
+def test_little_runs_leave_the_real_figures_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = (DOCS / manifest.MANIFEST).read_bytes()
+    assert main(["--quick", "--only", "cost-model"]) == 0
+    assert set(load(tmp_path / "results-quick")) == {"cost-model"}
+    assert faults(tmp_path / "results-quick", load(tmp_path / "results-quick")) == []
+    assert (DOCS / manifest.MANIFEST).read_bytes() == before
