@@ -164,6 +164,8 @@ STUDIES: Final = (
     Study(
         "published-picks", "published picks beside our verdicts", ("results/published-picks.*",),
         ("python -m benchmarks.published_picks DATA --work WORK/picks --out OUT/results/published-picks",),
+        ("python -m benchmarks.published_picks DATA --work WORK/picks --objects 011_banana "
+         "--out OUT/results/published-picks",),
         stages=(),
     ),
     Study(
