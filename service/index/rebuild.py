@@ -223,10 +223,10 @@ def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[st
 
 
 def _lasting(row: dict[str, Any]) -> dict[str, Any]:
-    """A row without what only the present moment knows: that a task is running, and where."""
+    """A row without what only the present moment knows: that a task is running, and where it was when it stopped."""
     if row.get("state") == State.RUNNING.value:
         row["state"] = State.QUEUED.value
-    if row.get("state") == State.QUEUED.value and "worker" in row:
+    if row.get("state") in (State.QUEUED.value, State.CANCELLED.value) and "worker" in row:
         row["worker"] = None
     if "verdict" in row:  # attempts of a check are not kept in the store: it either ends in a finding or is repeated
         row["last_attempt"] = 0

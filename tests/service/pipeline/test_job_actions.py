@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from service.index.rebuild import differences
 from service.model import names
 from service.model.domain import AssetKind, Lane, State
 from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
@@ -92,6 +93,13 @@ def test_a_cancelled_job_leaves_the_queue(parts: Parts) -> None:
     assert (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
     assert parts.queue.waiting() == set()
     assert [event.what for event in job_events(parts.store, job.id)] == ["cancelled"]
+
+
+def test_where_a_cancelled_task_ran_is_no_difference_to_the_store(parts: Parts) -> None:
+    job, _ = job_actions.submit(parts, request())
+    parts.index.live.set_running({task.id: "w" for task in parts.index.jobs.tasks(job=job.id).items})
+    job_actions.cancel(parts, job.id)
+    assert differences(parts.index, parts.store) == []
 
 
 def test_a_finished_job_cannot_be_cancelled(parts: Parts) -> None:
