@@ -131,11 +131,11 @@ def hold_interpreter(seconds: float) -> None:
 
 
 def _pretend_to_work(context: TaskContext) -> None:
-    seconds = float(os.environ.get("FAKE_SECONDS", "0"))
+    seconds, hold = float(os.environ.get("FAKE_SECONDS", "0")), Path(os.environ.get("FAKE_HOLD", "none"))
     end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    while (left := end - time.monotonic()) > 0 or hold.exists():
         context.check()
-        context.progress(seconds - (end - time.monotonic()), seconds, "pretending")
+        context.progress(min(seconds, seconds - left), seconds, "pretending")
         time.sleep(0.01)
 
 
@@ -143,8 +143,8 @@ def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
     FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
-    long each task holds the interpreter lock, and while there is a file FAKE_BROKEN nothing works. Of the options of
-    `graspd worker` it takes `--burst` and `--idle`.
+    long each task holds the interpreter lock; while there is a file FAKE_HOLD no task ends, and while there is a file
+    FAKE_BROKEN nothing works. Of the options of `graspd worker` it takes `--burst` and `--idle`.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings

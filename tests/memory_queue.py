@@ -6,7 +6,7 @@ import itertools
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from service.model.domain import Lane, Stage
@@ -29,6 +29,7 @@ class Delivery:
 class MemoryQueue:
     """`TaskQueue` without Redis. `take`, `beat` and `finish` are the worker's side."""
 
+    clock: Callable[[], float] = time.monotonic
     _lanes: dict[Lane, list[Message]] = field(default_factory=lambda: {lane: [] for lane in Lane})
     _held: dict[str, Delivery] = field(default_factory=dict)
     _cancelled: set[str] = field(default_factory=set)
@@ -126,16 +127,16 @@ class MemoryQueue:
             return [(str(i + 1), e) for i, e in enumerate(self._events) if i >= start][:limit]
 
     def announce(self, part: str, seconds: float) -> None:
-        self._announced[part] = time.monotonic() + seconds
+        self._announced[part] = self.clock() + seconds
 
     def announced(self, part: str) -> bool:
-        return self._announced.get(part, 0.0) > time.monotonic()
+        return self._announced.get(part, 0.0) > self.clock()
 
     def lead(self, part: str, holder: str, seconds: float) -> bool:
         held_by, until = self._leads.get(part, ("", 0.0))
-        if held_by != holder and until > time.monotonic():
+        if held_by != holder and until > self.clock():
             return False
-        self._leads[part] = (holder, time.monotonic() + seconds)
+        self._leads[part] = (holder, self.clock() + seconds)
         return True
 
     def resign(self, part: str, holder: str) -> None:

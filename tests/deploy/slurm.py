@@ -124,7 +124,7 @@ class FakeSlurm:
     def lose_node(self, element: Element) -> None:
         """SIGKILL to all without a word, and again from the start."""
         element.signal(signal.SIGKILL, everybody=True)
-        element.wait(10)
+        element.wait(60)
         self._again(element)
 
     def reach_time_limit(self, element: Element, *, notice_s: float) -> bool:
@@ -155,7 +155,7 @@ class FakeSlurm:
             element.signal(signal.SIGKILL, everybody=True)
             element.process.wait()
         # Whatever of the job outlived its shell goes with it.
-        deadline = time.monotonic() + 5
+        deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             try:
                 os.killpg(element.process.pid, signal.SIGKILL)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from service.store.store import open_store
 from tests.fakes import add_assets
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
+from tests.waiting import until
 
 
 @pytest.fixture(scope="session")
@@ -35,17 +35,16 @@ def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         process.terminate()
 
 
-def wait_for_redis(queue: RqQueue, seconds: float = 10.0) -> None:
+def wait_for_redis(queue: RqQueue) -> None:
     """Until it answers."""
-    deadline = time.monotonic() + seconds
-    while True:
+
+    def answers() -> bool:
         try:
-            queue.ping()
-            return
+            return queue.ping() >= 0
         except QueueUnavailable:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.02)
+            return False
+
+    until(answers, "Redis answers")
 
 
 @pytest.fixture

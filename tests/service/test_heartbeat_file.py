@@ -6,7 +6,6 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,7 @@ from service.model.errors import QueueUnavailable
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper
 from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
+from tests.waiting import until
 
 
 def is_healthy(file: Path) -> bool:
@@ -25,13 +25,6 @@ def is_healthy(file: Path) -> bool:
         command, env={**os.environ, "GRASPD_HEARTBEAT_FILE": str(file)}, capture_output=True, check=False
     )
     return done.returncode == 0
-
-
-def until(met: Callable[[], bool]) -> None:
-    end = time.monotonic() + 20.0
-    while not met():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
@@ -55,7 +48,7 @@ def test_a_keeper_lives_also_while_redis_is_away(parts: Parts, tmp_path: Path, m
     thread = threading.Thread(target=Keeper(Parts(settings, parts.store, parts.index, parts.queue)).run, args=(stop,))
     thread.start()
     try:
-        until(file.exists)
+        until(file.exists, "the file is touched")
     finally:
         stop.set()
         thread.join()

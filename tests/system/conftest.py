@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,16 @@ from service.pipeline.backends import Parts
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.fakes import add_assets
-
-READY_S = 30.0
+from tests.waiting import PATIENCE_S, until
 
 
 class System:
     """A running service and the parts of it that a test looks at."""
 
-    def __init__(self, supervisor: Supervisor, *, fakes: bool = True) -> None:
+    def __init__(self, supervisor: Supervisor, hold: Path, *, fakes: bool = True) -> None:
+        """While there is a file `hold`, fake workers end no task."""
         self.supervisor = supervisor
+        self.hold = hold
         self.parts = Parts.open(supervisor.settings)
         if fakes:
             add_assets(self.parts)
@@ -35,21 +35,14 @@ class System:
     def submit(self, wanted: JobRequest) -> str:
         return job_actions.submit(self.parts, wanted)[0].id
 
-    def until(self, met: Callable[[], Any], seconds: float, what: str) -> float:
-        """Seconds until a condition is met; fails when it takes longer than that."""
-        start = time.monotonic()
-        while not met():
-            assert time.monotonic() - start < seconds, f"after {seconds} s still not: {what}\n{self.logs()}"
-            time.sleep(0.02)
-        return time.monotonic() - start
+    def until(self, met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S) -> None:
+        """Until a condition is met; a failure shows the logs."""
+        until(met, what, seconds=seconds, logs=self.logs)
 
-    def finish(self, *jobs: str, seconds: float) -> list[JobView]:
+    def finish(self, *jobs: str, seconds: float = PATIENCE_S) -> list[JobView]:
         """The jobs once all are at their end."""
-        self.until(
-            lambda: all(self.parts.index.jobs.get(job).state.is_final for job in jobs),
-            seconds,
-            f"{len(jobs)} jobs done",
-        )
+        states = lambda: [self.parts.index.jobs.get(job).state for job in jobs]  # noqa: E731
+        self.until(lambda: all(state.is_final for state in states()), f"{len(jobs)} jobs done", seconds=seconds)
         return [self.parts.index.jobs.get(job) for job in jobs]
 
     def kill(self, name: str) -> int:
@@ -80,15 +73,15 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
         environment: dict[str, str] | None = None,
         **settings: Any,
     ) -> System:
-        for name, value in (environment or {}).items():
+        for name, value in {"FAKE_HOLD": str(tmp_path / "hold"), **(environment or {})}.items():
             monkeypatch.setenv(name, value)
         wanted = Settings(data_dir=tmp_path / "data", port=0, device="cpu", keeper_interval_s=0.5, **settings)
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
         supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))
         supervisor.start()
         try:
-            supervisor.wait_ready(READY_S)
-            running.append(System(supervisor, fakes=fakes))
+            supervisor.wait_ready(PATIENCE_S)
+            running.append(System(supervisor, tmp_path / "hold", fakes=fakes))
         except BaseException:
             supervisor.stop()
             raise

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,22 +19,24 @@ from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.fakes import add_assets
 from tests.service.conftest import wait_for_redis
+from tests.waiting import until
 
 LEASE_S = 2.0
 
 
 class House:
-    """Redis, keepers and a worker as processes, each with a log."""
+    """Redis, keepers and a worker as processes, each with a log. While there is a file `hold` no task ends."""
 
     def __init__(self, folder: Path, *, lease_s: float = LEASE_S) -> None:
         self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, keeper_interval_s=0.3)
         self._logs = folder / "logs"
         self._logs.mkdir()
+        self.hold = folder / "hold"
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.start("redis", *server_command(self.settings))
         self.parts = Parts.open(self.settings)
         assert isinstance(self.parts.queue, RqQueue)
-        wait_for_redis(self.parts.queue, 60)
+        wait_for_redis(self.parts.queue)
         add_assets(self.parts)
 
     def start(self, name: str, *command: str, **more: str) -> None:
@@ -47,6 +48,7 @@ class House:
             "GRASPD_LEASE_S": str(self.settings.lease_s),
             "GRASPD_KEEPER_INTERVAL_S": "0.3",
             "GRASPD_LOG_FORMAT": "text",
+            "FAKE_HOLD": str(self.hold),
             **more,
         }
         with (self._logs / f"{name}.log").open("ab") as log:
@@ -59,17 +61,15 @@ class House:
         """How often a process said something."""
         return len(re.findall(what, (self._logs / f"{name}.log").read_text()))
 
-    def until(self, met: Callable[[], object], what: str, seconds: float = 90.0) -> float:
-        """Seconds until a condition is met; fails when it takes longer than that."""
-        start = time.monotonic()
-        while not met():
-            logs = "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in self._logs.iterdir())
-            assert time.monotonic() - start < seconds, f"still not: {what}\n{logs}"
-            time.sleep(0.02)
-        return time.monotonic() - start
+    def until(self, met: Callable[[], object], what: str) -> None:
+        """Until a condition is met; a failure shows the logs."""
+        until(met, what, logs=self._said)
 
     def done(self, job: str) -> int:
         return len(self.parts.index.jobs.tasks(job=job, state=State.SUCCEEDED, limit=100).items)
+
+    def _said(self) -> str:
+        return "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in sorted(self._logs.iterdir()))
 
     def close(self) -> None:
         self.parts.close()

@@ -36,16 +36,17 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Callable[..., Syst
         add_asset(system.parts, "object", name)
     request = wanted("kitchen", hands=("gripper",), objects=OBJECTS, scenes=1)
     actions.create(system.parts, request)
-    system.until(
-        lambda: system.parts.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 5, 60, "a quarter is done"
-    )
+    system.until(lambda: system.parts.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 5, "a quarter is done")
+    system.hold.touch()
     for pid in system.supervisor.pids.values():
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     before = made(system)
+    assert len(before) < 2 * len(OBJECTS)
     again, new = actions.create(system.parts, request)
     assert not new and not again.state.is_final
-    system.until(lambda: system.parts.index.datasets.get("kitchen").state.is_final, 120, "the dataset is done")
+    system.hold.unlink()
+    system.until(lambda: system.parts.index.datasets.get("kitchen").state.is_final, "the dataset is done")
     after = made(system)
     assert {key: after[key] for key in before} == before
     assert len(after) == 2 * len(OBJECTS)
@@ -60,15 +61,14 @@ def test_a_dataset_that_is_cancelled_stops_and_stays_so(start: Callable[..., Sys
     for name in OBJECTS:
         add_asset(system.parts, "object", name)
     actions.create(system.parts, wanted("kitchen", hands=("gripper",), objects=OBJECTS))
-    system.until(lambda: system.parts.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 2, 60, "two are done")
+    system.until(lambda: system.parts.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 2, "two are done")
+    system.hold.touch()
     actions.cancel(system.parts, "kitchen")
-    system.until(lambda: system.parts.index.datasets.get("kitchen").state is State.CANCELLED, 30, "it is cancelled")
+    system.until(lambda: system.parts.index.datasets.get("kitchen").state is State.CANCELLED, "it is cancelled")
     system.kill("keeper")
-    system.until(lambda: _waits_for_nothing(system), 30, "nothing waits for it any more")
+    system.until(lambda: _waits_for_nothing(system), "nothing waits for it any more")
     # A task that was at its end when the cancellation came has succeeded; the new keeper hears of it.
-    system.until(
-        lambda: not differences(system.parts.index, system.parts.store), 30, "the index is what the store says"
-    )
+    system.until(lambda: not differences(system.parts.index, system.parts.store), "the index is what the store says")
     states = {cell.state for cell in status(system.parts.index, "kitchen").cells}
     assert states == {State.SUCCEEDED, State.CANCELLED}
 

@@ -20,22 +20,22 @@ def test_a_worker_whose_engine_breaks_hands_its_tasks_back_and_returns_when_it_i
 ) -> None:
     broken = tmp_path / "broken"
     system = start(api=True, environment={"FAKE_BROKEN": str(broken)})
-    system.finish(system.submit(request(seed=1)), seconds=60)
+    system.finish(system.submit(request(seed=1)))
     broken.touch()
     jobs = [system.submit(request(seed=seed)) for seed in (2, 3)]
     url = f"{system.supervisor.api_url}/v1/workers"
     found: list[dict[str, str]] = []
 
     def is_shown() -> bool:
-        found[:] = [worker for worker in httpx.get(url).json() if worker["state"] == "quarantined"]
+        found[:] = [worker for worker in httpx.get(url, timeout=60).json() if worker["state"] == "quarantined"]
         return bool(found)
 
-    system.until(is_shown, 60, "the worker is shown in quarantine")
+    system.until(is_shown, "the worker is shown in quarantine")
     assert found[0]["reason"] == "no kernel can be loaded"
-    page = httpx.get(f"{system.supervisor.api_url}/workers").text
+    page = httpx.get(f"{system.supervisor.api_url}/workers", timeout=60).text
     assert "takes no tasks: no kernel can be loaded" in page
     broken.unlink()
-    done = system.finish(*jobs, seconds=90)
+    done = system.finish(*jobs)
     assert {job.state for job in done} == {State.SUCCEEDED}
     assert system.parts.index.jobs.attempts() == [], "it cost no attempt"
 
@@ -47,7 +47,7 @@ def test_a_worker_that_cannot_load_its_engine_takes_no_task(start: Callable[...,
     first = system.kill("worker-0")
     job = system.submit(request())
     states = lambda: {worker.state for worker in system.parts.index.overview.workers()}  # noqa: E731
-    system.until(lambda: "quarantined" in states(), 60, "its successor is in quarantine")
+    system.until(lambda: "quarantined" in states(), "its successor is in quarantine")
     assert system.supervisor.pids["worker-0"] != first
     assert system.parts.index.jobs.get(job).state is State.QUEUED
     assert system.parts.index.jobs.attempts() == []

@@ -24,23 +24,26 @@ pytestmark = pytest.mark.chaos
 def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable[..., System], scene: str) -> None:
     system = start(fakes=False, lease_s=2.0, retry_backoff_s=0.1)
     index = system.parts.index
-    request = JobRequest(hand="barrett", object="block", grasps=24, fidelity="draft", seed=7, scene=scene)
     system.until(
         lambda: {a.name for kind in AssetKind for a in index.assets.page(kind=kind).items} >= {"barrett", "block"},
-        20, "the built-in assets are published",
+        "the built-in assets are published",
     )  # fmt: skip
-    job = system.submit(request)
-    system.until(
-        lambda: any(
-            task.stage is Stage.SYNTHESIZE and 0 < task.done < 0.9 * task.total
-            for task in index.jobs.tasks(job=job, state=State.RUNNING).items
-        ),
-        60, "the synthesis is under way",
-    )  # fmt: skip
-    system.kill("worker-0")
-    (done,) = system.finish(job, seconds=90)
-    assert (done.state, done.grasps) == (State.SUCCEEDED, 24)
-    assert [attempt.kind for attempt in index.jobs.attempts(job=job)] == ["WorkerLost"]
+
+    def is_under_way(job: str) -> bool:
+        tasks = index.jobs.tasks(job=job, state=State.RUNNING).items
+        return any(task.stage is Stage.SYNTHESIZE and 0 < task.done < 0.9 * task.total for task in tasks)
+
+    # On a busy machine one may be done before this process sees it under way, or kills its worker.
+    for seed in range(7, 12):
+        request = JobRequest(hand="barrett", object="block", grasps=24, fidelity="draft", seed=seed, scene=scene)
+        job = system.submit(request)
+        system.until(lambda job=job: is_under_way(job) or index.jobs.get(job).state.is_final, "its synthesis goes on")
+        system.kill("worker-0")
+        (done,) = system.finish(job)
+        assert (done.state, done.grasps) == (State.SUCCEEDED, 24)
+        if attempts := index.jobs.attempts(job=job):
+            break
+    assert [attempt.kind for attempt in attempts] == ["WorkerLost"]
     (shard,) = index.shards.page(job=job, kind="base").items
     kept = read_shard(system.parts.store.get(shard.key))
     block = object_from_path("block", face_error_m=request.knobs.face_error_m)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import stat
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -25,9 +24,9 @@ from tests.conftest import REPOSITORY
 from tests.deploy.slurm import FakeSlurm
 from tests.fakes import add_assets, request
 from tests.system.conftest import System
+from tests.waiting import PATIENCE_S, until
 
 SLURM = REPOSITORY / "docker" / "slurm"
-READY_S = 60.0
 
 
 def command(path: Path, module: str) -> Path:
@@ -61,18 +60,23 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
     fakes = command(tmp_path / "bin" / "graspd", "tests.fakes")
     supervisor.start()
     try:
-        supervisor.wait_ready(READY_S)
-        system = System(supervisor)
+        supervisor.wait_ready(PATIENCE_S)
+        hold = tmp_path / "hold"
+        system = System(supervisor, hold)
         assert stat.S_IMODE((shared / "join.env").stat().st_mode) == 0o600
         job = job_actions.submit(system.parts, request(grasps=32 * 16))[0].id
-        slow = environment(shared, GRASPD=str(fakes), FAKE_SECONDS="0.6", GRASPD_LEASE_S="2", IDLE_S="2")
+        hold.touch()
+        slow = environment(
+            shared, GRASPD=str(fakes), FAKE_SECONDS="0.2", FAKE_HOLD=str(hold), GRASPD_LEASE_S="2", IDLE_S="2"
+        )
         first, second, third = slurm.sbatch(SLURM / "worker.sbatch", slow, array=3)
         busy = lambda: len(system.parts.index.jobs.tasks(job=job, state=State.RUNNING).items)  # noqa: E731
-        system.until(lambda: busy() == 3, READY_S, f"three busy workers\n{slurm.logs()}")
-        slurm.preempt(second, grace_s=30)
-        assert slurm.reach_time_limit(first, notice_s=30), slurm.logs()
+        system.until(lambda: busy() == 3, f"three busy workers\n{slurm.logs()}")
+        slurm.preempt(second, grace_s=PATIENCE_S)
+        assert slurm.reach_time_limit(first, notice_s=PATIENCE_S), slurm.logs()
         slurm.lose_node(third)
-        (done,) = system.finish(job, seconds=120)
+        hold.unlink()
+        (done,) = system.finish(job)
         assert done.state is State.SUCCEEDED
         tasks = system.parts.index.jobs.tasks(job=job, limit=100).items
         assert len(tasks) == 16
@@ -81,7 +85,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
         shards = [path.stem for path in (shared / "store" / "shards" / "base").glob("*.h5")]
         assert len(shards) == len(set(shards)) == 16
         for element in (first, second, third):
-            assert element.wait(60) == 0, slurm.logs()
+            assert element.wait(PATIENCE_S) == 0, slurm.logs()
             assert element.restarts == 1
         system.parts.close()
     finally:
@@ -114,15 +118,7 @@ def test_the_service_of_a_lost_node_starts_anew_elsewhere_and_the_workers_find_i
     manifests = shared / "store" / "shards" / "base"
     until(lambda: len(list(manifests.glob("*.json"))) == 8, f"8 shards of {job}\n{slurm.logs()}")
     assert worker.restarts == 0, "the worker found the service by itself"
-    assert slurm.reach_time_limit(service, notice_s=60), slurm.logs()
-
-
-def until(met: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
-    """Until a condition is met; fails when it takes longer than that."""
-    deadline = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
+    assert slurm.reach_time_limit(service, notice_s=PATIENCE_S), slurm.logs()
 
 
 def joined(shared: Path) -> str | None:
@@ -147,13 +143,13 @@ def submitted(shared: Path, slurm: FakeSlurm) -> str:
 
     def ready() -> bool:
         try:
-            return httpx.get(f"{url}/readyz", trust_env=False).status_code == 200
+            return httpx.get(f"{url}/readyz", trust_env=False, timeout=60).status_code == 200
         except httpx.HTTPError:
             return False
 
     until(ready, f"the API at {url}\n{slurm.logs()}")
     wanted = request(grasps=32 * 8).model_dump(mode="json", exclude_none=True)
-    answer = httpx.post(f"{url}/v1/jobs", json=wanted, trust_env=False, timeout=30)
+    answer = httpx.post(f"{url}/v1/jobs", json=wanted, trust_env=False, timeout=60)
     assert answer.status_code == 202, answer.text
     done = shared / "store" / "shards" / "base"
     until(lambda: len(list(done.glob("*.json"))) >= 2, f"two shards\n{slurm.logs()}")
@@ -164,7 +160,7 @@ def test_redis_asks_for_the_password_of_the_file_and_nobody_else_reads_it(tmp_pa
     settings = Settings(data_dir=tmp_path / "data", store_url=(tmp_path / "store").as_uri())
     others = joining(settings, tmp_path / "shared" / "join.env", host="127.0.0.1")
     with Supervisor(settings, workers=0, api=False, joining=others) as supervisor:
-        supervisor.wait_ready(READY_S)
+        supervisor.wait_ready(PATIENCE_S)
         arguments = Path(f"/proc/{supervisor.pids['redis']}/cmdline").read_bytes().decode()
         assert others.password not in arguments, "every user of the machine reads arguments"
         assert Redis.from_url(others.redis_url).ping()
@@ -174,5 +170,5 @@ def test_redis_asks_for_the_password_of_the_file_and_nobody_else_reads_it(tmp_pa
         for file in (tmp_path / "shared" / "join.env", settings.data_dir / "redis" / "password"):
             assert stat.S_IMODE(file.stat().st_mode) == 0o600
     with Supervisor(settings, workers=0, api=False) as alone:
-        alone.wait_ready(READY_S)
+        alone.wait_ready(PATIENCE_S)
         assert Redis.from_url(redis_url(settings)).ping(), "without --share there is no password any more"

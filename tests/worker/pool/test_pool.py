@@ -6,13 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from service.model.errors import TaskCancelled
+from tests.waiting import until
 from tests.worker.pool import works
 from worker.pool.pool import KEPT, Pool, ProcessLost
 from worker.pool.size import BYTES_PER_PROCESS, MEMORY_SHARE, processes_at_once
@@ -22,13 +22,6 @@ from worker.pool.size import BYTES_PER_PROCESS, MEMORY_SHARE, processes_at_once
 def pool() -> Iterator[Pool]:
     with Pool(2) as made:
         yield made
-
-
-def wait_for(fact: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120
-    while not fact():
-        assert time.monotonic() < end, "what is waited for does not come"
-        time.sleep(0.02)
 
 
 def alive(pid: int) -> bool:
@@ -75,7 +68,7 @@ def test_one_that_was_killed_while_it_waited_is_replaced(pool: Pool) -> None:
     pool.map(works.times, "three", 3, range(6))
     for pid in pool.pids:
         os.kill(pid, signal.SIGKILL)
-        wait_for(lambda pid=pid: not alive(pid))
+        until(lambda pid=pid: not alive(pid), "it is dead")
     assert pool.map(works.times, "three", 3, range(6)) == [0, 3, 6, 9, 12, 15]
 
 
@@ -97,13 +90,13 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
     )
     parent = subprocess.Popen([sys.executable, "-c", program])
     try:
-        wait_for(lambda: len(list(tmp_path.iterdir())) == 2 or parent.poll() is not None)
+        until(lambda: len(list(tmp_path.iterdir())) == 2 or parent.poll() is not None, "both work")
     finally:
         parent.kill()
         parent.wait()
     pids = [int(file.name) for file in tmp_path.iterdir()]
     assert len(pids) == 2
-    wait_for(lambda: not any(alive(pid) for pid in pids))
+    until(lambda: not any(alive(pid) for pid in pids), "they end")
 
 
 def machine(root: Path, cores: float, memory: int) -> Path:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 from service.settings import Settings
 from tests.system.conftest import alive
+from tests.waiting import until
 from worker.process.several import run_workers
 
 #: Notes its pid under its number and waits.
@@ -31,10 +31,8 @@ def test_each_has_a_number_and_one_that_ends_comes_again(tmp_path: Path) -> None
     running.start()
 
     def notes(count: int) -> list[tuple[int, int]]:
-        end = time.monotonic() + 60
-        while len(found := [file.name.split("-") for file in tmp_path.iterdir()]) < count:
-            assert time.monotonic() < end, f"{count} processes were to start; there are {found}"
-            time.sleep(0.02)
+        until(lambda: len(list(tmp_path.iterdir())) >= count, f"{count} processes start")
+        found = [file.name.split("-") for file in tmp_path.iterdir()]
         return sorted((int(number), int(pid)) for number, pid in found)
 
     try:
