@@ -21,9 +21,9 @@ app = typer.Typer(no_args_is_help=True)
 #: Formats of robots and their simulators; the first of them goes by two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 #: Formats that a network is trained on: they take a folder of shards.
-TRAINING: Final = ("dexlearn",)
+TRAINING: Final = ("dexlearn", "graspgen")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-IMPORTS: Final = ("dexgraspbench", "dexlearn", "dexgraspnet", "multidex", "ddgc", "reference")
+IMPORTS: Final = ("dexgraspbench", "dexlearn", "graspgen", "dexgraspnet", "multidex", "ddgc", "reference")
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
@@ -101,7 +101,7 @@ def import_(
     hand: Annotated[str | None, typer.Option(help="The hand: a URDF or a built-in.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="The object's mesh, at the source's scale 1.")] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
-    name: Annotated[str, typer.Option(help="multidex: name of the object in the file.")] = "",
+    name: Annotated[str, typer.Option(help="multidex, graspgen: name of the object in the file.")] = "",
     number: Annotated[int, typer.Option(help="ddgc: which object of the scene.")] = 0,
     referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
     friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
@@ -142,7 +142,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     Raises:
         InputError: unknown format, something that it needs is not given, or not such a file.
     """
-    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, multidex, reference
+    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, graspgen, multidex, reference
 
     if format_ not in IMPORTS:
         raise InputError(f"there is no import format {format_!r}; choose one of {', '.join(IMPORTS)}")
@@ -154,6 +154,8 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
     if format_ in ("dexgraspbench", "dexlearn"):
         return dexgraspbench.read(source, hand=hand, obj=obj)
+    if format_ == "graspgen":
+        return graspgen.read(source, hand=hand, obj=obj, object_name=str(options["object_name"]))
     if format_ == "dexgraspnet":
         return dexgraspnet.read(source, hand=hand, obj=obj)
     if format_ == "ddgc":

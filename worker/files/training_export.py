@@ -18,7 +18,10 @@ from worker.files.exchange.imported import plain_name
 from worker.files.exchange.lots import SEEN, Lot, held_out
 from worker.files.exchange.written import Written
 
-FORMATS: Final = ("dexlearn",)
+FORMATS: Final = ("dexlearn", "graspgen")
+
+#: Formats that tell good grasps from bad ones.
+LABELLED: Final = ("graspgen",)
 
 
 @dataclass(frozen=True)
@@ -39,20 +42,21 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
     Raises:
         InputError: unknown format, no such grasps, a share that is none, or what the format's writer refuses.
     """
-    from worker.files.exchange import dexlearn
+    from worker.files.exchange import dexlearn, graspgen
 
     if format_ not in FORMATS:
         raise InputError(f"there is no training format {format_!r}; choose one of {', '.join(FORMATS)}")
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
-    lots = _lots(shards, wishes)
+    lots = _lots(shards, format_, wishes)
     out = held_out({lot.name: lot.obj.digest for lot in lots}, wishes.held_out)
-    pictures = _pictures(shards, wishes)
-    return dexlearn.write(lots, pictures, folder, out)
+    if format_ == "graspgen":
+        return graspgen.write(lots, folder, out)
+    return dexlearn.write(lots, _pictures(shards, wishes), folder, out)
 
 
-def _lots(shards: Shards, wishes: TrainingWishes) -> list[Lot]:
+def _lots(shards: Shards, format_: str, wishes: TrainingWishes) -> list[Lot]:
     """Grasps of all base shards that have some of the kind that is asked for."""
     lots: list[Lot] = []
     digests: dict[str, str] = {}
@@ -61,7 +65,7 @@ def _lots(shards: Shards, wishes: TrainingWishes) -> list[Lot]:
         path = shards.path(file)
         shard = read_shard(path, kind="base")
         try:
-            mask, _ = choose(shard, unjudged=wishes.unjudged, every=wishes.every)
+            mask = _chosen(shard, format_, wishes)
         except InputError as error:
             refused = error
             continue
@@ -74,6 +78,18 @@ def _lots(shards: Shards, wishes: TrainingWishes) -> list[Lot]:
     if not lots:
         raise refused or InputError("there is no base shard, so there are no grasps")
     return lots
+
+
+def _chosen(shard: Shard, format_: str, wishes: TrainingWishes) -> np.ndarray:
+    """(N,) grasps that go into the export. A format that labels grasps gets good ones and bad ones."""
+    if format_ not in LABELLED:
+        return choose(shard, unjudged=wishes.unjudged, every=wishes.every)[0]
+    judged = standing.judged(shard.arrays)
+    if wishes.unjudged or not judged.any():
+        raise InputError(
+            f"{format_} says of each grasp whether it holds; judge them first: graspd synth without --referee none"
+        )
+    return judged
 
 
 def _held(shard: Shard) -> np.ndarray:
