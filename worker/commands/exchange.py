@@ -21,9 +21,18 @@ app = typer.Typer(no_args_is_help=True)
 #: Formats of robots and their simulators; the first of them goes by two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 #: Formats that a network is trained on: they take a folder of shards.
-TRAINING: Final = ("dexlearn", "graspgen")
+TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-IMPORTS: Final = ("dexgraspbench", "dexlearn", "graspgen", "dexgraspnet", "multidex", "ddgc", "reference")
+IMPORTS: Final = (
+    "dexgraspbench",
+    "dexlearn",
+    "graspgen",
+    "dexgraspnet",
+    "dexgraspnet2",
+    "multidex",
+    "ddgc",
+    "reference",
+)
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
@@ -102,7 +111,7 @@ def import_(
     object_: Annotated[str | None, typer.Option("--object", help="The object's mesh, at the source's scale 1.")] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
     name: Annotated[str, typer.Option(help="multidex, graspgen: name of the object in the file.")] = "",
-    number: Annotated[int, typer.Option(help="ddgc: which object of the scene.")] = 0,
+    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: which object of the scene.")] = 0,
     referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
     friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: all cores.")] = 0,
@@ -142,7 +151,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     Raises:
         InputError: unknown format, something that it needs is not given, or not such a file.
     """
-    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, graspgen, multidex, reference
+    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, dexgraspnet2, graspgen, multidex, reference
 
     if format_ not in IMPORTS:
         raise InputError(f"there is no import format {format_!r}; choose one of {', '.join(IMPORTS)}")
@@ -158,6 +167,8 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         return graspgen.read(source, hand=hand, obj=obj, object_name=str(options["object_name"]))
     if format_ == "dexgraspnet":
         return dexgraspnet.read(source, hand=hand, obj=obj)
+    if format_ == "dexgraspnet2":
+        return dexgraspnet2.read(source, hand=hand, obj=obj, number=int(options["number"]))
     if format_ == "ddgc":
         return ddgc.read(source, hand=hand, obj=obj, number=int(options["number"]))
     if not options["robot"] or not options["object_name"]:

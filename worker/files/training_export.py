@@ -18,7 +18,7 @@ from worker.files.exchange.imported import plain_name
 from worker.files.exchange.lots import SEEN, Lot, held_out
 from worker.files.exchange.written import Written
 
-FORMATS: Final = ("dexlearn", "graspgen")
+FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen")
 
 #: Formats that tell good grasps from bad ones.
 LABELLED: Final = ("graspgen",)
@@ -42,7 +42,7 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
     Raises:
         InputError: unknown format, no such grasps, a share that is none, or what the format's writer refuses.
     """
-    from worker.files.exchange import dexlearn, graspgen
+    from worker.files.exchange import dexgraspnet2, dexlearn, graspgen
 
     if format_ not in FORMATS:
         raise InputError(f"there is no training format {format_!r}; choose one of {', '.join(FORMATS)}")
@@ -53,7 +53,8 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
     out = held_out({lot.name: lot.obj.digest for lot in lots}, wishes.held_out)
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
-    return dexlearn.write(lots, _pictures(shards, wishes), folder, out)
+    writer = dexlearn.write if format_ == "dexlearn" else dexgraspnet2.write
+    return writer(lots, _pictures(shards, wishes), folder, out)
 
 
 def _lots(shards: Shards, format_: str, wishes: TrainingWishes) -> list[Lot]:

@@ -238,9 +238,9 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
                         continue
                     names.append(key)
                     if found is None and uuid in ("", key):
-                        stream = tar.extractfile(member)
-                        assert stream is not None, "a plain file has content"
-                        found = f"{file}: {key}", _parsed(f"{file}: {key}", stream.read(LARGEST + 1))
+                        content = tar.extractfile(member)
+                        assert content is not None, "a plain file has content"
+                        found = f"{file}: {key}", _parsed(f"{file}: {key}", content.read(LARGEST + 1))
         except (OSError, tarfile.TarError) as error:
             raise InputError(f"{file} is no tar file: {error}") from None
     if found is None or (not uuid and len(names) > 1):

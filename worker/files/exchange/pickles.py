@@ -44,7 +44,7 @@ def load_npy(path: Path) -> Any:
             if (array := _plain(file)) is not None:
                 return array
             found = _Reader(file).load()
-    except (OSError, ValueError, EOFError, TypeError, AttributeError, KeyError, IndexError) as error:
+    except (OSError, ValueError, EOFError, TypeError, AttributeError, KeyError, IndexError, MemoryError) as error:
         raise InputError(f"{path} is no NumPy file: {error}") from None
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None

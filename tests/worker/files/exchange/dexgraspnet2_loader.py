@@ -1,0 +1,86 @@
+"""DexGraspNet 2.0's loader, rebuilt: what it does was read in its source and is written anew here, without its draws of
+chance, its sparse tensors and torch.
+
+yl-wang996/DexGraspNet2, src/utils/dataset.py at cc03dc65505ab47482582d4641d81b4159e8aa1d (`GraspNetDataset`), with
+configs/network/train_dex_ours.yaml there. How a depth picture becomes points is GraspNet's rule, as
+tgaspar/DexGraspNet2 has it in dexgraspnet2/utils/point_cloud.py at eae45394d4b182a0d80742d14a74c162fdcb7a52.
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+from PIL import Image
+
+#: Of its configuration: how far a grasp's point may be from the cloud [m].
+MAX_POINT_DIS = 0.006
+#: Of GraspNet: what is farther from the box around the objects is cut off [m].
+OUTLIER = 0.02
+
+
+@dataclass
+class Sample:
+    """Of one view of a scene, in the camera's frame: all of it, where the loader draws."""
+
+    point_clouds: np.ndarray
+    seg: np.ndarray
+    rot: np.ndarray
+    """(N, 3, 3)"""
+    trans: np.ndarray
+    qpos: np.ndarray
+    """(N, J) in the order of the joint names given"""
+    near: np.ndarray
+    """(N,) whether the grasp's point is near a point of the cloud: others are not taken"""
+
+
+def views_of(split: range) -> list[tuple[str, int]]:
+    """What is drawn from: 256 views of each scene of a split."""
+    return [(f"scene_{number:04}", view) for number in split for view in range(256)]
+
+
+def some_views(root: Path, split: range, count: int, seed: int) -> list[tuple[str, int]]:
+    """Views that are drawn and are there; a scene that is missing makes it draw again."""
+    draw = random.Random(seed)
+    there = [view for view in views_of(split) if (root / "data" / "scenes" / view[0]).is_dir()]
+    return draw.sample(there, count)
+
+
+def sample(root: Path, scene: str, view: int, robot: str, joint_names: list[str]) -> Sample:
+    path = root / "data" / "scenes" / scene / "realsense"
+    with Image.open(path / "depth_gt" / f"{view:04}.png") as file:
+        depth = np.array(file)
+    with Image.open(path / "label_gt" / f"{view:04}.png") as file:
+        seg = np.array(file)
+    meta = scipy.io.loadmat(path / "meta" / f"{view:04}.mat")
+    poses, align = np.load(path / "camera_poses.npy"), np.load(path / "cam0_wrt_table.npy")
+    cloud = _points(depth, meta["intrinsic_matrix"], meta["factor_depth"])
+    assert seg.any(), "a view without objects is drawn anew"
+    mask = (depth > 0) & _workspace(cloud, seg, align @ poses[view])
+    cloud, seg = cloud[mask], seg[mask]
+    parts = [np.load(file) for file in sorted((root / "data" / "dex_grasps_new" / scene / robot).iterdir())]
+    grasps = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].files}
+    turn, place = poses[view][:3, :3], poses[view][:3, 3]
+    point = (grasps["point"] - place) @ turn
+    return Sample(
+        cloud, seg, np.einsum("ji,njk->nik", turn, grasps["rotation"]), (grasps["translation"] - place) @ turn,
+        np.stack([grasps[name] for name in joint_names], axis=-1),
+        np.linalg.norm(cloud[None] - point[:, None], axis=2).min(axis=1) <= MAX_POINT_DIS,
+    )  # fmt: skip
+
+
+def _points(depth: np.ndarray, intrinsics: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
+    z = depth / float(np.squeeze(factor))
+    x, y = ((at - intrinsics[k, 2]) * z / intrinsics[k, k] for k, at in enumerate((u, v)))
+    return np.stack([x, y, z], axis=-1)
+
+
+def _workspace(cloud: np.ndarray, seg: np.ndarray, trans: np.ndarray) -> np.ndarray:
+    """The box around what is labelled, in the table's frame."""
+    there = cloud @ trans[:3, :3].T + trans[:3, 3]
+    low, high = there[seg > 0].min(axis=0) - OUTLIER, there[seg > 0].max(axis=0) + OUTLIER
+    return ((there > low) & (there < high)).all(axis=-1)
