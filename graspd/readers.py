@@ -1,5 +1,20 @@
-"""Datasets as samples for training: `Shards`, `Grasps` and `Pictures` of files or a store (docs/exchange.md)."""
+"""Datasets as samples for training: `Shards`, `Grasps`, `Pictures`, `Clouds` of files or a store (docs/exchange.md)."""
 
-from service.readers import Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards
+from typing import Any
 
-__all__ = ["Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "open_shards"]
+from service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards
+
+__all__ = [
+    "Clouds", "DepthNoise", "Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "hand_surface", "open_shards",
+]  # fmt: skip
+
+
+def hand_surface(shard: Any, rows: Any) -> Any:
+    """(K, H, 3) points on the hand's surface in grasps of a base shard, in the object's frame [m]: for graspness.
+
+    Raises:
+        NotFoundError: the hand that the shard was made with is not here.
+    """
+    from worker.files.hand_surface import hand_surface as found  # loads the hands' reader
+
+    return found(shard, rows)

@@ -7,13 +7,16 @@
     grasps = Grasps(shards)                                                # grasps[i]: one grasp as a dictionary
     arrays = grasps.arrays("grasp/hand_pose", "quality/epsilon")           # all of them as arrays
     pictures = Pictures(shards)                                            # a picture with the grasps of its scene
+    clouds = pictures.clouds(points=1024, noise="stereo")                  # as a depth camera sees it, in points
 
 `service.readers.torch_data` wraps them for PyTorch; nothing here imports it.
 """
 
 from service.readers.cache import ShardCache
+from service.readers.clouds import Clouds
+from service.readers.depth_noise import DepthNoise
 from service.readers.files import ShardFile, Shards, open_shards
 from service.readers.grasps import Grasps
 from service.readers.pictures import Pictures
 
-__all__ = ["Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "open_shards"]
+__all__ = ["Clouds", "DepthNoise", "Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "open_shards"]

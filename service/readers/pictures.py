@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from service.model.errors import InputError
 from service.readers.files import ShardFile, Shards
 from service.store import standing
 from service.store.shards import SCHEMAS, open_shard, read_shard
+
+if TYPE_CHECKING:
+    from service.readers.clouds import Clouds
 
 Array = NDArray[Any]
 
@@ -27,6 +31,25 @@ DEFAULT_COLUMNS: Final = (
     "box/bounding_box_2d_tight",
 )
 _KEPT: Final = 64
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a picture lies."""
+
+    file: ShardFile
+    scene_shard: str
+    """Id of the scene or base shard with its scenes."""
+    scene: int
+    row: int
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """What samples say of where they come from."""
+        return {
+            "hand": self.file.hand, "object": self.file.object, "shard_id": self.file.id, "row": self.row,
+            "scene": self.scene,
+        }  # fmt: skip
 
 
 class Pictures(Sequence[dict[str, Any]]):
@@ -75,8 +98,8 @@ class Pictures(Sequence[dict[str, Any]]):
             raise InputError(f"base shards have no column {sorted(unknown)[0]!r}; docs/dataset.md lists them")
         self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
         self._which = {"clear": clear, "valid": valid, "unjudged": unjudged}
-        self._scenes: OrderedDict[str, _Scenes] = OrderedDict()
-        self._places: list[tuple[ShardFile, str, int, int]] = []
+        self._scenes: OrderedDict[str, Scenes] = OrderedDict()
+        self._places: list[Place] = []
         for file in shards.of("views"):
             self._add(file, with_grasps_only=with_grasps_only)
 
@@ -86,12 +109,31 @@ class Pictures(Sequence[dict[str, Any]]):
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        file, scene_shard, scene, row = self._places[index]
-        with open_shard(self.shards.path(file)) as opened:
-            sample: dict[str, Any] = {name: opened[name][row] for name in self.columns}
-            extrinsics = np.asarray(opened["camera/extrinsics"][row], float)
-        names = {"hand": file.hand, "object": file.object, "shard_id": file.id, "row": row, "scene": scene}
-        return sample | self._scenes_of(scene_shard).grasps(scene, extrinsics) | names
+        place = self._places[index]
+        sample = self.columns_of(place, {*self.columns, "camera/extrinsics"})
+        extrinsics = np.asarray(sample["camera/extrinsics"], float)
+        sample = {name: sample[name] for name in self.columns}
+        return sample | self.scenes_of(place).grasps(place.scene, extrinsics) | place.names
+
+    @property
+    def places(self) -> Sequence[Place]:
+        """Where each picture lies."""
+        return self._places
+
+    def columns_of(self, place: Place, columns: Iterable[str]) -> dict[str, Array]:
+        """Some columns of one picture."""
+        with open_shard(self.shards.path(place.file)) as opened:
+            return {name: opened[name][place.row] for name in columns}
+
+    def scenes_of(self, place: Place) -> Scenes:
+        """The scenes of the picture's shard with the grasps that this reader keeps."""
+        return self._scenes_of(place.scene_shard)
+
+    def clouds(self, points: int = 1024, **options: Any) -> Clouds:
+        """The pictures as point clouds with the labels of their scenes; for the options see `Clouds`."""
+        from service.readers.clouds import Clouds
+
+        return Clouds(self, points, **options)
 
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with open_shard(self.shards.path(file)) as opened:
@@ -107,18 +149,21 @@ class Pictures(Sequence[dict[str, Any]]):
         held = self._scenes_of(scene_shard)
         for row, scene in enumerate(scenes):
             if not with_grasps_only or held.count(int(scene)):
-                self._places.append((file, scene_shard, int(scene), row))
+                self._places.append(Place(file, scene_shard, int(scene), row))
 
-    def _scenes_of(self, shard: str) -> _Scenes:
+    def _scenes_of(self, shard: str) -> Scenes:
         if shard not in self._scenes:
-            self._scenes[shard] = _Scenes(self.shards, shard, self._quality, **self._which)
+            self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)
         return self._scenes[shard]
 
 
-class _Scenes:
-    """The scenes of one shard with their grasps: of a scene shard, or of a base shard with grasps planned in scenes."""
+class Scenes:
+    """The scenes of one shard with their grasps: of a scene shard, or of a base shard with grasps planned in scenes.
+
+    `base` is the base shard of the grasps, `base_id` its id.
+    """
 
     def __init__(
         self, shards: Shards, shard: str, quality: Sequence[str], *, clear: bool, valid: bool, unjudged: bool
@@ -126,8 +171,9 @@ class _Scenes:
         file = shards.by_id(shard)
         scenes = read_shard(shards.path(file), kind=file.kind)
         planned = file.kind == "base"
-        self._base_id = shard if planned else str(scenes.attributes["base_shard"])
-        base = scenes if planned else read_shard(shards.path(shards.by_id(self._base_id)), kind="base")
+        self.base_id = shard if planned else str(scenes.attributes["base_shard"])
+        base = scenes if planned else read_shard(shards.path(shards.by_id(self.base_id)), kind="base")
+        self.base = base
         self._object = np.asarray(scenes["scene/object_pose"], float)
         scene = np.asarray(scenes["grasp/scene_index"])
         row = np.arange(len(scene)) if planned else np.asarray(scenes["grasp/base_index"])
@@ -146,12 +192,23 @@ class _Scenes:
         }
 
     def count(self, scene: int) -> int:
-        return int(np.count_nonzero(self._scene == scene))
+        return len(self._of(scene))
+
+    def object_pose(self, scene: int) -> NDArray[np.float64]:
+        """(7,) the object at rest, in the frame of the table."""
+        return self._object[scene]
+
+    def base_rows(self, scene: int) -> NDArray[np.intp]:
+        """(K,) rows in the base shard of the grasps kept in one scene."""
+        return self._row[self._of(scene)]
+
+    def _of(self, scene: int) -> NDArray[np.intp]:
+        return np.flatnonzero(self._scene == scene)
 
     def grasps(self, scene: int, extrinsics: NDArray[np.float64]) -> dict[str, Any]:
         """Of one scene, in the frame of the camera with these extrinsics (4, 4)."""
-        rows = np.flatnonzero(self._scene == scene)
+        rows = self._of(scene)
         pose = transforms.compose(transforms.pose_from_matrix(extrinsics), self._pose[rows])
-        found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self._base_id}
+        found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self.base_id}
         found["object/pose"] = transforms.compose(transforms.pose_from_matrix(extrinsics), self._object[scene])
         return found | {name: column[rows] for name, column in self._columns.items()}

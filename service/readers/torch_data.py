@@ -6,13 +6,14 @@ from service.readers.torch_data import Samples, ShuffledShards, collate
 
 shards = open_shards("demo-out/shards")
 DataLoader(Samples(Pictures(shards)), batch_size=16, shuffle=True, num_workers=4, collate_fn=collate)
+DataLoader(Samples(Pictures(shards).clouds(1024, noise="stereo")), batch_size=64, collate_fn=collate)
 DataLoader(ShuffledShards(shards, seed=1), batch_size=256, num_workers=4)     # larger than memory
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from service.readers.files import Shards
 from service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
 
 Sample = dict[str, Any]
+_OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
 
 
 def tensors(sample: Sample) -> Sample:
@@ -30,19 +32,19 @@ def tensors(sample: Sample) -> Sample:
 
 
 def collate(samples: Sequence[Sample]) -> Sample:
-    """One batch: values are stacked, but the grasps of each picture's scene stay a list of tensors."""
+    """One batch: values are stacked, but the grasps of each picture's or cloud's scene stay a list of tensors."""
     pictures = "grasp/base_row" in samples[0]
     batch: Sample = {}
     for name in samples[0]:
         values = [sample[name] for sample in samples]
         # Scenes may have equally many grasps by chance; the batch must not change its kind for that.
-        listed = pictures and name.startswith(("grasp/", "quality/"))
+        listed = pictures and name.startswith(_OF_GRASPS)
         batch[name] = values if listed else default_collate(values)
     return batch
 
 
 class Samples(Dataset[Sample]):
-    """`Grasps` or `Pictures` as a map-style dataset; a `DataLoader` may shuffle it and read it in processes."""
+    """`Grasps`, `Pictures` or `Clouds` as a map-style dataset; a `DataLoader` may shuffle it and read in processes."""
 
     def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = tensors) -> None:
         self._source, self._transform = source, transform

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
+from service.model.pinhole import pixel_rays
 
 Floats = NDArray[np.float64]
 
@@ -81,14 +82,6 @@ def narrow_field(k: Floats, width: int, height: int) -> float:
             f"camera can be aimed; give the cameras' places too"
         )
     return float(2 * np.arctan(min(slopes)))
-
-
-def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Directions (H, W, 3) with z = 1 in the camera frame through points `shift` [px] off the pixel centres."""
-    columns = (np.arange(width) + 0.5 + shift[0] - k[0, 2]) / k[0, 0]
-    rows = (np.arange(height) + 0.5 + shift[1] - k[1, 2]) / k[1, 1]
-    x, y = np.meshgrid(columns, rows)
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def look_at(eye: Floats, target: Floats) -> Floats:

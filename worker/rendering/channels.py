@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from service.model.domain import EXTRA_CHANNELS
 from service.model.errors import InputError
+from service.model.pinhole import pixel_rays
 from worker.rendering.annotate import OBJECT
-from worker.rendering.cameras import Floats, pixel_rays
+from worker.rendering.cameras import Floats
 
 ALL: Final = "all"
 

@@ -20,10 +20,11 @@ from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
 from service.model.errors import TaskCancelled
+from service.model.pinhole import pixel_rays
 from service.model.transforms import compose, pose_from_matrix, quat_from_axis_angle, quat_rotate
 from worker.engines import backend
 from worker.rendering import kernels
-from worker.rendering.cameras import Floats, pixel_rays
+from worker.rendering.cameras import Floats
 from worker.rendering.passes import LightPass, light_passes
 from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
 from worker.run import ALONE, Run

@@ -10,6 +10,7 @@ import pytest
 from service.pipeline.backends import Parts
 from service.readers import Grasps, Pictures, Shards, open_shards
 from tests.api import factories
+from tests.service.readers import box_scenes
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 from torch.utils.data import DataLoader  # noqa: E402
@@ -57,3 +58,15 @@ def test_pictures_are_stacked_and_their_grasps_listed(shards: Shards) -> None:
     assert batch["image/rgb"].shape == (3, 16, 24, 3)
     assert [pose.shape[1] for pose in batch["grasp/hand_pose"]] == [7, 7, 7]
     assert batch["camera/intrinsics"].dtype is torch.float32
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_clouds_are_stacked_and_their_grasps_listed(tmp_path: Path, processes: int) -> None:
+    clouds = Pictures(open_shards(box_scenes.write(tmp_path / "box"))).clouds(128, noise="stereo", seed=2)
+    loader = DataLoader(Samples(clouds), batch_size=4, collate_fn=collate, num_workers=processes)
+    batches = list(loader)
+    assert [tuple(batch["cloud/points"].shape) for batch in batches] == [(4, 128, 3), (2, 128, 3)]
+    assert batches[0]["cloud/points"].dtype is torch.float32
+    assert [len(rows) for rows in batches[0]["grasp/hand_pose"]] == [3, 3, 3, 2]
+    alone = torch.from_numpy(clouds[1]["cloud/points"])
+    assert torch.equal(batches[0]["cloud/points"][1], alone)

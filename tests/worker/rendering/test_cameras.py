@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from service.model.pinhole import pixel_rays
 from worker.rendering.cameras import (
     ELEVATION,
     FIELD_OF_VIEW,
@@ -12,7 +13,6 @@ from worker.rendering.cameras import (
     Cameras,
     intrinsics,
     look_at,
-    pixel_rays,
     sample_hemisphere,
     stereo_pair,
 )

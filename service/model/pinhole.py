@@ -1,0 +1,101 @@
+"""The pinhole camera: pixels, rays and points. x right, y down, z forward; pixel centres at +0.5."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+#: Depths of neighbouring pixels that differ by more than this share are of two surfaces.
+EDGE: Final = 0.02
+#: Cost of a side of which only one pixel is seen: that of an edge between faces.
+_BEND_UNKNOWN: Final = 0.5
+
+
+def pixel_rays(k: Floats, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Floats:
+    """Directions (H, W, 3) with z = 1 in the camera frame through points `shift` [px] off the pixel centres."""
+    columns = (np.arange(width) + 0.5 + shift[0] - k[0, 2]) / k[0, 0]
+    rows = (np.arange(height) + 0.5 + shift[1] - k[1, 2]) / k[1, 1]
+    x, y = np.meshgrid(columns, rows)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def back_project(k: Floats, depth: NDArray[Any]) -> Floats:
+    """(H, W, 3) points in the camera frame [m] of depth along the optical axis (H, W); nan where it is not finite."""
+    seen = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
+    return pixel_rays(k, depth.shape[1], depth.shape[0]) * seen[..., None]
+
+
+def surface_normals(points: Floats) -> Floats:
+    """(H, W, 3) unit normals toward the camera of back-projected points (H, W, 3); nan where none can be told.
+
+    The tangents are one-sided differences, to the side on which the surface goes on more nearly as a plane,
+    on which 1 / z is linear in pixels, and does not jump, so that a normal is that of the face on which its pixel lies.
+    """
+    along, down = _tangent(points, 1), _tangent(points, 0)
+    normal = np.cross(down, along)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        away = np.einsum("hwc,hwc->hw", normal, points) > 0
+    return np.where(away[..., None], -normal, normal)
+
+
+def _tangent(points: Floats, axis: int) -> Floats:
+    step = np.diff(points, axis=axis)
+    gap = np.full_like(np.take(points, [0], axis=axis), np.nan)
+    ahead, behind = np.concatenate([step, gap], axis=axis), np.concatenate([gap, step], axis=axis)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bend = np.abs(np.diff(1 / points[..., 2], 2, axis=axis)) * np.take(
+            points[..., 2], range(1, points.shape[axis] - 1), axis=axis
+        )
+    none = np.full_like(np.take(points[..., 2], [0, 0], axis=axis), np.nan)
+    bent_ahead, bent_behind = np.concatenate([bend, none], axis=axis), np.concatenate([none, bend], axis=axis)
+    cost_ahead, cost_behind = _cost(ahead, bent_ahead, points), _cost(behind, bent_behind, points)
+    return np.where((cost_ahead <= cost_behind)[..., None], ahead, behind)
+
+
+def _cost(step: Floats, bend: Floats, points: Floats) -> Floats:
+    """How badly a step stands for its surface: by its bend, worse across an edge, worst where there is nothing."""
+    with np.errstate(invalid="ignore"):
+        jump = np.abs(step[..., 2]) / points[..., 2]
+    cost = np.where(np.isnan(bend), _BEND_UNKNOWN, np.minimum(bend, _BEND_UNKNOWN)) + np.where(
+        jump > EDGE, 1.0 + jump, 0.0
+    )
+    return np.where(np.isnan(jump), np.inf, cost)
+
+
+def fitted_normals(
+    points: Floats, row: NDArray[np.intp], column: NDArray[np.intp], *, radius: int, gap_m: Floats
+) -> Floats:
+    """(P, 3) unit normals toward the camera of the planes that fit the windows around some pixels best.
+
+    Args:
+        points: (H, W, 3) in the camera frame [m]; nan: a hole.
+        row, column: (P,) the pixels.
+        radius: the window is 2 radius + 1 pixels wide.
+        gap_m: (P,) neighbours whose depth differs by more than this do not count [m].
+
+    Returns:
+        The direction of least variance of each window; toward the camera, too, where fewer than three points count.
+    """
+    offset = np.arange(-radius, radius + 1)
+    height, width = points.shape[:2]
+    rows = np.clip(row[:, None, None] + offset[:, None], 0, height - 1)
+    columns = np.clip(column[:, None, None] + offset[None, :], 0, width - 1)
+    centre = points[row, column]
+    window = points[rows, columns].reshape(len(row), -1, 3) - centre[:, None]
+    with np.errstate(invalid="ignore"):
+        counts = np.abs(window[..., 2]) <= gap_m[:, None]
+    weight = counts.astype(float)
+    window = np.where(counts[..., None], window, 0.0)
+    total = np.maximum(weight.sum(1), 1.0)
+    middle = window.sum(1) / total[:, None]
+    spread = np.einsum("pni,pnj->pij", window, window) / total[:, None, None] - middle[:, :, None] * middle[:, None, :]
+    normal = np.linalg.eigh(spread)[1][..., 0]
+    few = weight.sum(1) < 3
+    toward = -centre / np.maximum(np.linalg.norm(centre, axis=-1, keepdims=True), 1e-12)
+    normal = np.where(few[:, None], toward, normal)
+    return np.where(np.einsum("pc,pc->p", normal, centre)[:, None] > 0, -normal, normal)

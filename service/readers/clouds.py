@@ -1,0 +1,211 @@
+"""Pictures as point clouds with the labels of their scenes, made when they are asked for; nothing is stored."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model import transforms
+from service.model.errors import InputError
+from service.readers.cloud_views import COLUMNS, CloudView
+from service.readers.depth_noise import DepthNoise, noise_of
+from service.readers.graspness import TOUCH_M, graspness
+from service.readers.pictures import Pictures, Place, Scenes
+from service.store.shards import Shard
+
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+#: From a base shard and K of its rows to points (K, H, 3) on the hand's surface in the object's frame [m].
+HandSurface = Callable[[Shard, Ints], Floats]
+
+Frame = Literal["camera", "table", "object"]
+FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
+POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+_NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
+
+
+class Clouds(Sequence[dict[str, Any]]):
+    """Point clouds of views, or of all views of a scene together. `clouds[i]` is a dictionary:
+
+        cloud/points (P, 3) [m]; cloud/normals (P, 3), unit, toward the camera that saw the point
+        cloud/object (P,) 1 where the pixel shows the object; cloud/pixel (P, 3): view, row, column
+        cloud/seen: how many points there were to draw from; where fewer than P, some stand several times, and where
+            none, all is zero
+        cloud/graspness (P,), if asked for: share of the scene's K grasps whose hand touches the point
+        camera/intrinsics (3, 3) K [px], camera/extrinsics (4, 4) E, table to camera; of several views (V, ...)
+        table/plane (4,) n and d of n.x = d, the table's top; table/height [m] of the top along n in the table's frame
+        object/pose (7,) of the object's frame
+        grasp/hand_pose (K, 7), likewise of other `postures`; and grasp/hand_pose_camera (not of several views),
+            grasp/hand_pose_table, grasp/hand_pose_object in each of the frames; grasp/joint_positions (K, J)
+        grasp/base_row (K,), base_id, and the columns of `grasp_quality` of the pictures
+
+    Points, plane and poses are in `frame`. Grasps are those that the pictures keep: by default the certified ones
+    that are clear in the scene.
+    """
+
+    def __init__(
+        self,
+        pictures: Pictures,
+        points: int = 1024,
+        *,
+        noise: str | DepthNoise | None = None,
+        frame: Frame | None = None,
+        fuse: bool = False,
+        scene: bool = False,
+        voxel_m: float = 0.0,
+        postures: Sequence[str] = ("grasp",),
+        hand_surface: HandSurface | None = None,
+        touch_m: float = TOUCH_M,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            pictures: which pictures, and which grasps of their scenes.
+            points: P, how many points a cloud has.
+            noise: a depth camera, by name (`depth_noise.NOISES`) or as it is; None: perfect depth.
+            frame: camera, table or object; by default the camera's, of several views the table's.
+            fuse: one cloud of all views of a scene.
+            scene: of all that is seen, table and neighbours too; by default of the object alone.
+            voxel_m: keep one point of each cube of this edge [m]; 0: all.
+            postures: of pregrasp, grasp and squeeze, those to tell of each grasp.
+            hand_surface: asks for graspness; `graspd.readers.hand_surface` is one.
+            touch_m: how near the hand must be to touch [m].
+            seed: of the points that are drawn and of the noise; the same seed and `epoch` give the same clouds.
+
+        Raises:
+            InputError: an unknown noise, frame or posture, or a number out of range.
+        """
+        chosen = frame or ("table" if fuse else "camera")
+        if chosen not in FRAMES or (fuse and chosen == "camera"):
+            raise InputError(
+                f"clouds {'of several views ' * fuse}cannot be in the frame {chosen!r}; take table or object"
+            )
+        if unknown := set(postures) - set(POSTURES):
+            raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose of {', '.join(POSTURES)}")
+        if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
+            raise InputError(
+                "clouds need at least one point, a voxel of 0 or more, a touch above 0 and a seed of 0 or more"
+            )
+        self.pictures, self.points, self.frame, self.epoch = pictures, points, chosen, 0
+        self._noise, self._whole, self._voxel, self._seed = noise_of(noise), scene, voxel_m, seed
+        self._postures, self._surface, self._touch = tuple(postures), hand_surface, touch_m
+        self._fused = fuse
+        self._places = _by_scene(pictures.places) if fuse else [[place] for place in pictures.places]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        places = self._places[index]
+        first, scenes = places[0], self.pictures.scenes_of(places[0])
+        draw = np.random.default_rng([self._seed, self.epoch, *_words(first)])
+        views = [CloudView.of(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
+        object_pose = scenes.object_pose(first.scene)
+        into = self._into(views[0].extrinsics, object_pose)
+        sample = self._cloud(views, draw, into)
+        if self._surface is not None:
+            touched = self._graspness(views, sample["cloud/pixel"], scenes, first.scene)
+            sample["cloud/graspness"] = np.where(sample["cloud/object"] == 1, touched, 0.0).astype(np.float32)
+        for name in ("camera/intrinsics", "camera/extrinsics"):
+            stacked = np.stack([view.columns[name] for view in views])
+            sample[name] = stacked if self._fused else stacked[0]
+        normal = transforms.quat_rotate(into[3:], np.array([0.0, 0.0, 1.0]))
+        sample |= {"table/plane": np.append(normal, normal @ into[:3]), "table/height": 0.0}
+        sample["object/pose"] = transforms.compose(into, object_pose)
+        return sample | self._labels(scenes, first.scene, views[0].extrinsics, into) | first.names
+
+    def _cloud(self, views: Sequence[CloudView], draw: np.random.Generator, into: Floats) -> dict[str, Any]:
+        """P of the points that the views see, in the sample's frame."""
+        found = [view.pixels(whole=self._whole) for view in views]
+        pixel = np.concatenate([np.stack([np.full(len(row), v), row, col], 1) for v, (row, col) in enumerate(found)])
+        if self._voxel:
+            pixel = pixel[_voxels(_of(views, pixel, CloudView.points), self._voxel, draw)]
+        seen = len(pixel)
+        if seen >= self.points:
+            pixel = pixel[draw.choice(seen, self.points, replace=False)]
+        elif seen:  # each stands at least once
+            pixel = np.concatenate([pixel, pixel[draw.integers(seen, size=self.points - seen)]])
+        else:
+            empty = np.zeros((self.points, 3), np.float32)
+            none = np.zeros(self.points, np.uint8)
+            return {
+                "cloud/points": empty, "cloud/normals": empty.copy(), "cloud/object": none,
+                "cloud/pixel": np.zeros((self.points, 3), np.int32), "cloud/seen": 0,
+            }  # fmt: skip
+        normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
+        return {
+            "cloud/points": transforms.apply(into, _of(views, pixel, CloudView.points)).astype(np.float32),
+            "cloud/normals": normals.astype(np.float32),
+            "cloud/object": _of(views, pixel, CloudView.is_object).astype(np.uint8),
+            "cloud/pixel": pixel.astype(np.int32),
+            "cloud/seen": seen,
+        }
+
+    def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
+        """Of the true points of pixels: noise moves what is seen, not where hands touch."""
+        assert self._surface is not None
+        points = _of(views, pixel, CloudView.true_points)
+        on_object = transforms.apply(transforms.invert(scenes.object_pose(scene)), points)
+        rows = scenes.base_rows(scene)
+        hands = self._surface(scenes.base, rows) if len(rows) else np.zeros((0, 1, 3))
+        return graspness(on_object, hands, touch_m=self._touch)
+
+    def _labels(self, scenes: Scenes, scene: int, extrinsics: Floats, into: Floats) -> dict[str, Any]:
+        """The grasps in every frame."""
+        found = scenes.grasps(scene, extrinsics)
+        rows, pose = scenes.base_rows(scene), scenes.object_pose(scene)
+        labels = {name: value for name, value in found.items() if name not in ("grasp/hand_pose", "object/pose")}
+        for posture in self._postures:
+            own = np.asarray(scenes.base[f"{posture}/hand_pose"], float)[rows]
+            in_table = transforms.compose(pose, own)
+            labels[f"{posture}/hand_pose"] = transforms.compose(into, in_table)
+            if not self._fused:
+                camera = transforms.pose_from_matrix(extrinsics)
+                labels[f"{posture}/hand_pose_camera"] = transforms.compose(camera, in_table)
+            labels |= {f"{posture}/hand_pose_table": in_table, f"{posture}/hand_pose_object": own}
+            labels[f"{posture}/joint_positions"] = np.asarray(scenes.base[f"{posture}/joint_positions"])[rows]
+        return labels
+
+    def _into(self, extrinsics: Floats, object_pose: Floats) -> Floats:
+        """(7,) from the table's frame into that of the sample."""
+        if self.frame == "camera":
+            return transforms.pose_from_matrix(extrinsics)
+        if self.frame == "object":
+            return transforms.invert(object_pose)
+        return _NOWHERE
+
+
+def _by_scene(places: Sequence[Place]) -> list[list[Place]]:
+    found: dict[tuple[str, int], list[Place]] = {}
+    for place in places:
+        found.setdefault((place.file.id, place.scene), []).append(place)
+    return list(found.values())
+
+
+def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints, Ints], Array]) -> Array:
+    """What views tell of pixels (P, 3): view, row, column."""
+    parts = [what(view, *pixel[pixel[:, 0] == number, 1:].T) for number, view in enumerate(views)]
+    found = np.empty((len(pixel), *parts[0].shape[1:]), parts[0].dtype)
+    for number, part in enumerate(parts):
+        found[pixel[:, 0] == number] = part
+    return found
+
+
+def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
+    """One point of each cube, drawn evenly."""
+    order = draw.permutation(len(points))
+    cubes = np.floor(points[order] / edge).astype(np.int64)
+    return order[np.unique(cubes, axis=0, return_index=True)[1]]
+
+
+def _words(place: Place) -> tuple[int, int]:
+    """Numbers that follow from what a picture is of, whatever its file is called."""
+    name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row

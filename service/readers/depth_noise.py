@@ -1,0 +1,216 @@
+"""What a real depth camera makes of a perfect depth picture: noise, steps, bleeding edges, shadows and holes.
+
+| effect | how | of |
+| --- | --- | --- |
+| noise along the axis | s(z, t) = a + b (z - c)^2 + e t^2 / (sqrt(z) (pi/2 - t)^2), t the angle of incidence | Nguyen |
+| noise of the disparity | d = f B / z + N(0, p), so that the depth's grows as z^2 p / (f B) | Intel |
+| steps | the disparity, or the depth, is a multiple of its step | Intel, Khoshelham, Microsoft |
+| bleeding edges | depth comes from a pixel N(0, l + m t / (pi/2 - t)) beside | Handa, Nguyen |
+| flying points | a pixel on an edge mixes both depths | Toelgyessy |
+| shadows | what the second eye, or the projector, does not see | geometry; left-right check |
+| holes | angles past 80 degrees; nearer than the largest disparity searched; a share at random | Nguyen, Intel |
+
+Not modelled: materials (glass, mirrors, black), interference of several cameras, multiple paths of light, a warped
+calibration, and that errors of neighbouring pixels resemble each other.
+
+Sources: Nguyen, Izadi, Lovell 2012, Modeling Kinect Sensor Noise (3DIMPVT), eq. 1-4; Khoshelham, Elberink 2012,
+Accuracy and Resolution of Kinect Depth Data (Sensors 12); Handa et al. 2014, A Benchmark for RGB-D Visual Odometry
+(ICRA); Grunnet-Jepsen et al., Intel white papers on tuning and on subpixel linearity of the D400 series, and his
+answers in librealsense issues 999 and 3904; Microsoft, Azure Kinect DK depth camera; Toelgyessy et al. 2021,
+Evaluation of the Azure Kinect (Sensors 21), as BlenderProc reads its figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.errors import InputError
+from service.model.pinhole import EDGE, back_project, surface_normals
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """A depth camera. Lengths in pixels are those of its own sensor; they are carried over to the picture's."""
+
+    focal_px: float
+    """Focal length of its own picture [px]."""
+    baseline_m: float = 0.0
+    """From the eye to the second eye or the projector, along x; 0: it has none."""
+    axial_m: float = 0.0
+    """Noise along the axis at the distance `axial_from_m` and nearer [m]."""
+    axial_square: float = 0.0
+    """Its growth with the square of the distance beyond [1/m]."""
+    axial_slope: float = 0.0
+    """Its growth with the distance beyond."""
+    axial_from_m: float = 0.0
+    axial_angle: float = 0.0
+    """Its growth with the angle of incidence [m^1.5]."""
+    disparity_px: float = 0.0
+    disparity_step_px: float = 0.0
+    depth_step_m: float = 0.0
+    lateral_px: float = 0.0
+    lateral_angle_px: float = 0.0
+    """Growth of `lateral_px` with t / (pi/2 - t)."""
+    mixed: bool = False
+    """Pixels on an edge mix the depths on both of its sides."""
+    steepest_deg: float = 80.0
+    """Past this angle of incidence nothing comes back."""
+    most_disparity_px: float = np.inf
+    """Largest disparity it looks for."""
+    dropout: float = 0.0
+    """Share of the pixels that are holes for no other reason."""
+
+    def sigma(self, depth: Floats, angle: Floats) -> Floats:
+        """Standard deviation of the depth on a plane [m], steps included (as evenly spread: step^2 / 12).
+
+        Args:
+            depth: along the axis [m].
+            angle: of incidence [rad].
+        """
+        total = self.axial(depth, angle) ** 2 + self.depth_step_m**2 / 12
+        if self.baseline_m:
+            per_pixel = depth**2 / (self.focal_px * self.baseline_m)
+            total = total + per_pixel**2 * (self.disparity_px**2 + self.disparity_step_px**2 / 12)
+        return np.sqrt(total)
+
+    def axial(self, depth: Floats, angle: Floats) -> Floats:
+        """Noise along the axis without that of the disparity and without steps [m]."""
+        beyond = np.maximum(depth - self.axial_from_m, 0.0)
+        found = self.axial_m + self.axial_slope * beyond + self.axial_square * beyond**2
+        if self.axial_angle:
+            found = found + self.axial_angle / np.sqrt(depth) * _steepness(angle) ** 2
+        return np.asarray(found)
+
+    def apply(self, depth: NDArray[Any], k: Floats, draw: np.random.Generator) -> Floats:
+        """What the camera tells of a picture.
+
+        Args:
+            depth: (H, W) true depth along the axis [m]; not finite: nothing there.
+            k: (3, 3) intrinsics of the picture [px].
+            draw: of all that is random; the same generator gives the same picture.
+
+        Returns:
+            (H, W) depth [m]; nan: a hole.
+        """
+        true = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
+        angle = incidence(true, k)
+        scale = float(k[0, 0]) / self.focal_px
+        with np.errstate(invalid="ignore", divide="ignore"):
+            seen = _beside(true, scale * (self.lateral_px + self.lateral_angle_px * _steepness(angle)), draw)
+            if self.mixed:
+                seen = _mixed(seen, draw)
+            seen = seen + self.axial(seen, angle) * draw.standard_normal(true.shape)
+            if self.baseline_m:
+                seen = self._triangulated(seen, draw)
+            if self.depth_step_m:
+                seen = np.round(seen / self.depth_step_m) * self.depth_step_m
+            return np.where(self._holes(true, angle, k, draw), np.nan, seen)
+
+    def _triangulated(self, depth: Floats, draw: np.random.Generator) -> Floats:
+        product = self.focal_px * self.baseline_m
+        disparity = product / depth + self.disparity_px * draw.standard_normal(depth.shape)
+        if self.disparity_step_px:
+            disparity = np.round(disparity / self.disparity_step_px) * self.disparity_step_px
+        return np.where(disparity > 0, product / disparity, np.nan)
+
+    def _holes(self, true: Floats, angle: Floats, k: Floats, draw: np.random.Generator) -> Bools:
+        holes = np.degrees(angle) > self.steepest_deg
+        if self.baseline_m:
+            holes |= self.focal_px * self.baseline_m / true > self.most_disparity_px
+            holes |= shadows(true, float(k[0, 0]) * self.baseline_m)
+        return np.asarray(holes | (draw.random(true.shape) < self.dropout))
+
+
+def incidence(depth: Floats, k: Floats) -> Floats:
+    """(H, W) angle between the surface's normal and the ray to it [rad]; 0 where no normal can be told."""
+    points = back_project(k, depth)
+    with np.errstate(invalid="ignore"):
+        cosine = np.abs(np.einsum("hwc,hwc->hw", surface_normals(points), points)) / np.linalg.norm(points, axis=-1)
+    return np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), 0.0, 1.0))
+
+
+def shadows(depth: Floats, focal_baseline: float) -> Bools:
+    """(H, W) what an eye to the right, `focal_baseline` [px m] / depth [px] away in its picture, does not see.
+
+    Each pixel is carried into the other picture, where the nearest surface stays. What is farther there than the
+    surface by more than a pixel of disparity was hidden, as a left-right check finds; so is what falls off its side.
+    """
+    height, width = depth.shape
+    with np.errstate(divide="ignore"):
+        disparity = np.nan_to_num(focal_baseline / depth, nan=0.0)
+    at = np.arange(width) + 0.5 - disparity
+    left = np.floor(at - 0.5).astype(int)
+    rows = np.broadcast_to(np.arange(height)[:, None], left.shape)
+    other = np.zeros((height, width))
+    for column in (left, left + 1):  # a surface leaves no gap between pixels that lie next to each other
+        inside = (column >= 0) & (column < width)
+        np.maximum.at(other, (rows[inside], column[inside]), disparity[inside])
+    nearest = np.clip(np.floor(at).astype(int), 0, width - 1)
+    return (other[rows, nearest] > disparity + 1.0) | (at < 0)
+
+
+def _steepness(angle: Floats) -> Floats:
+    """t / (pi/2 - t), the form in which Nguyen et al. found angles to matter; as at 89 degrees beyond."""
+    bounded = np.minimum(angle, np.radians(89.0))
+    return np.asarray(bounded / (np.pi / 2 - bounded))
+
+
+def _beside(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Floats:
+    height, width = depth.shape
+    aside, down = (np.round(sigma_px * draw.standard_normal(depth.shape)).astype(int) for _ in range(2))
+    rows = np.clip(np.arange(height)[:, None] + down, 0, height - 1)
+    columns = np.clip(np.arange(width)[None, :] + aside, 0, width - 1)
+    return depth[rows, columns]
+
+
+def _mixed(depth: Floats, draw: np.random.Generator) -> Floats:
+    """Where the next pixel to the right or below lies past an edge, its light falls into this one, in any share."""
+    found = depth
+    for axis in (1, 0):
+        after = np.concatenate(
+            [np.take(depth, range(1, depth.shape[axis]), axis=axis), np.take(depth, [-1], axis=axis)], axis=axis
+        )
+        edge = np.abs(after - depth) > EDGE * depth
+        share = draw.random(depth.shape)
+        found = np.where(edge, (1 - share) * found + share * after, found)
+    return found
+
+
+NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
+    {
+        # Intel RealSense D435 at 848 x 480 and 90 degrees: f = 424 px; baseline 50 mm; subpixel 0.08 px (issue 3904),
+        # steps of 1/32 px (subpixel linearity), 126 px searched (its 17 cm: issue 999), 99 % filled (data sheet).
+        # Handa et al. shift by half a pixel.
+        "stereo": DepthNoise(
+            424.0, 0.05, disparity_px=0.08, disparity_step_px=1 / 32, lateral_px=0.5, most_disparity_px=126.0,
+            dropout=0.01,
+        ),
+        # Kinect v1: f = 585 px, 75 mm, steps of 1/8 px (Khoshelham); noise of Nguyen, eq. 2 and 4, lateral eq. 1.
+        "structured_light": DepthNoise(
+            585.0, 0.075, axial_m=0.0012, axial_square=0.0019, axial_from_m=0.4, axial_angle=0.0001,
+            disparity_step_px=1 / 8, lateral_px=0.8, lateral_angle_px=0.035,
+        ),
+        # Azure Kinect, narrow field: f = 504 px, millimetres (Microsoft); 0.5 mm to 0.5 m, 1 mm at 1 m (Toelgyessy).
+        "tof": DepthNoise(
+            504.0, axial_m=0.0005, axial_slope=0.001, axial_from_m=0.5, depth_step_m=0.001, mixed=True,
+        ),
+    }
+)  # fmt: skip
+
+
+def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
+    """The noise of that name; InputError if there is none."""
+    if given is None or isinstance(given, DepthNoise):
+        return given
+    if given not in NOISES:
+        raise InputError(f"there is no depth noise {given!r}; choose one of {', '.join(NOISES)}")
+    return NOISES[given]

@@ -1,0 +1,197 @@
+"""Clouds of closed-form pictures: points on the box, its face normals, frames that fit together, labels, graspness."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.model import transforms
+from service.model.errors import InputError
+from service.readers import Pictures, open_shards
+from service.readers.clouds import Clouds
+from service.readers.graspness import graspness
+from service.store.shards import read_shard
+from tests.service.readers import box_scenes
+from tests.service.readers.box_scenes import EYES, POSES, SCENE_OF_GRASP, SIZE, VALID
+
+#: Pictures keep depth in float32: half a unit in the last place of half a metre is 3e-8, of a point 6e-8 [m].
+DEPTH_M = 1e-7
+VIEWS = len(EYES)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return box_scenes.write(tmp_path_factory.mktemp("box"))
+
+
+@pytest.fixture(scope="module")
+def pictures(folder: Path) -> Pictures:
+    return Pictures(open_shards(folder))
+
+
+def on_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance from the box's surface [m] and the face's normal, of points in the object's frame."""
+    over = np.abs(points) - SIZE / 2
+    face = over.argmax(axis=1)
+    inward = np.take_along_axis(over, face[:, None], 1)[:, 0]
+    outward = np.linalg.norm(np.maximum(over, 0), axis=1)
+    normal = np.zeros_like(points)
+    normal[np.arange(len(points)), face] = np.sign(points[np.arange(len(points)), face])
+    return np.where(inward > 0, outward, -inward), normal
+
+
+def test_points_of_the_object_lie_on_it_and_their_normals_are_its_faces(pictures: Pictures) -> None:
+    for sample in pictures.clouds(500, frame="object"):
+        assert sample["cloud/points"].shape == sample["cloud/normals"].shape == (500, 3)
+        distance, normal = on_box(sample["cloud/points"].astype(float))
+        assert distance.max() < 4 * DEPTH_M
+        # Where a face is one or two pixels wide, its neighbour's bends as little: a twentieth of these pictures.
+        agree = np.einsum("pc,pc->p", normal, sample["cloud/normals"]) > 1 - 1e-4  # float32 over steps of 4 mm
+        assert agree.mean() > 0.9
+        assert sample["cloud/object"].all()
+
+
+def test_frames_are_those_of_the_cameras_and_of_the_object(pictures: Pictures) -> None:
+    per_frame = {frame: pictures.clouds(64, frame=frame, seed=3) for frame in ("camera", "table", "object")}
+    for index in (0, VIEWS):
+        camera, table, own = (per_frame[frame][index] for frame in ("camera", "table", "object"))
+        e = camera["camera/extrinsics"]
+        expected = table["cloud/points"] @ e[:3, :3].T + e[:3, 3]
+        np.testing.assert_allclose(camera["cloud/points"], expected, atol=4 * DEPTH_M)
+        rest = transforms.pose_to_matrix(POSES[camera["scene"]])
+        np.testing.assert_allclose(own["cloud/points"] @ rest[:3, :3].T + rest[:3, 3], table["cloud/points"], atol=4e-7)
+        np.testing.assert_allclose(camera["cloud/normals"], table["cloud/normals"] @ e[:3, :3].T, atol=1e-6)
+        np.testing.assert_allclose(transforms.pose_to_matrix(camera["object/pose"]), e @ rest, atol=1e-12)
+        np.testing.assert_allclose(table["object/pose"], POSES[camera["scene"]], atol=1e-12)
+        assert table["table/plane"].tolist() == [0, 0, 1, 0] and table["table/height"] == 0
+        # Rows and columns are those of the pixels.
+        image = camera["cloud/points"] @ camera["camera/intrinsics"].T
+        pixel = camera["cloud/pixel"][:, [2, 1]] + 0.5
+        np.testing.assert_allclose(image[:, :2] / image[:, 2:], pixel, atol=1e-4)  # float32 of 96 px
+
+
+def test_the_table_is_its_plane_in_every_frame(pictures: Pictures) -> None:
+    for frame in ("camera", "table", "object"):
+        sample = pictures.clouds(2000, frame=frame, scene=True)[4]
+        table = sample["cloud/object"] == 0
+        assert 0 < table.mean() < 1
+        plane = sample["table/plane"]
+        np.testing.assert_allclose(sample["cloud/points"][table] @ plane[:3], plane[3], atol=1e-6)  # seen to 2 m away
+
+
+def test_views_fused_agree_and_show_more_than_each(pictures: Pictures) -> None:
+    clouds = pictures.clouds(4000, fuse=True, frame="object")
+    assert len(clouds) == len(POSES)
+    for scene, sample in enumerate(clouds):
+        assert sample["scene"] == scene
+        assert sample["camera/extrinsics"].shape == (VIEWS, 4, 4)
+        assert set(np.unique(sample["cloud/pixel"][:, 0])) == set(range(VIEWS))
+        distance, normal = on_box(sample["cloud/points"].astype(float))
+        assert distance.max() < 4 * DEPTH_M
+        single = pictures.clouds(4000, frame="object")[scene * VIEWS]
+        faces = [len(np.unique(np.round(n), axis=0)) for n in (normal, on_box(single["cloud/points"].astype(float))[1])]
+        assert faces[0] > faces[1]
+
+
+def test_labels_stand_in_each_frame_and_are_the_valid_grasps_of_the_scene(pictures: Pictures, folder: Path) -> None:
+    base = read_shard(folder / "base.h5")
+    clouds = pictures.clouds(8, postures=("pregrasp", "grasp", "squeeze"))
+    for index in (1, VIEWS + 2):
+        sample = clouds[index]
+        rows = np.flatnonzero((sample["scene"] == SCENE_OF_GRASP) & (VALID == 1))
+        np.testing.assert_array_equal(sample["grasp/base_row"], rows)
+        for posture in ("pregrasp", "grasp", "squeeze"):
+            own = np.asarray(base[f"{posture}/hand_pose"], float)[rows]
+            in_table = transforms.pose_to_matrix(POSES[sample["scene"]]) @ transforms.pose_to_matrix(own)
+            np.testing.assert_array_equal(sample[f"{posture}/hand_pose_object"], own)
+            found = {frame: transforms.pose_to_matrix(sample[f"{posture}/hand_pose{frame}"])
+                     for frame in ("_table", "_camera", "")}  # fmt: skip
+            np.testing.assert_allclose(found["_table"], in_table, atol=1e-12)
+            np.testing.assert_allclose(found["_camera"], sample["camera/extrinsics"] @ in_table, atol=1e-12)
+            np.testing.assert_array_equal(found[""], found["_camera"])
+            joints = np.asarray(base[f"{posture}/joint_positions"])[rows]
+            np.testing.assert_array_equal(sample[f"{posture}/joint_positions"], joints)
+
+
+def test_the_same_seed_gives_the_same_clouds_and_another_epoch_others(pictures: Pictures) -> None:
+    def points(epoch: int, **options: Any) -> np.ndarray:
+        clouds = pictures.clouds(256, noise="stereo", **options)
+        clouds.epoch = epoch
+        return np.asarray(clouds[2]["cloud/points"])
+
+    np.testing.assert_array_equal(points(0), points(0))
+    assert (points(0) != points(1)).any() and (points(0) != points(0, seed=1)).any()
+
+
+@pytest.mark.parametrize("noise", ["stereo", "structured_light", "tof"])
+def test_noisy_points_stay_within_the_cameras_noise_of_the_box(pictures: Pictures, noise: str) -> None:
+    clean, noisy = pictures.clouds(600, frame="object"), pictures.clouds(600, frame="object", noise=noise)
+    for index in (0, 4):
+        sample = noisy[index]
+        assert 0.5 * clean[index]["cloud/seen"] < sample["cloud/seen"] < clean[index]["cloud/seen"] + 1
+        distance, normal = on_box(sample["cloud/points"].astype(float))
+        # At 0.4 m: 0.6 mm (stereo), 1.2 mm, 0.5 mm along the axis; those on edges bleed and fly.
+        assert 1e-5 < np.median(distance) < 1.2e-3
+        cosine = np.einsum("pc,pc->p", normal, sample["cloud/normals"])
+        assert np.median(cosine) > 0.95
+        eye = transforms.apply(transforms.invert(POSES[sample["scene"]]), np.array(EYES[index % VIEWS]))
+        assert (np.einsum("pc,pc->p", sample["cloud/normals"], eye - sample["cloud/points"]) > 0).all()
+
+
+def test_a_voxel_holds_one_point(pictures: Pictures) -> None:
+    edge = 0.011  # no face lies on the border between cubes, where float32 would put points on either side
+    sample = pictures.clouds(3000, fuse=True, voxel_m=edge)[0]
+    own = np.unique(sample["cloud/points"], axis=0)
+    assert (
+        len(own) == sample["cloud/seen"] < len(np.unique(pictures.clouds(3000, fuse=True)[0]["cloud/points"], axis=0))
+    )
+    assert len(np.unique(np.floor(own.astype(float) / edge), axis=0)) == len(own)
+
+
+def test_where_nothing_is_seen_the_cloud_is_zero_and_says_so(pictures: Pictures) -> None:
+    from service.readers.depth_noise import DepthNoise
+
+    blind = Clouds(pictures, 16, noise=DepthNoise(400.0, dropout=1.0), hand_surface=lambda *_: np.zeros((3, 1, 3)))
+    sample = blind[0]
+    assert sample["cloud/seen"] == 0
+    assert not sample["cloud/points"].any() and not sample["cloud/graspness"].any()
+
+
+def test_graspness_is_the_share_of_the_grasps_that_touch_the_point() -> None:
+    points = np.array([[0, 0, 0], [0.01, 0, 0], [0.5, 0, 0]])
+    hands = np.array([[[0, 0, 0.004], [0.011, 0, 0]], [[0.009, 0, 0], [0.2, 0, 0]], [[0, 0.0051, 0], [1, 1, 1]]])
+    assert graspness(points, hands, touch_m=0.005).tolist() == pytest.approx([1 / 3, 2 / 3, 0])
+    assert graspness(points, hands[:0]).tolist() == [0, 0, 0]
+    assert graspness(points[:0], hands).shape == (0,)
+
+
+def test_graspness_of_a_cloud_is_that_of_its_true_points(pictures: Pictures) -> None:
+    """Hands that are the +x half of the box, grown by 4 mm, touch that half and nothing else."""
+    grid = np.stack(np.meshgrid(*[np.linspace(-s / 2, s / 2, 15) for s in SIZE]), -1).reshape(-1, 3)
+    half = grid[grid[:, 0] > 0]
+
+    def surface(_: Any, rows: np.ndarray) -> np.ndarray:
+        return np.stack([np.resize(half if row % 2 else grid, grid.shape) for row in rows])
+
+    sample = pictures.clouds(500, noise="tof", frame="object", hand_surface=surface)[0]
+    odd = (sample["grasp/base_row"] % 2).mean()
+    true = pictures.clouds(500, frame="object")
+    assert 0 < odd < 1 and len(true) == 6
+    values = sample["cloud/graspness"]
+    assert set(np.round(np.unique(values), 6)) == {np.float32(round(1 - odd, 6)), np.float32(1)}
+    far = np.abs(sample["cloud/points"]).max(axis=1) < 0.06  # not those that fly
+    right, left = sample["cloud/points"][:, 0] > 0.01, sample["cloud/points"][:, 0] < -0.01
+    assert (values[right & far] == 1).mean() > 0.95
+    assert (values[left & far] < 1).mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    "options", [{"noise": "lidar"}, {"frame": "moon"}, {"fuse": True, "frame": "camera"}, {"postures": ["rest"]},
+                {"points": 0}, {"voxel_m": -1.0}, {"seed": -1}]
+)  # fmt: skip
+def test_what_no_cloud_can_be_is_refused(pictures: Pictures, options: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        pictures.clouds(**options)
