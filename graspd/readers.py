@@ -2,10 +2,11 @@
 
 from typing import Any
 
-from service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards
+from service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched
 
 __all__ = [
     "Clouds", "DepthNoise", "Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "hand_surface", "open_shards",
+    "prefetched",
 ]  # fmt: skip
 
 

@@ -18,5 +18,16 @@ from service.readers.depth_noise import DepthNoise
 from service.readers.files import ShardFile, Shards, open_shards
 from service.readers.grasps import Grasps
 from service.readers.pictures import Pictures
+from service.readers.prefetch import prefetched
 
-__all__ = ["Clouds", "DepthNoise", "Grasps", "Pictures", "ShardCache", "ShardFile", "Shards", "open_shards"]
+__all__ = [
+    "Clouds",
+    "DepthNoise",
+    "Grasps",
+    "Pictures",
+    "ShardCache",
+    "ShardFile",
+    "Shards",
+    "open_shards",
+    "prefetched",
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from service.model import transforms
 from service.model.errors import InputError
+from service.readers.chunks import RowTable, read_file
 from service.readers.files import ShardFile, Shards
 from service.store import standing
 from service.store.shards import SCHEMAS, open_shard, read_shard
@@ -31,6 +33,8 @@ DEFAULT_COLUMNS: Final = (
     "box/bounding_box_2d_tight",
 )
 _KEPT: Final = 64
+#: Shards of which it is remembered where their pictures lie: about 1 kB each.
+_TABLES: Final = 4096
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,7 @@ class Pictures(Sequence[dict[str, Any]]):
         self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
         self._which = {"clear": clear, "valid": valid, "unjudged": unjudged}
         self._scenes: OrderedDict[str, Scenes] = OrderedDict()
+        self._tables: OrderedDict[str, RowTable] = OrderedDict()
         self._places: list[Place] = []
         for file in shards.of("views"):
             self._add(file, with_grasps_only=with_grasps_only)
@@ -121,9 +126,15 @@ class Pictures(Sequence[dict[str, Any]]):
         return self._places
 
     def columns_of(self, place: Place, columns: Iterable[str]) -> dict[str, Array]:
-        """Some columns of one picture."""
-        with open_shard(self.shards.path(place.file)) as opened:
-            return {name: opened[name][place.row] for name in columns}
+        """Some columns of one picture.
+
+        Raises:
+            DamagedShard: they are not what was written.
+        """
+        path = self.shards.path(place.file)
+        wanted = list(columns)
+        table = self._table(place.file, path, wanted)
+        return table.row(place.row, wanted, lambda ranges: read_file(path, ranges))
 
     def scenes_of(self, place: Place) -> Scenes:
         """The scenes of the picture's shard with the grasps that this reader keeps."""
@@ -151,12 +162,24 @@ class Pictures(Sequence[dict[str, Any]]):
             if not with_grasps_only or held.count(int(scene)):
                 self._places.append(Place(file, scene_shard, int(scene), row))
 
+    def _table(self, file: ShardFile, path: Path, columns: Sequence[str]) -> RowTable:
+        table = self._tables.get(file.id)
+        if table is None or not table.has(columns):
+            known = table.columns if table else ()
+            with open_shard(path) as opened:
+                table = RowTable.of(opened, {*columns, *known}, str(path))
+            self._tables[file.id] = table
+            if len(self._tables) > _TABLES:
+                self._tables.popitem(last=False)
+        return table
+
     def _scenes_of(self, shard: str) -> Scenes:
-        if shard not in self._scenes:
-            self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
+        found = self._scenes.get(shard)
+        if found is None:  # threads that meet here make it twice, and both have it
+            found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)
-        return self._scenes[shard]
+        return found
 
 
 class Scenes:
@@ -207,8 +230,8 @@ class Scenes:
 
     def grasps(self, scene: int, extrinsics: NDArray[np.float64]) -> dict[str, Any]:
         """Of one scene, in the frame of the camera with these extrinsics (4, 4)."""
-        rows = self._of(scene)
-        pose = transforms.compose(transforms.pose_from_matrix(extrinsics), self._pose[rows])
+        rows, camera = self._of(scene), transforms.pose_from_matrix(extrinsics)
+        pose = transforms.compose(camera, self._pose[rows])
         found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self.base_id}
-        found["object/pose"] = transforms.compose(transforms.pose_from_matrix(extrinsics), self._object[scene])
+        found["object/pose"] = transforms.compose(camera, self._object[scene])
         return found | {name: column[rows] for name, column in self._columns.items()}
