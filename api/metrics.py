@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
@@ -13,6 +13,7 @@ from service.index.at_scrape import IndexNow
 from service.pipeline.series import HTTP_BUCKETS_S, SERIES, STAGE_BUCKETS_S
 from service.pipeline.tally import parse_field
 from service.queue.at_scrape import QueueNow
+from service.queue.port import Keeping
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -58,7 +59,7 @@ class Snapshot:
             if seconds is not None:
                 self._set("graspd_part_latency_seconds", part, value=seconds)
 
-    def add_queue(self, queue: QueueNow, *, keeper_is_up: bool) -> None:
+    def add_queue(self, queue: QueueNow, keepers: Sequence[Keeping]) -> None:
         for (lane, stage), depth in queue.depth.items():
             self._set("graspd_queue_depth", lane, stage, value=depth)
             oldest = queue.oldest_s.get((lane, stage), 0.0)
@@ -69,7 +70,9 @@ class Snapshot:
             self._set("graspd_workers", state, value=states.count(state))
         for name, pulse in queue.workers.items():
             self._set("graspd_worker_lease_age_seconds", name, pulse.device, value=pulse.lease_age_s)
-        self._set("graspd_keeper_up", value=float(keeper_is_up))
+        self._set("graspd_keeper_up", value=float(all(one.works for one in keepers)))
+        for one in keepers:
+            self._set("graspd_keeper_shard_up", one.shard, one.holder, value=float(one.works))
 
     def add_index(self, index: IndexNow) -> None:
         for state, count in index.jobs.items():
@@ -92,7 +95,7 @@ class Snapshot:
             yield family
         yield from _families(self._sums)
 
-    def _set(self, name: str, *labels: str, value: float) -> None:
+    def _set(self, name: str, *labels: object, value: float) -> None:
         self._values[name][tuple(map(str, labels))] = value
 
 

@@ -1,11 +1,13 @@
-"""How many workers one keeper serves: real Redis, PostgreSQL, store and keeper, and workers that do no work.
+"""How many workers keepers serve: real Redis, PostgreSQL, store and keepers, and workers that do no work.
 
-usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000] [--sqlite] [--json FILE]
+usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000] [--sqlite]
+                                  [--json FILE]
 
-For each number of workers, two runs. First all of them hold tasks that end at --rate a second in all, beat and tell
-their progress: how old is the oldest event that is not in the index, and how long does it take to read all leases? Then
-their tasks take no time: how many a second come through keeper and index? Everything shares this machine, the workers
-too; the processor time of each part is counted beside its clock. What the workers do is in `benchmarks.fleet_workers`.
+For each number of workers and of keepers, two runs. First all workers hold tasks that end at --rate a second in all,
+beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
+all leases? Then their tasks take no time: how many a second come through keepers and index? Everything shares this
+machine, the workers too; the processor time of each part is counted beside its clock, and that of the busiest keeper.
+What the workers do is in `benchmarks.fleet_workers`.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +34,10 @@ from service.index.tables import tasks
 from service.model.domain import Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
-from service.queue.rq_queue import EVENTS, RqQueue
+from service.pipeline.sharing import PART
+from service.queue.port import Keeping
+from service.queue.rq_queue import RqQueue
+from service.queue.streams import streams_kept
 from service.run.embedded import server_command
 from service.settings import Settings
 from tests.fakes import add_assets, request
@@ -49,6 +55,7 @@ class Result:
     """What one number of workers came to."""
 
     workers: int
+    keepers: int
     lag_s: float
     """Age of the oldest event that was not in the index: 95th of 100 looks."""
     worst_lag_s: float
@@ -56,7 +63,9 @@ class Result:
     """Median time in which all leases are read."""
     tasks_per_s: float
     keeper_ms: float
-    """Processor time of the keeper for a task."""
+    """Processor time of all keepers for a task."""
+    busiest_ms: float
+    """That of the keeper with most of it: so many tasks a second are a core of it."""
     database_ms: float
     redis_ms: float
 
@@ -86,15 +95,18 @@ class Machine:
         return {name: _tree_cpu(pid) for name, pid in self._pids.items()}
 
     def lag_s(self) -> float:
-        """Age of the oldest event that the keeper has not acknowledged."""
+        """Age of the oldest event that its keeper has not acknowledged."""
+        return max(map(self._lag_of, streams_kept(self.queue.connection)))
+
+    def _lag_of(self, stream: str) -> float:
         connection = self.queue.connection
-        groups = connection.xinfo_groups(EVENTS)
+        groups = connection.xinfo_groups(stream)
         if not groups:
             return 0.0
-        pending = connection.xpending(EVENTS, groups[0]["name"])
+        pending = connection.xpending(stream, groups[0]["name"])
         oldest = pending["min"]
         if oldest is None:
-            after = connection.xrange(EVENTS, b"(" + groups[0]["last-delivered-id"], count=1)
+            after = connection.xrange(stream, b"(" + groups[0]["last-delivered-id"], count=1)
             oldest = after[0][0] if after else None
         seconds, micros = connection.time()
         return 0.0 if oldest is None else max(0.0, seconds + micros / 1e6 - int(oldest.split(b"-")[0]) / 1000)
@@ -107,11 +119,12 @@ class Machine:
 
 
 @contextmanager
-def machine(*, sqlite: bool) -> Iterator[Machine]:
-    """A service of real processes that ends with the block."""
+def machine(*, sqlite: bool, keepers: int = 1) -> Iterator[Machine]:
+    """A service of real processes that ends with the block; each keeper has one shard of the work."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspd-fleet-")))
         options: dict[str, Any] = {"data_dir": folder, "log_level": "WARNING", "scrub_mb_per_s": 0.0, "lease_s": 20.0}
+        options["keeper_shards"] = keepers
         pids = {}
         if not sqlite:
             server = stack.enter_context(PostgresServer())
@@ -123,9 +136,17 @@ def machine(*, sqlite: bool) -> Iterator[Machine]:
         stack.callback(parts.close)
         _wait(lambda: _answers(parts), "Redis answers")
         add_assets(parts)
-        keeper = _started(stack, [sys.executable, "-m", "graspd", "keeper"], environment(settings))
-        _wait(lambda: parts.queue.announced("keeper"), "the keeper lives")
-        yield Machine(settings, parts, pids | {"redis": redis, "keeper": keeper})
+        for number in range(keepers):
+            command = [sys.executable, "-m", "graspd", "keeper"]
+            pids[f"keeper-{number}"] = _started(stack, command, environment(settings))
+        _wait(lambda: len({one.holder for one in _kept(parts)}) == keepers, "every shard has a keeper of its own")
+        yield Machine(settings, parts, pids | {"redis": redis})
+
+
+def _kept(parts: Parts) -> list[Keeping]:
+    """Shards that are kept; none as long as one of them is not."""
+    shards = parts.queue.keepers(PART)
+    return shards if all(one.works and one.holder for one in shards) else []
 
 
 @contextmanager
@@ -145,9 +166,9 @@ def environment(settings: Settings) -> dict[str, str]:
     return {f"GRASPD_{name.upper()}": value for name, value in plain.items()}
 
 
-def measure(workers: int, given: argparse.Namespace) -> Result:
-    """Both runs with one number of workers."""
-    with machine(sqlite=given.sqlite) as at:
+def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
+    """Both runs with one number of workers and of keepers."""
+    with machine(sqlite=given.sqlite, keepers=keepers) as at:
         task_s = workers / given.rate
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
         with fleet(at.settings, workers, task_s):
@@ -156,7 +177,7 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
             time.sleep(given.seconds / 2)
             lags, sweeps = _looks(at, given.seconds)
-    with machine(sqlite=given.sqlite) as at:
+    with machine(sqlite=given.sqlite, keepers=keepers) as at:
         at.submit(given.tasks)
         before = at.cpu()
         begun = time.perf_counter()
@@ -164,13 +185,16 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
             _wait(lambda: _finished(at.parts) >= given.tasks, "all tasks are in the index")
             seconds = time.perf_counter() - begun
             spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
+    of_keepers = [used for name, used in spent.items() if name.startswith("keeper")]
     return Result(
         workers=workers,
+        keepers=keepers,
         lag_s=statistics.quantiles(lags, n=20)[-1],
         worst_lag_s=max(lags),
         sweep_ms=1000 * statistics.median(sweeps),
         tasks_per_s=given.tasks / seconds,
-        keeper_ms=spent["keeper"],
+        keeper_ms=sum(of_keepers),
+        busiest_ms=max(of_keepers),
         database_ms=spent.get("database", 0.0),
         redis_ms=spent["redis"],
     )
@@ -225,21 +249,24 @@ def _tree_cpu(pid: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, nargs="+", default=[64, 512, 4096])
+    parser.add_argument("--keepers", type=int, nargs="+", default=[1])
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the lag is watched")
     parser.add_argument("--rate", type=float, default=100.0, help="tasks that end a second while it is watched")
     parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
     parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
     parser.add_argument("--json", type=Path, help="keep the figures there")
     given = parser.parse_args()
-    say("| workers | lag of events, p95 | worst | lease sweep | tasks/s | keeper, of a task | database | Redis |")
-    say("| --: | --: | --: | --: | --: | --: | --: | --: |")
+    say("| workers | keepers | lag of events, p95 | worst | lease sweep | tasks/s "
+        "| keepers, of a task | the busiest | database | Redis |")  # fmt: skip
+    say("| --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |")
     results = []
-    for workers in given.workers:
-        one = measure(workers, given)
+    for workers, keepers in product(given.workers, given.keepers):
+        one = measure(workers, keepers, given)
         results.append(one)
         say(
-            f"| {workers:,} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
-            f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.database_ms:.1f} ms | {one.redis_ms:.1f} ms |"
+            f"| {workers:,} | {keepers} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
+            f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.busiest_ms:.1f} ms | {one.database_ms:.1f} ms "
+            f"| {one.redis_ms:.1f} ms |"
         )
     if given.json:
         given.json.write_text(json.dumps([asdict(one) for one in results], indent=2) + "\n")

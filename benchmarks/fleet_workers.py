@@ -32,16 +32,8 @@ from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s
 from service.queue.reports import REPORTS
-from service.queue.rq_queue import (
-    EVENTS,
-    EVENTS_KEPT,
-    WORKERS,
-    RqQueue,
-    cancel_key,
-    encoded,
-    open_queue,
-    worker_key,
-)
+from service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, worker_key
+from service.queue.streams import put_event
 from service.settings import Settings
 from service.store.store import Store, open_store
 from tests.fakes import make_shard
@@ -173,7 +165,7 @@ class Fleet:
             worker=held.worker,
             **facts,
         )
-        pipe.xadd(EVENTS, encoded(event), maxlen=EVENTS_KEPT, approximate=True)
+        put_event(pipe, event)
         if kind.ends_attempt:
             pipe.hdel(REPORTS, held.message["task_id"])
 

@@ -9,6 +9,8 @@ from typing import Literal
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from service.model.keeper_shards import MOST_SHARDS
+
 
 class Settings(BaseSettings):
     """Settings of all processes of one graspd. Defaults run everything on one machine inside `data_dir`."""
@@ -81,6 +83,10 @@ class Settings(BaseSettings):
         max_length=200,
         description="of a keeper: started again under the same name, it leads without a wait; unset: a fresh one",
     )
+    keeper_shards: int = Field(
+        1, ge=1, le=MOST_SHARDS,
+        description="of all keepers: shards that they share their work in, so that as many can work at once",
+    )  # fmt: skip
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_tasks: int = Field(

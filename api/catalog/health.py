@@ -10,7 +10,7 @@ from typing import Final
 from api.models import Health, Part
 from service.model.errors import GraspdError, UnavailableError
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import PART as KEEPER
+from service.pipeline.sharing import is_kept
 
 #: The parts are asked anew at most this often [s].
 KEPT_S: Final = 2.0
@@ -64,7 +64,7 @@ class Probes:
     def _others(self) -> tuple[bool, int]:
         try:
             fit = [beat for beat in self._parts.queue.workers() if beat.state != "quarantined"]
-            return self._parts.queue.announced(KEEPER), len(fit)
+            return is_kept(self._parts.queue), len(fit)
         except UnavailableError:
             return False, 0
 

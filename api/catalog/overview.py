@@ -22,8 +22,9 @@ from service.model.domain import Lane, Stage
 from service.model.errors import NotFoundError, UnavailableError
 from service.model.projects import Reach
 from service.pipeline.backends import Parts
-from service.pipeline.keeper import PART as KEEPER
+from service.pipeline.sharing import PART
 from service.queue.at_scrape import QueueNow
+from service.queue.port import Keeping
 
 _DAMAGE_SHOWN: Final = 5
 _JOBS_WATCHED: Final = 20
@@ -61,6 +62,13 @@ class Overview:
             )
             for worker in known
         ]
+
+    def keepers(self) -> list[Keeping]:
+        """Who holds each shard of the keepers' work; none while Redis is away."""
+        try:
+            return self._parts.queue.keepers(PART)
+        except UnavailableError:
+            return []
 
     def task_of(self, worker: Worker) -> TaskView | None:
         """What a worker does; a check of an upload is no task of the index."""
@@ -110,7 +118,7 @@ class Overview:
         found.add_parts({name: _seconds(part) for name, part in parts.items()})
         with contextlib.suppress(UnavailableError):
             queue = self._parts.queue
-            found.add_queue(self._queue_now(), keeper_is_up=queue.announced(KEEPER))
+            found.add_queue(self._queue_now(), queue.keepers(PART))
             found.add_sums(queue.counted())
         with contextlib.suppress(UnavailableError):
             found.add_index(read_index(self._parts.index.database))

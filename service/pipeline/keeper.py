@@ -1,4 +1,9 @@
-"""The keeper: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on."""
+"""The keeper: one loop that runs what must not run in a worker. Killed at any moment, its successor goes on.
+
+Several share the work (`service.pipeline.sharing`): each takes up the events of its jobs, queues their tasks, and finds
+those that were lost. What is of no job, or of all of them, is done by who holds the first shard: workers, checks of
+uploads, datasets, deletions, webhooks, the scrub of the store, and an index that must be made anew.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +16,14 @@ from contextlib import contextmanager
 from typing import Final
 
 from service.heartbeat_file import HeartbeatFile
+from service.index.queries.feed import ReadyTask
 from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.domain import Lane
-from service.model.errors import DamagedError, StoreUnavailable, UnavailableError
+from service.model.errors import DamagedError, IndexUnavailable, StoreUnavailable, UnavailableError
+from service.model.keeper_shards import ALL_SHARDS, KeeperShards, shard_of
 from service.model.planning import ingest_id, ingest_message
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
@@ -30,12 +37,12 @@ from service.pipeline.reaper import Reaper
 from service.pipeline.reports import Reports
 from service.pipeline.routes import Routes
 from service.pipeline.scrubber import Scrubber
+from service.pipeline.sharing import PART
 from service.pipeline.sweeper import Sweeper
-from service.queue.port import Event, EventKind
+from service.queue.port import Event, EventKind, part_of
 from service.store.library import publish_builtins, stored_assets
 
 log = logging.getLogger(__name__)
-PART: Final = "keeper"
 #: Events of one round: a second's work. Those behind them wait for the next round, which follows at once.
 _EVENTS_A_ROUND: Final = 2000
 #: Events that wait for the store; while there are more, no further ones are taken from the stream.
@@ -55,10 +62,15 @@ _LAST_READ_S: Final = 3.0
 class Keeper:
     """Indexes events, queues what is ready, takes tasks from lost workers, keeps the list of workers."""
 
-    def __init__(self, parts: Parts, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, parts: Parts, shards: KeeperShards = ALL_SHARDS, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`shards` are those that it holds; with others it is another keeper."""
         self._parts = parts
+        self._shards = shards
+        self._streams = sorted(shards.held)
         self._indexer = Indexer(parts)
-        self._reaper = Reaper(parts, self._indexer, clock=clock)
+        self._reaper = Reaper(parts, self._indexer, shards, clock=clock)
         self._planner = DatasetRounds(parts, clock=clock)
         self._sweeper = Sweeper(parts, clock=clock)
         self._has_plans = False
@@ -75,7 +87,7 @@ class Keeper:
         self._workers = 0
         """Workers that were there when they were last counted."""
         self._clock = clock
-        self._reports = Reports(parts)
+        self._reports = Reports(parts, shards)
         interval_s = parts.settings.keeper_interval_s
         # Each lease is seen three times before it can be called lost.
         self._looking = Pace(clock, interval_s, longest_s=parts.settings.lease_s / 3)
@@ -86,33 +98,27 @@ class Keeper:
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until told to stop. Where a part is away, waits longer and longer, and loses nothing."""
-        with self._scrubbing(stop), self._telling(stop):
+        with self._beside(stop):
             self._run(stop)
 
     @contextmanager
-    def _scrubbing(self, stop: threading.Event) -> Iterator[None]:
-        """Reads through the store beside the rounds, where the settings want it."""
-        if not self._parts.settings.scrub_mb_per_s:
-            yield
-            return
-        thread = threading.Thread(target=Scrubber(self._parts, stop).run, name="scrub", daemon=True)
-        thread.start()
+    def _beside(self, stop: threading.Event) -> Iterator[None]:
+        """What goes on beside the rounds: webhooks are told what ended, and the store is read through, where the
+        settings want it."""
+        duties: dict[str, Callable[[], None]] = {}
+        if self._shards.leads:
+            duties["webhooks"] = Courier(self._parts, stop).run
+            if self._parts.settings.scrub_mb_per_s:
+                duties["scrub"] = Scrubber(self._parts, stop).run
+        threads = [threading.Thread(target=duty, name=name, daemon=True) for name, duty in duties.items()]
+        for thread in threads:
+            thread.start()
         try:
             yield
         finally:
             stop.set()
-            thread.join(_LAST_READ_S)
-
-    @contextmanager
-    def _telling(self, stop: threading.Event) -> Iterator[None]:
-        """Tells webhooks what ended, beside the rounds."""
-        thread = threading.Thread(target=Courier(self._parts, stop).run, name="webhooks", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join(_LAST_READ_S)
+            for thread in threads:
+                thread.join(_LAST_READ_S)
 
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
@@ -137,17 +143,15 @@ class Keeper:
         Raises:
             UnavailableError: a part is away; the round can be run again.
         """
-        if not self._started:
-            self._start()
-        elif self._parts.index.notes.completeness() is None:
-            self._make_whole()
+        self._see_to_the_index()
         away: list[UnavailableError] = []
         with _noted(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _REPORTS_EVERY_S))
         now = self._clock()
         if self._counting.is_due:
-            with _noted(away):
-                self._parts.queue.tidy()
+            if self._shards.leads:
+                with _noted(away):
+                    self._parts.queue.tidy()
             with _noted(away):
                 self._indexer.flush()
                 self._counting.run(self._look_after_workers)
@@ -162,6 +166,13 @@ class Keeper:
         if self._reporting.is_due:
             with _noted(away):
                 self._reporting.run(self._reports.take_up)
+        if self._shards.leads:
+            self._do_what_users_want(now, away)
+        if away:
+            raise away[0]
+
+    def _do_what_users_want(self, now: float, away: list[UnavailableError]) -> None:
+        """Datasets and deletions, a little of each."""
         if self._has_plans or now >= self._plan_again:
             with _noted(away):
                 self._has_plans = self._planner.advance()
@@ -170,11 +181,9 @@ class Keeper:
             with _noted(away):
                 is_left = self._sweeper.advance() or self._sweeper.collect()
                 self._sweep_again = now if is_left else now + _SWEEP_EVERY_S
-        if away:
-            raise away[0]
 
     def _look_after_workers(self) -> None:
-        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+        self._announce()
         # One that ended as it should says so, but its registration is gone a moment before that is read.
         present = self._parts.queue.workers()
         self._workers = len(present)
@@ -184,12 +193,25 @@ class Keeper:
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
         known = [beat for _, beat in self._seen.values()]
         self._routes = Routes(known)
+        if not self._shards.leads:
+            return
+        self._streams = [*sorted(self._shards.held), *self._parts.queue.left_over(self._shards.number)]
         self._parts.queue.clear_untaken(known)
         self._parts.index.live.set_workers(
             present,
             lost_before=timestamp(self._parts.settings.lease_s),
             forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
         )
+
+    def _see_to_the_index(self) -> None:
+        """It must be whole before events are taken up, and may be lost at any time."""
+        if not self._shards.leads:
+            if self._parts.index.notes.completeness() is None:
+                raise IndexUnavailable("the keeper of the first shard makes the index from the store")
+        elif not self._started:
+            self._start()
+        elif self._parts.index.notes.completeness() is None:
+            self._make_whole()
 
     def _start(self) -> None:
         publish_builtins(self._parts.store)
@@ -217,7 +239,7 @@ class Keeper:
         """Take up what came in; what the store is needed for waits while that is away."""
         if len(self._backlog) < _LONGEST_BACKLOG:
             wait_s = wait_s if not self._backlog else 0.0
-            self._backlog += self._parts.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
+            self._backlog += self._take_in(wait_s)
         if not self._backlog:
             return
         waiting = set(self._indexer.apply([event for _, event in self._backlog]))
@@ -228,8 +250,19 @@ class Keeper:
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
+    def _take_in(self, wait_s: float) -> list[tuple[str, Event]]:
+        """Events of this keeper's shards. Those of others are handed on: a worker of an earlier version puts all of its
+        events into the first stream, and others lie where they belonged when there were more or fewer shards."""
+        queue, shards = self._parts.queue, self._shards
+        found = queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s, shards=self._streams)
+        if foreign := [(event_id, event) for event_id, event in found if not shards.has(event.job_id)]:
+            queue.hand_on([(shard_of(event.job_id, shards.number), event) for _, event in foreign])
+            queue.acknowledge([event_id for event_id, _ in foreign])
+        return [(event_id, event) for event_id, event in found if shards.has(event.job_id)]
+
     def _announce(self) -> None:
-        self._parts.queue.announce(PART, 5 * self._parts.settings.keeper_interval_s + 5)
+        for shard in self._shards.held:
+            self._parts.queue.announce(part_of(PART, shard), 5 * self._parts.settings.keeper_interval_s + 5)
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails
@@ -241,7 +274,7 @@ class Keeper:
         self._reports.sweep({lease.task_id for lease in leases})
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
-        if stray := self._parts.index.feed.cancelled(present):
+        if self._shards.leads and (stray := self._parts.index.feed.cancelled(present)):
             self._parts.queue.discard(stray)
         self._reaper.find_missing(present)
         self._feed(present)
@@ -256,7 +289,7 @@ class Keeper:
         held: set[str] = set()
         for lane in Lane:
             room = window - sum(n for (of, _), n in depths.items() if of is lane)
-            ready = self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room) if room > 0 else []
+            ready = self._ready(lane, now, room) if room > 0 else []
             if present is None:
                 held |= queue_tasks(self._parts, ready, routes=self._routes)
                 continue
@@ -267,7 +300,11 @@ class Keeper:
         for why in sorted(held - self._held):
             log.warning("tasks are %s", why)
         self._held = held
-        self._feed_checks(present, now)
+        if self._shards.leads:
+            self._feed_checks(present, now)
+
+    def _ready(self, lane: Lane, now: float, room: int) -> list[ReadyTask]:
+        return self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room, shards=self._shards)
 
     def _feed_checks(self, present: set[str] | None, now: float) -> None:
         for check in self._parts.index.feed.ready_checks(now=now, limit=self._parts.settings.queue_window):

@@ -80,12 +80,12 @@ def event(data: bytes | None) -> Event | None:
         return None
 
 
-def sweep(connection: Any, kinds: Iterable[tuple[str, str]], stream: str) -> None:
-    """Remove what is not of the kind that its name says, and a stream that takes no more entries.
+def sweep(connection: Any, kinds: Iterable[tuple[str, str]], streams: Iterable[str] = ()) -> None:
+    """Remove what is not of the kind that its name says, and streams that take no more entries.
 
     Args:
         kinds: names with the type that Redis should tell of each.
-        stream: name of the stream of events.
+        streams: those of them that are streams of events.
     """
     expected = dict(kinds)
     with connection.pipeline(transaction=False) as pipe:
@@ -93,7 +93,7 @@ def sweep(connection: Any, kinds: Iterable[tuple[str, str]], stream: str) -> Non
             pipe.type(name)
         found = dict(zip(expected, map(text, pipe.execute()), strict=True))
     wrong = [name for name, kind in found.items() if kind not in ("none", expected[name])]
-    if found.get(stream) == "stream":
+    for stream in (name for name in streams if found.get(name) == "stream"):
         newest = int(text(connection.xinfo_stream(stream)["last-generated-id"]).partition("-")[0])
         if newest > connection.time()[0] * 1000 + _FUTURE_MS:
             wrong.append(stream)

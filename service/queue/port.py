@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final, Protocol
@@ -10,6 +10,7 @@ from typing import Annotated, Final, Protocol
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from service.model.domain import IngestMessage, Lane, Model, Stage, TaskMessage, Word
+from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.worker_beat import Count, HostWord, WorkerBeat
 from service.queue.at_scrape import QueueNow
 
@@ -18,6 +19,11 @@ Message = TaskMessage | IngestMessage
 
 #: Of so many tasks a worker looks for one in bulk first: a steady flow of interactive work must not end all other.
 BULK_EVERY: Final = 4
+
+
+def part_of(part: str, shard: int) -> str:
+    """Name under which the keeper of a shard announces itself."""
+    return part if shard == 0 else f"{part}:{shard}"
 
 
 def lane_order(taken: int) -> tuple[Lane, ...]:
@@ -108,6 +114,28 @@ class Holder:
     """None if Redis no longer knows."""
 
 
+@dataclass(frozen=True)
+class Share:
+    """What one of several keepers has of the work."""
+
+    number: int
+    """Shards that the work is cut into: where that is not what the keeper was told, it waits."""
+    fair: int = 0
+    """How many of them it should hold, given who else is there."""
+    held: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """A shard of the keepers' work."""
+
+    shard: int
+    holder: str
+    """Empty while nobody holds it."""
+    works: bool
+    """Whether its keeper gave a sign of life lately."""
+
+
 class Tasks(Protocol):
     """Tasks to workers, and who holds which."""
 
@@ -145,10 +173,13 @@ class Tasks(Protocol):
 
 
 class Events(Protocol):
-    """A bounded stream of what happened: one keeper consumes it, any number of readers follow it."""
+    """Bounded streams of what happened, one for each shard of the keepers' work."""
 
     def publish(self, *events: Event) -> None:
-        """Append to the bounded stream of events."""
+        """Append each to the stream of its job's shard."""
+
+    def hand_on(self, events: Iterable[tuple[int, Event]]) -> None:
+        """Append events to the streams of the shards given: whoever published them knew of fewer shards."""
 
     def report(self, task_id: str, report: Report) -> float:
         """Say how far a task is, in place of what was said before; gone with the event that ends the attempt.
@@ -157,20 +188,25 @@ class Events(Protocol):
             time after which more is welcome [s].
         """
 
-    def reports(self) -> dict[str, Report]:
-        """The last report on each task."""
+    def reports(self, shards: KeeperShards = ALL_SHARDS) -> dict[str, Report]:
+        """The last report on each task, of those whose own ids fall into these shards."""
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         """Take reports away whose tasks nobody holds."""
 
-    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Next events for the keeper, oldest first; those never acknowledged come again after its restart."""
+    def consume(self, *, limit: int, wait_s: float, shards: Collection[int] = (0,)) -> list[tuple[str, Event]]:
+        """Next events for the keeper that holds these shards, of each the oldest first; those never acknowledged come
+        again to the next one."""
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         """Say that the events are in the index."""
 
+    def left_over(self, number: int) -> list[int]:
+        """Shards beyond so many whose streams hold something unread: there were more before."""
+
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Events after an id, for any number of readers (SSE). `"$"`: only what comes from now on; `"0"`: all kept."""
+        """Events of the first shard after an id, for any number of readers. `"$"`: only what comes from now on; `"0"`:
+        all kept."""
 
 
 class Presence(Protocol):
@@ -185,11 +221,24 @@ class Presence(Protocol):
     def announced(self, part: str) -> bool:
         """Whether a part said so."""
 
-    def lead(self, part: str, holder: str, seconds: float) -> bool:
-        """Take or keep the lease of a part of the service for that long; False if another holder has it."""
+    def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
+        """Keep the shards of the keepers' work that are held, for that long, and take of the free ones up to a fair
+        share. Whoever asks counts as one who shares the work, for as long.
 
-    def resign(self, part: str, holder: str) -> None:
-        """Give the lease of a part back, if this holder has it."""
+        Args:
+            number: how many shards the holder was told that there are. Who holds the first one says it; to who was told
+                another number nothing is given.
+            before: shards that the holder had, and would rather have again.
+        """
+
+    def resign(self, holder: str, shards: Collection[int]) -> None:
+        """Give shards back that this holder has."""
+
+    def leave(self, holder: str, *, number: int) -> None:
+        """Share the work no longer; with what is still held, `resign` comes first."""
+
+    def keepers(self, part: str) -> list[Keeping]:
+        """Who holds each shard of the work, and whether it said lately that it works (`announce`, see `part_of`)."""
 
     def now(self, *, lease_s: float) -> QueueNow:
         """Lengths, ages and workers for the metrics, at a cost that does not grow with the queue.

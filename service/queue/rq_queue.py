@@ -8,47 +8,36 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
 from redis import Redis
-from redis.exceptions import RedisError, ResponseError
+from redis.exceptions import RedisError
 
 from service.model.ability import need_of
 from service.model.domain import Lane, Stage
 from service.model.errors import QueueUnavailable
+from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.worker_beat import WorkerBeat
-from service.queue import entries
+from service.queue import entries, shares
 from service.queue.adding import Appender
 from service.queue.address import redis_url
 from service.queue.allowed import AllowedJob
 from service.queue.at_scrape import QueueNow, read_queue
 from service.queue.connection import connect
 from service.queue.lists import LISTS, known_lists, place_of, queue_name, without_takers
-from service.queue.port import Event, Holder, Lease, Message, Report
+from service.queue.port import Event, Holder, Keeping, Lease, Message, Report, Share, part_of
 from service.queue.reports import REPORTS, drop_reports, put_report, read_reports
+from service.queue.streams import EVENTS, NUMBER, EventReader, put_event, put_into, readable, streams_kept
 from service.settings import Settings
 
-EVENTS: Final = "graspd:events"
-#: Events kept, 20 MB at most: a minute of a keeper that is away and four hundred tasks a second. Those lost are made
-#: good from the store.
-EVENTS_KEPT: Final = 50_000
 WORKERS: Final = "graspd:workers"
 #: Sums for Prometheus, a few hundred fields.
 METRICS: Final = "graspd:metrics"
-_GROUP: Final = "keeper"
 _CANCEL_TTL_S: Final = 24 * 3600
 _JOB: Final = b"rq:job:"
 _WORKER: Final = b"graspd:worker:"
-#: In one step, so that two that ask at once do not both get it.
-_LEAD: Final = """
-local holder = redis.call('GET', KEYS[1])
-if holder and holder ~= ARGV[1] then return 0 end
-redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
-return 1
-"""
-_RESIGN: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end"
 
 
 class RqQueue:
@@ -57,7 +46,7 @@ class RqQueue:
     def __init__(self, connection: Redis) -> None:
         self.connection: Any = connection
         self._appender = Appender(connection)
-        self._unread = "0"
+        self._reader = EventReader(connection)
 
     def ping(self) -> float:
         start = time.perf_counter()
@@ -150,78 +139,70 @@ class RqQueue:
     def publish(self, *events: Event) -> None:
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
-                pipe.xadd(EVENTS, encoded(event), maxlen=EVENTS_KEPT, approximate=True)
+                put_event(pipe, event)
                 if event.kind.ends_attempt:
                     pipe.hdel(REPORTS, event.task_id)
+            pipe.execute()
+
+    def hand_on(self, events: Iterable[tuple[int, Event]]) -> None:
+        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+            for shard, event in events:
+                put_into(pipe, shard, event)
             pipe.execute()
 
     def report(self, task_id: str, report: Report) -> float:
         with _mapped():
             return put_report(self.connection, task_id, report, WORKERS)
 
-    def reports(self) -> dict[str, Report]:
+    def reports(self, shards: KeeperShards = ALL_SHARDS) -> dict[str, Report]:
         with _mapped():
-            return read_reports(self.connection)
+            return read_reports(self.connection, shards)
 
     def forget_reports(self, task_ids: Collection[str]) -> None:
         with _mapped():
             drop_reports(self.connection, task_ids)
 
-    def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+    def consume(self, *, limit: int, wait_s: float, shards: Collection[int] = (0,)) -> list[tuple[str, Event]]:
         with _mapped():
-            try:
-                found = self._read_group(limit, wait_s)
-            except ResponseError as error:
-                if not str(error).startswith("NOGROUP"):
-                    raise
-                self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
-                found = self._read_group(limit, wait_s)
-        return found
-
-    def _read_group(self, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        # First what an earlier keeper took and never acknowledged, then what is new.
-        while self._unread != ">":
-            reply = self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: self._unread}, count=limit)
-            pending, last = self._readable(reply)
-            self._unread = last or ">"
-            if pending:
-                return pending
-        block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
-        return self._readable(self.connection.xreadgroup(_GROUP, _GROUP, {EVENTS: ">"}, count=limit, block=block))[0]
-
-    def _readable(self, reply: Any) -> tuple[list[tuple[str, Event]], str]:
-        """Events of a reply, and the id of its last entry. What cannot be read is acknowledged: it is nobody's."""
-        found = self._events(reply)
-        known = {event_id for event_id, _ in found}
-        entries_of = [event_id.decode() for event_id, _ in _entries_of(reply)]
-        self.acknowledge([event_id for event_id in entries_of if event_id not in known])
-        return found, entries_of[-1] if entries_of else ""
+            return self._reader.read(shards, limit=limit, wait_s=wait_s)
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
             with _mapped():
-                self.connection.xack(EVENTS, _GROUP, *event_ids)
+                self._reader.acknowledge(event_ids)
+
+    def left_over(self, number: int) -> list[int]:
+        with _mapped():
+            return self._reader.left_over(number)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with _mapped():
             block = max(1, int(wait_s * 1000)) if wait_s > 0 else None
-            return self._events(self.connection.xread({EVENTS: after}, count=limit, block=block))
+            return readable(self.connection.xread({EVENTS: after}, count=limit, block=block))
 
     def announce(self, part: str, seconds: float) -> None:
         with _mapped():
-            self.connection.set(f"graspd:part:{part}", "1", px=int(seconds * 1000))
+            self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def announced(self, part: str) -> bool:
         with _mapped():
-            return bool(self.connection.exists(f"graspd:part:{part}"))
+            return bool(self.connection.exists(_part_key(part)))
 
-    def lead(self, part: str, holder: str, seconds: float) -> bool:
+    def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
         with _mapped():
-            return bool(self.connection.eval(_LEAD, 1, f"graspd:lead:{part}", holder, int(seconds * 1000)))
+            return shares.take_share(self.connection, holder, seconds, number, before)
 
-    def resign(self, part: str, holder: str) -> None:
+    def resign(self, holder: str, shards: Collection[int]) -> None:
         with _mapped():
-            self.connection.eval(_RESIGN, 1, f"graspd:lead:{part}", holder)
+            shares.give_back(self.connection, holder, shards)
+
+    def leave(self, holder: str, *, number: int) -> None:
+        with _mapped():
+            shares.leave(self.connection, holder, number)
+
+    def keepers(self, part: str) -> list[Keeping]:
+        with _mapped():
+            return shares.read_keepers(self.connection, lambda shard: _part_key(part_of(part, shard)))
 
     def now(self, *, lease_s: float) -> QueueNow:
         with _mapped():
@@ -248,9 +229,10 @@ class RqQueue:
     def tidy(self) -> None:
         # RQ's registries of workers and failures are emptied by its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            entries.sweep(self.connection, _KINDS, EVENTS)
+            streams = streams_kept(self.connection)
+            entries.sweep(self.connection, [*_KINDS, *((name, "stream") for name in streams)], streams)
             lists = known_lists(self.connection)
-            entries.sweep(self.connection, _kinds(lists), EVENTS)
+            entries.sweep(self.connection, _kinds(lists))
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
@@ -271,11 +253,6 @@ class RqQueue:
     def _list_keys(self) -> list[str]:
         return [f"rq:queue:{name}" for name in known_lists(self.connection)]
 
-    @staticmethod
-    def _events(reply: Any) -> list[tuple[str, Event]]:
-        read = ((event_id, entries.event(fields.get(b"e"))) for event_id, fields in _entries_of(reply) if fields)
-        return [(event_id.decode(), event) for event_id, event in read if event is not None]
-
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
     """The queue that the settings name; it need not answer yet."""
@@ -292,12 +269,6 @@ def cancel_key(task_id: str) -> str:
     return f"graspd:cancel:{task_id}"
 
 
-def _entries_of(reply: Any) -> list[tuple[bytes, dict[bytes, bytes] | None]]:
-    """Ids and fields of what a read of the stream gives; an entry that was trimmed has no fields."""
-    streams = reply.values() if isinstance(reply, dict) else [found for _, found in reply or []]
-    return [one for found in streams for entry in found for one in ([entry] if isinstance(entry, tuple) else entry)]
-
-
 def _lease(key: str, entry: bytes, score: float) -> Lease:
     task, attempt = entries.task_of(entries.text(entry.partition(b":")[0]))
     # Every sign of life moves the score, and an entry is of one execution only.
@@ -309,14 +280,14 @@ def worker_key(name: str) -> str:
     return f"{_WORKER.decode()}{name}"
 
 
-def encoded(event: Event) -> dict[str, str]:
-    """The fields of an event's entry in the stream."""
-    return {"e": event.model_dump_json(exclude_defaults=True)}
+def _part_key(part: str) -> str:
+    return f"graspd:part:{part}"
 
 
 #: Names of a fixed number, each with its type in Redis.
 _KINDS: Final = (
-    (EVENTS, "stream"),
+    (NUMBER, "string"),
+    (shares.KEEPERS, "zset"),
     (WORKERS, "set"),
     (METRICS, "hash"),
     (REPORTS, "hash"),

@@ -76,7 +76,8 @@ def keeper(
     check: Annotated[bool, typer.Option("--check", help="Start none; exit code 1 says that none lives.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Reaper, delayed retries and indexer. Of several one works, and another takes over; `graspd up` starts one."""
+    """Reaper, delayed retries and indexer. Several share the work and take over from each other; `graspd up` starts
+    one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "keeper")
     keep_private(settings)
@@ -87,24 +88,28 @@ def keeper(
 
 
 def _run_keeper(settings: Settings, stop: threading.Event) -> None:
-    """Wait until this keeper leads, then keep; again from the start where another has taken over."""
+    """Keep the shards of the work that are this keeper's; from the start where they become others."""
     from service.heartbeat_file import HeartbeatFile
     from service.pipeline.backends import Parts
-    from service.pipeline.keeper import PART, Keeper
-    from service.pipeline.leadership import Leadership
+    from service.pipeline.keeper import Keeper
+    from service.pipeline.sharing import Sharing
     from service.queue.rq_queue import open_queue
 
     queue = open_queue(settings, patience=0)
-    leadership = Leadership(
-        queue, PART, lease_s=settings.lease_s, alive=HeartbeatFile(settings.heartbeat_file), name=settings.keeper_name
+    sharing = Sharing(
+        queue,
+        number=settings.keeper_shards,
+        lease_s=settings.lease_s,
+        alive=HeartbeatFile(settings.heartbeat_file),
+        name=settings.keeper_name,
     )
     try:
-        while leadership.wait(stop):
-            with leadership.held(stop) as over:
-                # What an earlier leader took in and did not finish comes again to a fresh one.
+        while (shards := sharing.wait(stop)) is not None:
+            with sharing.held(stop) as over:
+                # What an earlier keeper took in and did not finish comes again to a fresh one.
                 parts = Parts.open(settings)
                 try:
-                    Keeper(parts).run(over)
+                    Keeper(parts, shards).run(over)
                 finally:
                     parts.close()
     finally:
@@ -182,12 +187,12 @@ def _check_rooms(workers: int) -> None:
 
 def check_keeper(settings: Settings) -> None:
     """UnavailableError if no keeper gave a sign of life lately."""
-    from service.pipeline.keeper import PART
+    from service.pipeline.sharing import is_kept
     from service.queue.rq_queue import open_queue
 
     queue = open_queue(settings, patience=0)
     try:
-        if not queue.announced(PART):
+        if not is_kept(queue):
             raise UnavailableError("no keeper gave a sign of life lately; start `graspd keeper`")
     finally:
         queue.close()

@@ -17,7 +17,7 @@ from typing import IO, Final, Self
 import httpx
 
 from service.model.errors import BusyError, GraspdError, InputError, UnavailableError
-from service.pipeline.keeper import PART as KEEPER
+from service.pipeline.sharing import is_kept
 from service.queue.address import redis_url
 from service.queue.port import Presence
 from service.queue.rq_queue import open_queue
@@ -132,7 +132,7 @@ class Supervisor:
     def _missing(self, queue: Presence) -> list[str]:
         missing = []
         try:
-            if not queue.announced(KEEPER):
+            if not is_kept(queue):
                 missing.append("keeper")
             beats = queue.workers()
             if sum(beat.state != "quarantined" for beat in beats) < self._workers:

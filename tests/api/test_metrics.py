@@ -5,6 +5,7 @@ from __future__ import annotations
 from api.metrics import Metrics, Snapshot
 from service.pipeline.series import SERIES
 from service.queue.at_scrape import QueueNow, WorkerPulse
+from service.queue.port import Keeping
 
 STATES = ("checking", "idle", "busy", "stopping", "quarantined")
 
@@ -13,7 +14,7 @@ def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
     """An alert on workers in quarantine asks for this very series; none is 0 and not absent."""
     snapshot = Snapshot()
     pulses = {str(i): WorkerPulse("cpu", state, 0.1) for i, state in enumerate(["idle", "quarantined", "quarantined"])}
-    snapshot.add_queue(QueueNow(workers=pulses), keeper_is_up=True)
+    snapshot.add_queue(QueueNow(workers=pulses), [Keeping(0, "a", True), Keeping(1, "b", False)])
     text = Metrics().render(snapshot).decode()
     assert all(state in SERIES["graspd_workers"].meaning for state in STATES)
     counts = {state: float(text.partition(f'graspd_workers{{state="{state}"}} ')[2].split()[0]) for state in STATES}

@@ -1,15 +1,18 @@
-"""Several keepers: one works, and where it is killed or stands still another goes on."""
+"""Several keepers: one works, or all share the work; where one is killed or stands still the others go on."""
 
 from __future__ import annotations
 
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from service.index.rebuild import differences
 from service.model.domain import State
+from service.model.keeper_shards import shard_of
 from service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.house import House
@@ -71,3 +74,42 @@ def test_one_that_is_started_again_under_its_name_need_not_wait(house: House) ->
     house.processes["first"].wait()
     house.keeper("again", GRASPD_KEEPER_NAME="node-1", GRASPD_LEASE_S="600")
     house.until(lambda: house.says("again", "this keeper leads"), "it leads again")
+
+
+@pytest.mark.chaos
+def test_keepers_share_the_work_and_take_over_from_one_that_is_killed(tmp_path: Path) -> None:
+    # No worker is killed here: on a busy machine one may be silent for some time and is there all the same.
+    house = House(tmp_path, lease_s=8.0)
+
+    def shares() -> list[int]:
+        """How many of the shards each of the keepers holds, the least first."""
+        holders = Counter(one.holder for one in house.parts.queue.keepers("keeper") if one.works)
+        return sorted(holders.values())
+
+    try:
+        for name in "ab":
+            house.keeper(name, GRASPD_KEEPER_SHARDS="4", GRASPD_KEEPER_NAME=name)
+        house.until(lambda: shares() == [2, 2], "two share four shards evenly")
+        jobs = [job_actions.submit(house.parts, request(grasps=32 * 6, seed=seed))[0].id for seed in range(8)]
+        assert {shard_of(job, 4) for job in jobs} == {0, 1, 2, 3}, "every shard has a job"
+        house.start("worker", sys.executable, "-m", "tests.fakes", FAKE_SECONDS="0.1")
+        house.until(lambda: sum(house.done(job) for job in jobs) >= 4, "they keep")
+
+        house.hold.touch()
+        running = {"state": State.RUNNING, "limit": 100}
+        house.until(lambda: any(house.parts.index.jobs.tasks(job=job, **running).items for job in jobs), "work goes on")
+        # The one that also has what is of no job.
+        first = house.parts.queue.keepers("keeper")[0].holder
+        house.processes[first].kill()
+        house.processes[first].wait()
+        house.until(lambda: shares() == [4], "the other has all shards")
+        house.hold.unlink()
+
+        house.until(lambda: all(house.parts.index.jobs.get(job).state.is_final for job in jobs), "all are done")
+        tasks = [task for job in jobs for task in house.parts.index.jobs.tasks(job=job, limit=100).items]
+        assert {task.state for task in tasks} == {State.SUCCEEDED}
+        assert [task.attempt for task in tasks] == [1] * 48, "no task was taken from its worker"
+        assert house.says("worker", "synthesize took") == 48, "none was done twice"
+        assert differences(house.parts.index, house.parts.store) == []
+    finally:
+        house.close()

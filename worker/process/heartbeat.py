@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.model.worker_beat import WorkerBeat
-from service.queue.rq_queue import EVENTS, EVENTS_KEPT, WORKERS, cancel_key, worker_key
+from service.queue.rq_queue import WORKERS, cancel_key, worker_key
+from service.queue.streams import EVENTS, EVENTS_KEPT
 from worker.stages.context import StopReason, TaskContext
 
 log = logging.getLogger(__name__)

@@ -22,7 +22,8 @@ from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.port import Event, EventKind
-from service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
+from service.queue.rq_queue import METRICS, WORKERS, RqQueue, worker_key
+from service.queue.streams import EVENTS
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets, request
@@ -111,7 +112,7 @@ def test_a_forged_entry_stops_neither_feeding_nor_reaping_nor_pages(parts: Parts
     queue.discard([task.id])
     assert task.id not in queue.waiting()
     page = Snapshot()
-    page.add_queue(queue.now(lease_s=6), keeper_is_up=True)
+    page.add_queue(queue.now(lease_s=6), queue.keepers("keeper"))
     page.add_sums(queue.counted())
     assert b"graspd_workers" in Metrics().render(page)
     assert [beat.name for beat in queue.workers()] == []
