@@ -59,6 +59,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("view", "worker.commands.view", "Without a server", "Grasps of a file in 3D in the browser, one at a time."),
     ("pictures", "worker.commands.render", "Without a server", "The best grasps of a file on one sheet."),
     ("grasps", "worker.commands.curate", "Without a server", "Grasps of files and datasets, chosen by their numbers."),
+    ("clouds", "worker.commands.clouds", "Without a server", "Pictures as point clouds with their grasps, in files."),
     ("export", "worker.commands.exchange", "Without a server", "Grasps and pictures in the formats of others."),
     ("import", "worker.commands.exchange", "Without a server", "Grasps of others, judged and measured like ours."),
     ("stability", "worker.commands.stability", "Studies", "Where integrators and the planner fail."),

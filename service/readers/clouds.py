@@ -26,6 +26,8 @@ HandSurface = Callable[[Shard, Ints], Floats]
 Frame = Literal["camera", "table", "object"]
 FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
+#: Beginnings of the keys that have a row for each grasp.
+OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
 _NOWHERE: Final = np.array([0.0, 0, 0, 1, 0, 0, 0])
 
 

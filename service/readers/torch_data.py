@@ -13,17 +13,17 @@ DataLoader(ShuffledShards(shards, seed=1), batch_size=256, num_workers=4)     # 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate, get_worker_info
 
+from service.readers.clouds import OF_GRASPS
 from service.readers.files import Shards
 from service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
 
 Sample = dict[str, Any]
-_OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
 
 
 def tensors(sample: Sample) -> Sample:
@@ -38,7 +38,7 @@ def collate(samples: Sequence[Sample]) -> Sample:
     for name in samples[0]:
         values = [sample[name] for sample in samples]
         # Scenes may have equally many grasps by chance; the batch must not change its kind for that.
-        listed = pictures and name.startswith(_OF_GRASPS)
+        listed = pictures and name.startswith(OF_GRASPS)
         batch[name] = values if listed else default_collate(values)
     return batch
 
