@@ -48,7 +48,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     return done
 
 
-def stacked(samples: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
     """Samples of one shard as arrays."""
     found: dict[str, NDArray[Any]] = {name: np.array(str(samples[0][name])) for name in _WORDS}
     found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in samples], np.int32)
