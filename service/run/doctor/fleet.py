@@ -44,9 +44,8 @@ def keeper(settings: Settings) -> Finding:
             f"no keeper{of} gave a sign of life: finished tasks are not taken up, and nothing is queued",
             "graspd keeper",
         )
-    return good(
-        name, "a keeper lives" if len(shards) == 1 else f"{len(holders)} share the work of {len(shards)} shards"
-    )
+    holding = "a keeper lives" if len(holders) == 1 else f"{len(holders)} keepers live"
+    return good(name, holding if len(shards) == 1 else f"{holding}, with all {len(shards)} shards of the work")
 
 
 def workers(settings: Settings) -> Finding:

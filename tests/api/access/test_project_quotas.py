@@ -1,0 +1,141 @@
+"""What the keys of a project may use together: grasps in work, grasps of a day, and GPU seconds of a day."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, tzinfo
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+from sqlalchemy import update
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, ProjectLimits, Scope
+from api.app import create_app
+from service.index.tables import shards
+from service.model import names
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.queue.rq_queue import RqQueue
+from service.settings import Settings
+from service.store.records import read_record
+from tests.api.factories import finish_all
+
+JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+NOON = "2026-11-20"
+Ask = Callable[..., Any]
+
+
+class Noon(datetime):
+    """A clock of quotas that stands still: no test runs over midnight."""
+
+    @classmethod
+    def now(cls, tz: tzinfo | None = None) -> Noon:
+        return cls(2026, 11, 20, 12, tzinfo=UTC)
+
+
+@pytest.fixture
+def service(
+    settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[TestClient]:
+    monkeypatch.setattr("api.access.quotas.datetime", Noon)
+    wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server)})
+    shared = Parts(wanted, parts.store, parts.index, parts.queue)
+    with TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") as client:
+        yield client
+
+
+@pytest.fixture
+def ask(service: TestClient, settings: Settings) -> Ask:
+    """Submits a job in the name of a key: two are of `red`, one of `blue`."""
+    keys = KeyFile(settings.resolved_keys_file)
+    projects = {"ann": "red", "amy": "red", "bob": "blue"}
+    tokens = {name: keys.add(name, Scope.SUBMIT, project=project) for name, project in projects.items()}
+
+    def submit(who: str, seed: int, path: str = "/v1/jobs", /, **changes: Any) -> Any:
+        body = {**JOB, "seed": seed, **changes} if path == "/v1/jobs" else changes
+        return service.post(path, json=body, headers={"Authorization": f"Bearer {tokens[who]}"})
+
+    return submit
+
+
+def limit(settings: Settings, **limits: int) -> None:
+    KeyFile(settings.resolved_keys_file).limit_project("red", ProjectLimits(**limits))
+
+
+def done(parts: Parts, job: str, *, seconds: float, device: str = "cuda:0", day: str = NOON) -> None:
+    """A job of a single task is done: on that day, in that time."""
+    (made,) = finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job)))
+    values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
+    with parts.index.database.writing() as connection:
+        connection.execute(update(shards).where(shards.c.id == made.shard_id).values(**values))
+
+
+def refused(answer: Any) -> str:
+    """Why."""
+    assert answer.status_code == 429 and answer.json()["type"] == "/problems/quota-exceeded", answer.text
+    return str(answer.json()["detail"])
+
+
+def test_keys_of_a_project_share_its_grasps_in_work_and_another_project_has_its_own(
+    ask: Ask, settings: Settings, parts: Parts
+) -> None:
+    limit(settings, grasps_in_flight=64)
+    first = ask("ann", 1).json()["id"]
+    assert ask("amy", 2).status_code == 202
+    assert "the project 'red' has 64 grasps in work and may have 64" in refused(ask("amy", 3))
+    assert ask("bob", 3).status_code == 202
+    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    assert ask("amy", 3).status_code == 202, "one of ann's ended"
+
+
+def test_keys_of_a_project_share_the_grasps_that_it_may_ask_for_on_a_day(
+    ask: Ask, settings: Settings, parts: Parts
+) -> None:
+    limit(settings, grasps_per_day=96)
+    first = ask("ann", 1).json()["id"]
+    finish_all(parts, read_record(JobRecord, parts.store, names.job_record(first)))
+    too_many = ask("amy", 2, grasps=65)
+    assert "has asked for 32 of its 96 grasps of today" in refused(too_many), "also for what is done"
+    assert 12 * 3600 <= int(too_many.headers["retry-after"]) <= 12 * 3600 + 1, "until midnight, and not before"
+    matrix = {"name": "d", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
+    assert ask("amy", 0, "/v1/datasets", **matrix | {"grasps": 33}).status_code == 429
+    assert ask("amy", 0, "/v1/datasets", **matrix).status_code == 202
+    assert "has asked for 96 of its 96" in refused(ask("ann", 2))
+    assert ask("bob", 2).status_code == 202
+
+
+def test_a_project_that_used_up_its_gpu_seconds_of_the_day_submits_no_more(
+    ask: Ask, settings: Settings, parts: Parts
+) -> None:
+    limit(settings, gpu_seconds_per_day=60)
+    made = [ask("ann", seed).json()["id"] for seed in (1, 2)]
+    waiting = ask("ann", 3).json()["id"]
+
+    done(parts, made[0], device="cpu", seconds=61.0)
+    done(parts, ask("ann", 4).json()["id"], day="2026-11-19", seconds=61.0)
+    assert ask("amy", 5).status_code == 202, "neither a CPU's time nor yesterday's counts"
+    done(parts, made[1], seconds=61.0)
+    assert "the project 'red' has used 61 of its 60 GPU seconds of today" in refused(ask("amy", 6))
+    assert ask("bob", 6).status_code == 202
+    assert not parts.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
+
+
+def test_usage_is_told_as_a_document_and_as_a_table_of_the_own_project_alone(
+    ask: Ask, service: TestClient, settings: Settings, parts: Parts
+) -> None:
+    for name, seed in (("ann", 1), ("bob", 2)):
+        done(parts, ask(name, seed).json()["id"], seconds=2.5)
+    keys = KeyFile(settings.resolved_keys_file)
+    reader, admin = keys.add("reader", Scope.READ, project="red"), keys.add("root", Scope.ADMIN)
+
+    def read(path: str, token: str) -> Any:
+        headers = {"Authorization": f"Bearer {token}"}
+        return service.get(path, params={"since": NOON, "until": NOON}, headers=headers)
+
+    (own,) = read("/v1/usage", reader).json()
+    assert (own["project"], own["day"], own["grasps"], own["gpu_seconds"]) == ("red", NOON, 32, 2.5)
+    lines = read("/v1/usage.csv", reader).text.splitlines()
+    assert lines == [",".join(own), ",".join(str(value) for value in own.values())]
+    assert {day["project"] for day in read("/v1/usage", admin).json()} == {"red", "blue"}
