@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tests.servers import MissingServer, PostgresServer, S3Server
 
-# The same examples in each run: a test that passes on one machine passes on another. `slow` tests draw fresh ones.
-settings.register_profile("graspd", derandomize=True)
+# The same examples in each run, however long they take: a test that passes on one machine passes on another. `slow`
+# tests draw fresh ones.
+settings.register_profile(
+    "graspd", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+)
 settings.load_profile("graspd")
 
 REPOSITORY = Path(__file__).resolve().parent.parent

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from datetime import datetime, tzinfo
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,18 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     add_builtins(opened)
     opened.close()
     return folder
+
+
+@pytest.fixture
+def noon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is noon (UTC) to quotas: their day does not end while a test runs."""
+
+    class Noon(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:
+            return datetime(2026, 5, 1, 12, tzinfo=tz)
+
+    monkeypatch.setattr("api.access.quotas.datetime", Noon)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -20,6 +19,7 @@ from api.server import bind, configuration
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from tests.api.factories import add_job
+from tests.waiting import PATIENCE_S, until
 
 Connect = Callable[..., socket.socket]
 _WHOLE = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
@@ -42,21 +42,23 @@ async def tells_its_client(scope: Any, receive: Any, send: Any) -> None:
 
 @pytest.fixture
 def connect(settings: Settings) -> Iterator[Connect]:
-    """Opens connections to an application, each served as `graspd api` does but for a shorter patience."""
+    """Opens connections to an application, each served as `graspd api` does but for a shorter patience; what is `sent`
+    is there before the server looks, however busy the machine is."""
     running: list[tuple[uvicorn.Server, threading.Thread]] = []
     opened: list[socket.socket] = []
 
-    def start(app: Any = tells_its_client) -> socket.socket:
+    def start(sent: bytes = b"", *, app: Any = tells_its_client) -> socket.socket:
         config = configuration(app, settings)
         assert config.http is TimedProtocol
         config.http = _Quick
         listener = bind("127.0.0.1", 0)
+        connection = socket.create_connection(listener.getsockname(), timeout=PATIENCE_S)
+        opened.append(connection)
+        connection.sendall(sent)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         running.append((server, thread))
-        connection = socket.create_connection(listener.getsockname(), timeout=20)
-        opened.append(connection)
         return connection
 
     yield start
@@ -64,7 +66,7 @@ def connect(settings: Settings) -> Iterator[Connect]:
         connection.close()
     for server, thread in running:
         server.should_exit = True
-        thread.join(20)
+        thread.join(PATIENCE_S)
 
 
 def rest(connection: socket.socket) -> bytes:
@@ -80,53 +82,49 @@ def test_a_connection_that_sends_nothing_is_ended(connect: Connect) -> None:
 
 
 def test_half_sent_headers_are_given_up(connect: Connect) -> None:
-    connection = connect()
-    connection.sendall(_HALF)
+    connection = connect(_HALF)
     assert rest(connection).startswith(b"HTTP/1.1 408 ")
 
 
 def test_headers_that_trickle_in_win_no_time(connect: Connect) -> None:
-    connection = connect()
-    connection.sendall(_HALF)
-    deadline = time.monotonic() + 20
+    connection = connect(_HALF)
     answer = b""
     connection.settimeout(0.02)
-    while not answer and time.monotonic() < deadline:
+
+    def trickle() -> bool:
+        nonlocal answer
         try:
             answer = connection.recv(100)
         except TimeoutError:
             connection.sendall(b"a")
+        return bool(answer)
+
+    until(trickle, "the server gives up")
     assert answer.startswith(b"HTTP/1.1 408 ")
 
 
 def test_half_of_a_later_request_is_given_up_too(connect: Connect) -> None:
-    connection = connect()
-    connection.sendall(_WHOLE)
+    connection = connect(_WHOLE)
     assert b" 200 " in connection.recv(65536)
     connection.sendall(_HALF)
     assert b" 408 " in rest(connection)
 
 
 def test_half_of_a_request_behind_another_is_given_up_after_its_answer(connect: Connect) -> None:
-    connection = connect()
-    connection.sendall(_WHOLE + _HALF)
+    connection = connect(_WHOLE + _HALF)
     answer = rest(connection)
     assert answer.index(b" 200 ") < answer.index(b" 408 ")
 
 
 def test_an_answer_may_take_longer_than_headers(connect: Connect) -> None:
-    connection = connect()
-    connection.sendall(_WHOLE)
+    connection = connect(_WHOLE)
     assert b" 200 " in connection.recv(65536)
 
 
 def test_a_request_of_two_lengths_is_refused(connect: Connect, app: FastAPI) -> None:
-    connection = connect(app)
     lengths = b"Transfer-Encoding: chunked\r\nContent-Length: 5\r\n"
-    connection.sendall(
-        b"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n0\r\n\r\nGET /healthz HTTP/1.1\r\n"
-    )
-    answer = rest(connection)
+    sent = b"POST /v1/jobs HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n0\r\n\r\nGET /healthz HTTP/1.1\r\n"
+    answer = rest(connect(sent, app=app))
     assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1") == 1
 
 
@@ -137,9 +135,8 @@ def test_a_forwarded_address_is_believed_only_where_the_operator_says_so(
     monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
     if believed:
         monkeypatch.setenv("FORWARDED_ALLOW_IPS", believed)
-    connection = connect()
     forwarded = b"X-Forwarded-For: 192.0.2.7\r\nConnection: close\r\n\r\n"
-    connection.sendall(_WHOLE.removesuffix(b"\r\n") + forwarded)
+    connection = connect(_WHOLE.removesuffix(b"\r\n") + forwarded)
     assert rest(connection).endswith(b"\r\n\r\n" + seen)
 
 
@@ -155,7 +152,7 @@ def test_a_stream_of_events_ends_with_its_key(
     job = add_job(parts).id
 
     async def nothing() -> dict[str, Any]:
-        await asyncio.sleep(60)
+        await asyncio.sleep(2 * PATIENCE_S)
         return {"type": "http.disconnect"}
 
     async def watch() -> None:
@@ -164,7 +161,7 @@ def test_a_stream_of_events_ends_with_its_key(
             stream = events.job_events(app.state.jobs, job, request)
         else:
             stream = events.service_events(app.state.overview, request)
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE_S):
             await anext(stream)
             if end == "revoked":
                 keys.revoke("me")

@@ -18,6 +18,7 @@ from api.server import bind
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.api.conftest import app, furnished, parts, settings
+from tests.waiting import PATIENCE_S
 
 __all__ = ["app", "furnished", "parts", "settings"]
 
@@ -26,7 +27,8 @@ ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
-READY_S = 60.0
+#: Longest wait for something on a page, on a machine that is busy with other things.
+SHOWN_MS = 1000 * PATIENCE_S
 
 
 @pytest.fixture
@@ -83,6 +85,7 @@ def page(address: str, chromium: Any) -> Iterator[Any]:
     """A page of the application in this process; the test fails if anything went wrong on it."""
     watch = Watch(address)
     context = chromium.new_context(base_url=address, viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(SHOWN_MS)
     yield watch(context.new_page())
     context.close()
     assert watch.trouble == []
@@ -96,7 +99,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     supervisor = Supervisor(wanted, workers=1, worker_command=worker)
     supervisor.start()
     try:
-        supervisor.wait_ready(READY_S)
+        supervisor.wait_ready(PATIENCE_S)
         yield supervisor.api_url
     finally:
         supervisor.stop()
@@ -107,6 +110,7 @@ def real_page(service: str, chromium: Any, tmp_path: Path) -> Iterator[Any]:
     """A page of the whole service."""
     watch = Watch(service)
     context = chromium.new_context(base_url=service, viewport={"width": 1440, "height": 900}, accept_downloads=True)
+    context.set_default_timeout(SHOWN_MS)
     yield watch(context.new_page())
     context.close()
     assert watch.trouble == []

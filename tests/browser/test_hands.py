@@ -19,7 +19,6 @@ from worker.stages.context import TaskContext
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
-SHOWN_MS = 60_000
 BAR = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.016 0.02 0.06"/></geometry></collision>'
 SEEN = (
     '<visual><origin xyz="0 0 0.03"/><geometry><cylinder radius="0.009" length="0.06"/></geometry>'
@@ -56,14 +55,15 @@ def drawn(page: Any) -> bytes:
 def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     page: Any, parts: Parts, address: str
 ) -> None:
-    httpx.post(f"{address}/v1/hands", files={"file": ("claw.urdf", CLAW)}, trust_env=False).raise_for_status()
+    file = ("claw.urdf", CLAW)
+    httpx.post(f"{address}/v1/hands", files={"file": file}, trust_env=False, timeout=60).raise_for_status()
     # A small canvas is drawn quickly without a GPU.
     page.set_viewport_size({"width": 700, "height": 700})
     page.goto("/hands")
     page.click("text=claw")
     assert page.inner_text("#shown") == "A worker looks at it: what it finds is shown here."
     checked(parts, "claw")
-    page.wait_for_selector(".viewer[data-state=ready]", timeout=SHOWN_MS)
+    page.wait_for_selector(".viewer[data-state=ready]")
     assert colours(page.locator(".viewer canvas")) > 50
     assert page.is_checked("[name='closing.0'][value='1']")
 
@@ -100,7 +100,7 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
     page.wait_for_url(lambda url: "/hands/" in url and not url.endswith("claw"))
     assert page.inner_text("h1") == "claw-right"
     checked(parts, "claw-right")
-    page.wait_for_selector(".viewer[data-state=ready]", timeout=SHOWN_MS)
+    page.wait_for_selector(".viewer[data-state=ready]")
 
     asset = parts.index.assets.get(AssetKind.HAND, "claw-right")
     files = library.load_asset_files(parts.store, AssetKind.HAND, asset.digest)
@@ -114,7 +114,7 @@ def test_a_wrong_guess_is_seen_corrected_and_kept_as_a_hand_that_jobs_can_use(
 
     assert page.is_visible("text=Collision shapes")
     page.click("text=Use it in a job")
-    page.wait_for_selector("[data-thing=hand] figure[data-state=ready]", timeout=SHOWN_MS)
+    page.wait_for_selector("[data-thing=hand] figure[data-state=ready]")
     assert page.input_value("#hand") == "claw-right"
-    job = httpx.post(f"{address}/v1/jobs", json={"hand": "claw-right", "object": "mug"}, trust_env=False)
+    job = httpx.post(f"{address}/v1/jobs", json={"hand": "claw-right", "object": "mug"}, trust_env=False, timeout=60)
     assert job.status_code == 202

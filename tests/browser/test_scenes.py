@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from service.pipeline.backends import Parts
 from tests.api.factories import finish_with
+from tests.waiting import until
 from worker.commands.synth import app as synth
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
-SHOWN_MS = 60_000
 STOPS = ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
 
 
@@ -34,7 +34,7 @@ def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_one_slider_leads_from_the_standoff_to_the_lift_in_the_scene(page: Any, parts: Parts, bin_file: Path) -> None:
     shard = finish_with(parts, bin_file).shard_id
     page.goto(f"/grasps/{shard}/0")
-    page.wait_for_selector(".viewer[data-state=ready]", timeout=SHOWN_MS)
+    page.wait_for_selector(".viewer[data-state=ready]")
     assert page.locator("[data-posture]").all_inner_texts() == STOPS
     assert page.inner_text("[data-stage]") == "grasp"
     canvas = page.locator(".viewer canvas")
@@ -58,7 +58,6 @@ def test_one_slider_leads_from_the_standoff_to_the_lift_in_the_scene(page: Any, 
 
     page.click("[data-posture='0']")
     page.uncheck("[data-toggle=scenery]")
-    page.wait_for_timeout(200)
-    assert canvas.screenshot() != seen["standoff"]
+    until(lambda: canvas.screenshot() != seen["standoff"], "the scenery goes")
     page.click("[data-play]")
-    page.wait_for_selector("[data-posture='4'][aria-current=true]", timeout=SHOWN_MS)
+    page.wait_for_selector("[data-posture='4'][aria-current=true]")

@@ -41,7 +41,7 @@ def test_the_store_hands_files_out_where_users_reach_it(tmp_path: Path, s3_url: 
     with front_door(tmp_path, s3_url, s3_server.environment["AWS_ENDPOINT_URL"]) as (http, path, sha256):
         answer = http.get(path, follow_redirects=False)
         assert answer.status_code == 307
-        data = httpx.get(answer.headers["location"], trust_env=False).content
+        data = httpx.get(answer.headers["location"], trust_env=False, timeout=60).content
         assert hashlib.sha256(data).hexdigest() == sha256
 
 

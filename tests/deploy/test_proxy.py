@@ -21,7 +21,7 @@ from tests.conftest import REPOSITORY
 from tests.servers import free_ports
 
 NAME = "grasps.example.org"
-_READY_S = 60.0
+_READY_S = 120.0
 
 
 def served(folder: Path, api: int, plain: int, secure: int) -> Path:
@@ -84,7 +84,7 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
         headers={"Host": f"{NAME}:{secure}"},
         verify=trust,
         trust_env=False,
-        timeout=20,
+        timeout=60,
         event_hooks={"request": [lambda request: request.extensions.update(sni_hostname=NAME)]},
     )
     try:
@@ -103,7 +103,7 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
         for process in started:
             process.terminate()
         for process in started:
-            process.wait(timeout=30)
+            process.wait(timeout=60)
 
 
 def test_a_stranger_is_asked_for_a_key(proxy: Proxy) -> None:
@@ -134,6 +134,6 @@ def test_a_form_from_another_page_is_refused(proxy: Proxy) -> None:
 
 def test_plain_http_is_sent_to_tls(proxy: Proxy) -> None:
     plain = f"http://127.0.0.1:{proxy.plain_port}/jobs"
-    answer = httpx.get(plain, headers={"Host": NAME}, trust_env=False)
+    answer = httpx.get(plain, headers={"Host": NAME}, trust_env=False, timeout=60)
     assert answer.status_code == 301
     assert answer.headers["location"] == f"https://{NAME}/jobs"

@@ -21,7 +21,7 @@ from tests.conftest import REPOSITORY
 from tests.deploy import composition
 from tests.servers import PostgresServer, S3Server, free_ports
 
-_READY_S = 60.0
+_READY_S = 120.0
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Topology:
         for port in self.ports:
             while True:
                 try:
-                    if httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=5, trust_env=False).status_code == 200:
+                    if httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60, trust_env=False).status_code == 200:
                         break
                 except httpx.HTTPError:
                     pass
@@ -131,13 +131,13 @@ def test_the_services_of_the_compose_file_do_a_job_together(
             base_url=f"http://127.0.0.1:{port}",
             headers={"Authorization": f"Bearer {key}"},
             trust_env=False,
-            timeout=30,
+            timeout=60,
         )
         for port in topology.ports
     )
     with first, second:
-        assert httpx.get(f"{first.base_url}/v1/jobs", trust_env=False).status_code == 401
-        deadline = time.monotonic() + 60
+        assert httpx.get(f"{first.base_url}/v1/jobs", trust_env=False, timeout=60).status_code == 401
+        deadline = time.monotonic() + _READY_S
         while not first.get("/v1/objects").json()["items"]:  # the keeper publishes what comes with graspd
             assert time.monotonic() < deadline, topology.logs()
             time.sleep(0.2)
@@ -176,7 +176,7 @@ def test_redis_refuses_those_without_the_password(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         try:
             with redis.Redis(port=port, password="secret") as client:
-                deadline = time.monotonic() + 10
+                deadline = time.monotonic() + _READY_S
                 while True:
                     try:
                         client.ping()

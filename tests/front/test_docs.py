@@ -68,7 +68,7 @@ def test_a_hand_is_added_corrected_and_used_as_the_page_says(environment: dict[s
     (curl,) = [shlex.split(line) for line in lines if line.startswith("curl ")]
     url = next(part for part in curl if part.startswith("http"))
     body = json.loads(curl[curl.index("-d") + 1])
-    with httpx.Client(base_url=environment["GRASPD_API_URL"], trust_env=False) as http:
+    with httpx.Client(base_url=environment["GRASPD_API_URL"], trust_env=False, timeout=60) as http:
         answer = http.post(httpx.URL(url).path, json=body)
         assert answer.status_code == 202, answer.text
         assert http.get("/v1/jobs", params={"hand": "my_hand"}).json()["items"][0]["state"] == "succeeded"

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from service.model.errors import TaskCancelled
+from tests.waiting import PATIENCE_S
 from worker.meeting import Meeting
 from worker.run import Run
 
@@ -126,7 +127,7 @@ def test_what_fills_a_launch_goes_before_what_was_asked_for_earlier() -> None:
         meeting.leave()
         meeting.leave()
         meeting.leave()
-        early.result(timeout=20)
+        early.result(timeout=PATIENCE_S)
     assert order == ["full", "early"]
 
 
@@ -136,7 +137,7 @@ def test_who_is_cancelled_waits_no_longer_and_is_not_served() -> None:
         waiting = pool.submit(meeting.ask, "same", 2, doubled, size=1, cancelled=stop.is_set)
         stop.set()
         with pytest.raises(TaskCancelled):
-            waiting.result(timeout=20)
+            waiting.result(timeout=PATIENCE_S)
         meeting.leave()
         assert asked(meeting, [4]) == [8]
     assert meeting.served == [1]

@@ -32,7 +32,9 @@ Unfinished = Callable[[Collection[str]], Collection[str]]
 
 
 @pytest.fixture
-def twins(settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue) -> Iterator[list[TestClient]]:
+def twins(
+    settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, noon: None
+) -> Iterator[list[TestClient]]:
     """Two applications over the same parts, keys and Redis."""
     wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server)})
     shared = Parts(wanted, parts.store, parts.index, parts.queue)
@@ -51,7 +53,7 @@ def headers(settings: Settings) -> dict[str, str]:
 
 
 @pytest.fixture
-def quotas(settings: Settings, rq_queue: RqQueue) -> Callable[[Unfinished], Quotas]:
+def quotas(settings: Settings, rq_queue: RqQueue, noon: None) -> Callable[[Unfinished], Quotas]:
     return lambda unfinished: Quotas(settings, rq_queue.connection, unfinished)
 
 
@@ -174,7 +176,7 @@ def test_of_two_objects_of_one_name_at_once_one_gets_it(
     def both_have_looked(self: Store, key: str, file: Any) -> bool:
         if key.startswith("assets/object/") and key.endswith("files.zip"):
             with suppress(BrokenBarrierError):
-                together.wait(10)
+                together.wait(60)
         return put_file(self, key, file)
 
     def upload(number: int) -> int:

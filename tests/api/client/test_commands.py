@@ -22,6 +22,7 @@ from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.library import load_asset_files
 from service.store.store import open_store
+from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
 
@@ -46,7 +47,7 @@ class Shell:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Supervisor]:
     settings = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0)
     with Supervisor(settings, workers=0) as supervisor:
-        supervisor.wait_ready(60)
+        supervisor.wait_ready(PATIENCE_S)
         yield supervisor
 
 
@@ -181,7 +182,9 @@ def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None
 
 def test_an_idempotency_key_binds_to_its_request(service: Supervisor) -> None:
     body = {"hand": "allegro", "object": "mug", "seed": 5}
-    with httpx.Client(base_url=service.api_url, headers={"Idempotency-Key": "one"}, trust_env=False) as http:
+    with httpx.Client(
+        base_url=service.api_url, headers={"Idempotency-Key": "one"}, trust_env=False, timeout=60
+    ) as http:
         first, second = (http.post("/v1/jobs", json=body) for _ in range(2))
         other = http.post("/v1/jobs", json=body | {"seed": 6})
     assert first.json()["id"] == second.json()["id"]

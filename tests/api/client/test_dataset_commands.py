@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from api.client.client import Client
 from api.client.datasets import DatasetClient
 from service.model.domain import State
 from service.run.supervisor import Supervisor
+from tests import waiting
 from tests.api.client.test_commands import Shell, graspd, said, service
 
 __all__ = ["graspd", "service"]  # fixtures
@@ -20,12 +20,10 @@ CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--obje
 def until(service: Supervisor, name: str, state: State) -> None:
     """Wait until the keeper has brought every cell to a state."""
     with Client(service.api_url) as client:
-        for _ in range(600):
-            cells = list(DatasetClient(client).cells(name))
-            if all(cell.planned and cell.state is state for cell in cells):
-                return
-            time.sleep(0.05)
-    raise AssertionError(f"{name} is {[cell.state for cell in cells]}, not {state}")
+        cells = DatasetClient(client).cells
+        waiting.until(
+            lambda: all(cell.planned and cell.state is state for cell in cells(name)), f"all of {name} is {state}"
+        )
 
 
 def test_a_dataset_is_created_listed_cancelled_and_retried(graspd: Shell, service: Supervisor) -> None:

@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from api.routes import assets
 from api.routes.long_requests import Turns
 from service.model.errors import UnavailableError
+from tests.waiting import PATIENCE_S
 
 
 def test_sixty_uploads_that_take_long_keep_no_other_request_waiting(
@@ -22,7 +23,7 @@ def test_sixty_uploads_that_take_long_keep_no_other_request_waiting(
 
     def takes_long(*_: object, **__: object) -> dict[str, bytes]:
         inside.release()
-        hold.wait(60)
+        hold.wait(PATIENCE_S)
         raise UnavailableError("it took too long")
 
     monkeypatch.setattr(assets, "files_of_upload", takes_long)
@@ -34,7 +35,7 @@ def test_sixty_uploads_that_take_long_keep_no_other_request_waiting(
             uploads = [asyncio.create_task(client.post("/v1/objects", files=files)) for _ in range(60)]
             await asyncio.to_thread(inside.acquire)
             try:
-                async with asyncio.timeout(60):
+                async with asyncio.timeout(PATIENCE_S):
                     # What is over the bound is refused at once; only then is everybody else where they wait.
                     while sum(task.done() for task in uploads) < 24:
                         await asyncio.sleep(0.01)
@@ -52,7 +53,7 @@ def test_a_turn_that_does_not_come_in_time_is_refused() -> None:
     async def use() -> None:
         turns = Turns(1, patience_s=0.05)
         hold = threading.Event()
-        first = asyncio.create_task(turns.run(hold.wait, 20))
+        first = asyncio.create_task(turns.run(hold.wait, PATIENCE_S))
         await asyncio.sleep(0)
         try:
             with pytest.raises(UnavailableError):

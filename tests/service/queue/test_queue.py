@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -21,6 +20,7 @@ from service.queue.port import BULK_EVERY, Counters, Event, EventKind, Holder, K
 from service.queue.rq_queue import RqQueue, worker_key
 from tests.fakes import request
 from tests.memory_queue import MemoryQueue
+from tests.waiting import PATIENCE_S, until
 from worker.process.heartbeat import Heartbeat, Hold, place_of
 from worker.process.pulse import Pulse
 from worker.stages.context import StopReason, TaskContext
@@ -294,10 +294,7 @@ def test_a_part_is_there_as_long_as_it_says_so(sides: tuple[TaskQueue, Worker]) 
     assert not queue.announced("keeper")
     queue.announce("keeper", 600)
     queue.announce("brief", 0.05)
-    deadline = time.monotonic() + 60
-    while queue.announced("brief"):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: not queue.announced("brief"), "its time is over")
     assert queue.announced("keeper")
 
 
@@ -315,10 +312,7 @@ def test_of_those_who_want_to_lead_one_does_until_it_is_silent_or_resigns(sides:
     queue.resign("a", {0})
     queue.leave("a", number=1)
     assert leads("b", 0.05)
-    deadline = time.monotonic() + 60
-    while not leads("a"):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: leads("a"), "the lease of b is over")
     assert not leads("b")
 
 
@@ -409,13 +403,14 @@ def test_what_waits_is_told_by_lane_and_stage(sides: tuple[TaskQueue, Worker]) -
     assert not any(shown.running.values())
 
 
-def test_a_worker_is_listed_while_it_gives_signs_of_life(rq_queue: RqQueue, redis_server: str) -> None:
+def test_a_worker_is_listed_while_it_gives_signs_of_life(
+    rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.process.heartbeat._LEAVE_S", PATIENCE_S)
     heart = Heartbeat(redis_server, beat_of("alive"), lease_s=6)
     heart.start()
     try:
-        deadline = time.monotonic() + 20
-        while not rq_queue.workers() and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(rq_queue.workers, "its first sign of life")
         (found,) = rq_queue.workers()
         assert (found.name, found.stages) == ("alive", (Stage.SYNTHESIZE,))
     finally:

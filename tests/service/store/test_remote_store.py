@@ -56,7 +56,7 @@ def test_anybody_with_the_signed_address_may_read_that_object_and_no_other(signi
     signing.put("shards/base/b.h5", b"secret")
     address = signing.sign("shards/base/a.h5", seconds=60)
     assert address is not None
-    with httpx.Client(trust_env=False) as client:
+    with httpx.Client(trust_env=False, timeout=60) as client:
         assert client.get(address).content == bytes(range(100))
         part = client.get(address, headers={"Range": "bytes=10-14"})
         assert (part.status_code, part.content) == (206, bytes(range(10, 15)))

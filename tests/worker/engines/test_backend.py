@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 
+from tests.waiting import PATIENCE_S
 from worker.engines import backend
 
 
@@ -16,12 +17,12 @@ def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:
     def other() -> None:
         runtime.default_device = "a GPU"
         set_.set()
-        looked.wait(20)
+        looked.wait(PATIENCE_S)
         seen.append(runtime.default_device)
 
     thread = threading.Thread(target=other)
     thread.start()
-    assert set_.wait(20)
+    assert set_.wait(PATIENCE_S)
     assert runtime.default_device is first
     runtime.default_device = "the CPU"
     looked.set()

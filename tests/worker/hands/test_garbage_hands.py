@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.model.domain import AssetKind
@@ -49,20 +49,20 @@ def answers(urdf: bytes, asset: bytes) -> None:
     assert hand.dofs >= 1
 
 
-@settings(max_examples=120, deadline=5000, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=120)
 @given(mutated(SOURCE["barrett.urdf"]))
 def test_a_damaged_urdf_loads_or_is_refused(urdf: bytes) -> None:
     answers(urdf, SOURCE["asset.json"])
 
 
-@settings(max_examples=120, deadline=5000, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=120)
 @given(mutated(SOURCE["asset.json"]))
 def test_a_damaged_asset_json_loads_or_is_refused(asset: bytes) -> None:
     answers(SOURCE["barrett.urdf"], asset)
 
 
 @pytest.mark.slow
-@settings(derandomize=False, max_examples=10_000, deadline=5000, suppress_health_check=[HealthCheck.too_slow])
+@settings(derandomize=False, max_examples=10_000)
 @given(mutated(SOURCE["barrett.urdf"]), mutated(SOURCE["asset.json"]) | st.just(SOURCE["asset.json"]))
 def test_ten_thousand_damaged_hands_load_or_are_refused(urdf: bytes, asset: bytes) -> None:
     answers(urdf, asset)

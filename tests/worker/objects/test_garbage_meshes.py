@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.worker.objects.test_formats import FILES
@@ -22,7 +22,6 @@ WORDS = [
     b"{",
     b"[",
 ]
-relaxed = settings(deadline=5000, suppress_health_check=[HealthCheck.too_slow])
 
 
 @st.composite
@@ -45,20 +44,20 @@ def answers(name: str, data: bytes, allow_open: bool) -> None:
         assert report["facts"]["volume_m3"] > 0
 
 
-@settings(relaxed, max_examples=250)
+@settings(max_examples=250)
 @given(mutated(), st.booleans())
 def test_a_damaged_mesh_loads_or_is_refused(file: tuple[str, bytes], allow_open: bool) -> None:
     answers(*file, allow_open)
 
 
-@settings(relaxed, max_examples=100)
+@settings(max_examples=100)
 @given(st.sampled_from(["m.stl", "m.obj", "m.ply", "m.off", "m.glb"]), st.binary(max_size=400))
 def test_noise_is_refused(name: str, data: bytes) -> None:
     assert check_object({name: data}, "m")["verdict"] == "refuse"
 
 
 @pytest.mark.slow
-@settings(relaxed, derandomize=False, max_examples=10_000)
+@settings(derandomize=False, max_examples=10_000)
 @given(mutated(), st.booleans())
 def test_ten_thousand_damaged_meshes_load_or_are_refused(file: tuple[str, bytes], allow_open: bool) -> None:
     answers(*file, allow_open)

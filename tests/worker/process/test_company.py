@@ -26,6 +26,7 @@ from service.store.manifests import shard_exists
 from service.store.records import task_attempts
 from service.store.store import open_store
 from tests.fakes import alike_batches, fake_synthesize, request
+from tests.waiting import PATIENCE_S
 from worker.process.company import Company
 from worker.process.main import run_worker
 from worker.stages.alike import alike
@@ -143,7 +144,7 @@ def test_one_that_is_cancelled_stops_while_the_others_go_on(rq_queue: RqQueue, w
                 stopped.wait(0.01)
             stopped.set()
             context.check()
-        assert stopped.wait(30), "the others are still at work when it stops"
+        assert stopped.wait(PATIENCE_S), "the others are still at work when it stops"
 
     rq_queue.enqueue(tasks, Lane.BULK)
     told = work(Meetings(wait))

@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -172,10 +171,10 @@ def test_a_cancelled_check_ends_its_child(context: TaskContext, monkeypatch: pyt
     def spy(*args: object, **kwargs: object) -> object:
         child = popen(*args, **kwargs)  # type: ignore[call-overload]
         pids.append(child.pid)
+        context.stop(StopReason.CANCELLED)
         return child
 
     monkeypatch.setattr(ingest.subprocess, "Popen", spy)
-    threading.Timer(0.2, context.stop, [StopReason.CANCELLED]).start()
     with pytest.raises(TaskCancelled):
         ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
     assert not Path(f"/proc/{pids[0]}").exists()

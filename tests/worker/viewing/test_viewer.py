@@ -81,7 +81,7 @@ def first(request) -> None:
 
 def test_the_page_is_answered_on_the_loopback(viewer):
     assert viewer.url.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(viewer.url, timeout=10) as answer:
+    with urllib.request.urlopen(viewer.url, timeout=60) as answer:
         assert b"<html" in answer.read().lower()
 
 
@@ -169,7 +169,7 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
         found = re.search(r"http://127\.0\.0\.1:(\d+)$", address.strip())
         assert found, address
         assert f"ssh -L {found[1]}:127.0.0.1:{found[1]}" in forwarding
-        with urllib.request.urlopen(found[0], timeout=10) as answer:
+        with urllib.request.urlopen(found[0], timeout=60) as answer:
             assert answer.status == 200
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0

@@ -32,6 +32,12 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Settings]:
         process.terminate()
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is slow is the machine that the tests run on."""
+    monkeypatch.setattr("service.run.doctor.redis_server._SLOW_S", 60.0)
+
+
 @pytest.fixture
 def client(own: Settings) -> Iterator[Redis]:
     """A client whose changes of the configuration are taken back."""
