@@ -21,18 +21,11 @@ app = typer.Typer(no_args_is_help=True)
 #: Formats of robots and their simulators; the first of them goes by two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 #: Formats that a network is trained on: they take a folder of shards.
-TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen")
+TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-IMPORTS: Final = (
-    "dexgraspbench",
-    "dexlearn",
-    "graspgen",
-    "dexgraspnet",
-    "dexgraspnet2",
-    "multidex",
-    "ddgc",
-    "reference",
-)
+#: Imports of one object, which `--name` names in the file.
+NAMED: Final = ("graspgen", "huggingface", "lerobot")
+IMPORTS: Final = ("dexgraspbench", "dexlearn", *NAMED, "dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference")
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
@@ -64,6 +57,7 @@ def export(
         str | None, typer.Option(help="The hand's root link in the mount: x y z qw qx qy qz.")
     ] = None,
     held_out: Annotated[float, typer.Option(help="For training: share of the objects that are held out.")] = 0.2,
+    noise: Annotated[str, typer.Option(help="For training: a depth camera, stereo or structured_light.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="The folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
@@ -82,7 +76,7 @@ def export(
     elif format_ in TRAINING:
         from worker.files.training_export import TrainingWishes, export_training
 
-        done = export_training(source, format_, TrainingWishes(hand, object_, unjudged, every, held_out), output)
+        done = export_training(source, format_, TrainingWishes(hand, object_, unjudged, every, held_out, noise), output)
         written, notes = done.counts, done.notes
     elif format_ == "webdataset":
         written = _webdataset(source, output, unjudged=unjudged, every=every)
@@ -110,7 +104,7 @@ def import_(
     hand: Annotated[str | None, typer.Option(help="The hand: a URDF or a built-in.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="The object's mesh, at the source's scale 1.")] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
-    name: Annotated[str, typer.Option(help="multidex, graspgen: name of the object in the file.")] = "",
+    name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
     number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: which object of the scene.")] = 0,
     referee: Annotated[str, typer.Option(help="letter, certificate, screen or none.")] = "certificate",
     friction: Annotated[float, typer.Option(help="Coulomb coefficient of the metrics.")] = 1.0,
@@ -151,7 +145,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     Raises:
         InputError: unknown format, something that it needs is not given, or not such a file.
     """
-    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, dexgraspnet2, graspgen, multidex, reference
+    from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, dexgraspnet2, multidex, reference
 
     if format_ not in IMPORTS:
         raise InputError(f"there is no import format {format_!r}; choose one of {', '.join(IMPORTS)}")
@@ -163,8 +157,8 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         raise InputError(f"{format_} files do not hold the hand and the object; name both: --hand and --object")
     if format_ in ("dexgraspbench", "dexlearn"):
         return dexgraspbench.read(source, hand=hand, obj=obj)
-    if format_ == "graspgen":
-        return graspgen.read(source, hand=hand, obj=obj, object_name=str(options["object_name"]))
+    if format_ in NAMED:
+        return _named(format_, source, hand, obj, str(options["object_name"]))
     if format_ == "dexgraspnet":
         return dexgraspnet.read(source, hand=hand, obj=obj)
     if format_ == "dexgraspnet2":
@@ -174,6 +168,13 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     if not options["robot"] or not options["object_name"]:
         raise InputError("a multidex file holds many robots and objects; name one of each: --robot and --name")
     return multidex.read(source, hand=hand, obj=obj, robot=options["robot"], object_name=options["object_name"])
+
+
+def _named(format_: str, source: Path, hand: str, obj: str, name: str) -> list[Any]:
+    from worker.files.exchange import graspgen, huggingface, lerobot_import
+
+    read = {"graspgen": graspgen.read, "huggingface": huggingface.read, "lerobot": lerobot_import.read}[format_]
+    return list(read(source, hand=hand, obj=obj, object_name=name))
 
 
 def _pictures(source: Path, format_: str, depth: str, output: Path) -> dict[str, int]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.readers import Pictures, Shards, open_shards
+from service.readers.depth_noise import noise_of
 from service.store import standing
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
@@ -18,7 +19,7 @@ from worker.files.exchange.imported import plain_name
 from worker.files.exchange.lots import SEEN, Lot, held_out
 from worker.files.exchange.written import Written
 
-FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen")
+FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 
 #: Formats that tell good grasps from bad ones.
 LABELLED: Final = ("graspgen",)
@@ -34,6 +35,8 @@ class TrainingWishes:
     every: bool = False
     held_out: float = 0.2
     """Share of the objects that a network is tested on."""
+    noise: str = ""
+    """Name of a depth camera; nothing: perfect depth."""
 
 
 def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: Path) -> Written:
@@ -42,8 +45,6 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
     Raises:
         InputError: unknown format, no such grasps, a share that is none, or what the format's writer refuses.
     """
-    from worker.files.exchange import dexgraspnet2, dexlearn, graspgen
-
     if format_ not in FORMATS:
         raise InputError(f"there is no training format {format_!r}; choose one of {', '.join(FORMATS)}")
     if not 0 < wishes.held_out < 1:
@@ -51,10 +52,22 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
     shards = open_shards(source)
     lots = _lots(shards, format_, wishes)
     out = held_out({lot.name: lot.obj.digest for lot in lots}, wishes.held_out)
+    return _write(format_, lots, shards, wishes, folder, out)
+
+
+def _write(
+    format_: str, lots: list[Lot], shards: Shards, wishes: TrainingWishes, folder: Path, out: frozenset[str]
+) -> Written:
+    from worker.files.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
+
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
-    writer = dexlearn.write if format_ == "dexlearn" else dexgraspnet2.write
-    return writer(lots, _pictures(shards, wishes), folder, out)
+    columns = SEEN if format_ in ("dexlearn", "dexgraspnet2") else (*SEEN, "image/rgb")
+    pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unjudged=wishes.unjudged)
+    if format_ == "lerobot":
+        return lerobot.write(lots, pictures, folder, out)
+    writer = {"dexlearn": dexlearn.write, "dexgraspnet2": dexgraspnet2.write, "huggingface": huggingface.write}[format_]
+    return writer(lots, pictures, folder, out, noise_of(wishes.noise or None))
 
 
 def _lots(shards: Shards, format_: str, wishes: TrainingWishes) -> list[Lot]:
@@ -74,8 +87,9 @@ def _lots(shards: Shards, format_: str, wishes: TrainingWishes) -> list[Lot]:
         name = plain_name(case.obj.name)
         if digests.setdefault(name, case.obj.digest) != case.obj.digest:
             name = f"{name}-{case.obj.digest[:8]}"
+        verdict = np.asarray(shard.arrays.get("quality/success", np.full(len(mask), -1)), np.int8)
         rows = np.flatnonzero(mask)
-        lots.append(Lot(file.id, name, case.hand, case.obj, case.grasps, rows, _held(shard), shard.arrays, case.placed))
+        lots.append(Lot(file.id, name, case.hand, case.obj, case.grasps, rows, verdict, shard, case.placed))
     if not lots:
         raise refused or InputError("there is no base shard, so there are no grasps")
     return lots
@@ -91,14 +105,3 @@ def _chosen(shard: Shard, format_: str, wishes: TrainingWishes) -> np.ndarray:
             f"{format_} says of each grasp whether it holds; judge them first: graspd synth without --referee none"
         )
     return judged
-
-
-def _held(shard: Shard) -> np.ndarray:
-    judged, valid = standing.judged(shard.arrays), standing.valid(shard.arrays)
-    return np.where(judged, valid, -1).astype(np.int8)
-
-
-def _pictures(shards: Shards, wishes: TrainingWishes) -> Pictures:
-    """The pictures whose grasps are among the shards."""
-    columns = (*SEEN, "camera/eye")
-    return Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unjudged=wishes.unjudged)

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError
 from service.model.transforms import apply, compose, invert, pose_from_matrix, pose_to_matrix
-from service.readers import Pictures
+from service.readers import DepthNoise, Pictures
+from service.readers.cloud_views import CloudView
 from worker.files.exchange.archives import load_npz
 from worker.files.exchange.imported import Imported, completed, joints_by_name, plain_name
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
@@ -59,7 +60,9 @@ _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
 _LARGEST_META: Final = 64 * 2**10
 
 
-def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str]) -> Written:
+def write(
+    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> Written:
     """Write each scene that has pictures and grasps.
 
     Args:
@@ -67,6 +70,7 @@ def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[
         pictures: of the scenes.
         folder: stands for a checkout; made if absent.
         out: objects that are held out.
+        noise: depth camera whose depth is written; None: perfect depth.
 
     Returns:
         numbers of grasps, scenes, views and files of grasps.
@@ -88,7 +92,7 @@ def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[
     for some in scenes:
         lot = known[some[0].base]
         name = f"scene_{next(numbers[lot.name in out]):04}"
-        _write_scene(some[:VIEWS], pictures, top / "scenes" / name / CAMERA)
+        _write_scene(some[:VIEWS], pictures, top / "scenes" / name / CAMERA, noise)
         _write_grasps(some[0], lot, top / "dex_grasps_new" / name / plain_name(lot.hand.name))
         done.counts["grasps"] += len(some[0].rows)
         done.counts["views"] += min(len(some), VIEWS)
@@ -107,7 +111,7 @@ def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, Lot], out: f
     return islice(room, count)
 
 
-def _write_scene(some: list[Look], pictures: Pictures, path: Path) -> None:
+def _write_scene(some: list[Look], pictures: Pictures, path: Path, noise: DepthNoise | None) -> None:
     for part in ("depth_gt", "label_gt", "meta"):
         (path / part).mkdir(parents=True)
     first = invert(pose_from_matrix(some[0].extrinsics))
@@ -116,8 +120,8 @@ def _write_scene(some: list[Look], pictures: Pictures, path: Path) -> None:
     np.save(path / "camera_poses.npy", np.array([poses[view % len(some)] for view in range(VIEWS)]))
     for view, look in enumerate(some):
         sample = pictures[look.index]
-        depth = np.asarray(sample["image/depth"], float) * FACTOR
-        steps = np.where(depth < np.iinfo(np.uint16).max + 0.5, np.rint(depth), 0)
+        steps = CloudView.of(sample, noise, np.random.default_rng(look.index)).seen * FACTOR
+        steps = np.where(steps < np.iinfo(np.uint16).max + 0.5, np.rint(steps), 0)
         export_png(path / "depth_gt" / f"{view:04}.png", steps.astype(np.uint16))
         labels = np.maximum(np.asarray(sample["image/segmentation"], int) - (OBJECT - 1), 0)
         export_png(path / "label_gt" / f"{view:04}.png", labels.astype(np.uint8))
@@ -163,7 +167,7 @@ def _write_grasps(look: Look, lot: Lot, folder: Path) -> None:
         f"{name}_qpos": np.concatenate([placed[name], some[name].joint_positions], axis=1)
         for name in ("pregrasp", "squeeze")
     }
-    arrays |= {"success": lot.held[look.rows], "row": look.rows}
+    arrays |= {"success": lot.verdict[look.rows], "row": look.rows}
     folder.mkdir(parents=True)
     np.savez_compressed(folder / f"{lot.name}.npz", **arrays)
 

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
-from service.model.transforms import IDENTITY_POSE, apply, invert, pose_from_matrix
-from service.readers import Pictures
+from service.model.transforms import IDENTITY_POSE, apply, invert
+from service.readers import DepthNoise, Pictures
 from worker.files.exchange.bench_mapping import COLLECTED, HandMapping
 from worker.files.exchange.bench_object import SET, write_object, write_table
 from worker.files.exchange.bench_scene import TABLETOP, check_table
@@ -42,7 +42,9 @@ POINTS: Final = 1024
 _FREE: Final = -1
 
 
-def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str]) -> Written:
+def write(
+    lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+) -> Written:
     """Write grasps and what their cameras see.
 
     Args:
@@ -50,6 +52,7 @@ def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[
         pictures: of their scenes; may be none.
         folder: stands for a checkout of DexLearn.
         out: objects that are held out.
+        noise: depth camera whose clouds are written; None: perfect depth.
 
     Returns:
         numbers of grasps, scenes, clouds and files.
@@ -64,7 +67,7 @@ def write(lots: Sequence[Lot], pictures: Pictures, folder: Path, out: frozenset[
         if lot.placed is not None:
             check_table(lot.placed)
     scenes = _scenes(lots, folder)
-    clouds, bare = _clouds(pictures, lots, scenes, folder)
+    clouds, bare = _clouds(pictures, lots, scenes, folder, noise)
     done = Written({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
     if not clouds:
         done.notes.append("there are no pictures, so no clouds: put views beside the grasps (graspd render) to train")
@@ -101,13 +104,15 @@ def _scenes(lots: Sequence[Lot], folder: Path) -> _Scenes:
     return scenes
 
 
-def _clouds(pictures: Pictures, lots: Sequence[Lot], scenes: _Scenes, folder: Path) -> tuple[int, int]:
+def _clouds(
+    pictures: Pictures, lots: Sequence[Lot], scenes: _Scenes, folder: Path, noise: DepthNoise | None
+) -> tuple[int, int]:
     """Write what each picture shows of its object; the numbers of clouds, and of scenes that are left without."""
     on_table = {lot.id: lot.placed is not None for lot in lots}
     written: dict[Path, int] = {}
     for look in looks(pictures):
         scene = scenes.get((look.base, look.scene if on_table.get(look.base) else _FREE))
-        if scene is None or not len(points := _points(pictures, look, on_table=on_table[look.base])):
+        if scene is None or not len(points := _points(pictures, look, noise, on_table=on_table[look.base])):
             continue
         number = written[scene] = written.get(scene, -1) + 1
         place = folder / VISION / _scene_id(scene)
@@ -120,8 +125,8 @@ def _clouds(pictures: Pictures, lots: Sequence[Lot], scenes: _Scenes, folder: Pa
     return sum(number + 1 for number in written.values()), len(bare)
 
 
-def _points(pictures: Pictures, look: Look, *, on_table: bool) -> Floats:
-    points = apply(invert(pose_from_matrix(look.extrinsics)), object_points(pictures[look.index]))
+def _points(pictures: Pictures, look: Look, noise: DepthNoise | None, *, on_table: bool) -> Floats:
+    points = object_points(pictures[look.index], look.index, noise)
     return points if on_table else apply(invert(look.object_pose), points)
 
 
@@ -162,7 +167,7 @@ def _rows_of(lot: Lot, scenes: _Scenes, folder: Path, *, seen: bool) -> Iterator
     """The lot's rows by the file of their scene and their type; without those of scenes that nobody sees, where others
     are seen."""
     index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
-    types = np.asarray(lot.columns.get("quality/grasp_type", np.zeros(len(index))), np.intp)
+    types = np.asarray(lot.shard.arrays.get("quality/grasp_type", np.zeros(len(index))), np.intp)
     for scene in sorted({int(index[row]) for row in lot.rows}):
         path = scenes[lot.id, scene]
         if seen and not (folder / path).is_file():
@@ -195,7 +200,7 @@ def _record(mapping: HandMapping, lot: Lot, rows: NDArray[np.intp], scene: Path)
     record |= {f"{name}_qpos": np.array([one[f"{name}_qpos"] for one in each]) for name in POSTURES}
     # Not read by DexLearn: what brings the grasps back as they were.
     record["obj_pose"] = np.array([IDENTITY_POSE if pose is None else pose for pose in poses])
-    return record | {"succ_flag": lot.held[rows], "row": np.asarray(rows)}
+    return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 
 
 def _save(file: Path, record: dict[str, Any]) -> None:

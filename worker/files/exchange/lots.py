@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.transforms import compose, invert, pose_from_matrix
-from service.readers import Pictures
+from service.readers import DepthNoise, Pictures
+from service.readers.cloud_views import COLUMNS, CloudView
+from service.store.shards import Shard
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
-from worker.rendering.annotate import OBJECT
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
-#: Columns that tell where a camera stands and what it sees.
-CAMERA: Final = ("camera/intrinsics", "camera/extrinsics")
-SEEN: Final = (*CAMERA, "image/depth", "image/segmentation")
+#: Columns of a picture that writers of clouds and depth take.
+SEEN: Final = (*COLUMNS, "camera/eye")
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,9 @@ class Lot:
     grasps: GraspSet
     rows: NDArray[np.intp]
     """Rows that go into the export."""
-    held: NDArray[np.int8]
-    """(N,) verdict on every grasp: 1 valid, 0 not, -1 nobody judged."""
-    columns: Mapping[str, NDArray[Any]]
-    """Of the shard."""
+    verdict: NDArray[np.int8]
+    """(N,) of the referee on every grasp: 1 held, 0 dropped, -1 nobody judged."""
+    shard: Shard
     placed: Placed | None = None
 
     @property
@@ -99,13 +98,10 @@ def looks(pictures: Pictures) -> Iterator[Look]:
 RIGHT: Final = 2
 
 
-def object_points(sample: Mapping[str, Any]) -> Floats:
-    """(P, 3) what a picture shows of the object, in the camera's frame [m]."""
-    depth = np.asarray(sample["image/depth"], float)
-    v, u = np.nonzero((np.asarray(sample["image/segmentation"]) == OBJECT) & np.isfinite(depth))
-    k, z = np.asarray(sample["camera/intrinsics"], float), depth[v, u]
-    # Pixel centres stand at +0.5.
-    return np.stack([(u + 0.5 - k[0, 2]) / k[0, 0] * z, (v + 0.5 - k[1, 2]) / k[1, 1] * z, z], axis=1)
+def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | None) -> Floats:
+    """(P, 3) what a picture shows of the object, in the table's frame [m]; its number decides the noise."""
+    view = CloudView.of(sample, noise, np.random.default_rng(index))
+    return view.points(*view.pixels(whole=False))
 
 
 def by_scene(found: Sequence[Look]) -> dict[tuple[str, int], list[Look]]:

@@ -1,0 +1,85 @@
+"""Parquet files through pyarrow, which is there where a user put it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from service.model.errors import InputError
+
+#: Most that a file of others may unpack to, by its own account [bytes].
+LARGEST: Final = 2**31
+#: What Hugging Face's readers make pictures of: bytes of a file, and where it was.
+IMAGE: Final = "image"
+
+
+def arrow() -> Any:
+    """The package pyarrow.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ModuleNotFoundError:
+        raise InputError("Parquet files need pyarrow; install it: pip install 'graspd[parquet]'") from None
+    return pyarrow
+
+
+def type_of(name: str) -> Any:
+    """Arrow's type of a word: `image`, `text`, a NumPy type; with [n] behind it a list of n, with [] of any number."""
+    pa = arrow()
+    if name.endswith("]"):
+        inner, _, size = name[:-1].rpartition("[")
+        return pa.list_(type_of(inner), int(size)) if size else pa.list_(type_of(inner))
+    if name == IMAGE:
+        return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    return pa.string() if name == "text" else getattr(pa, name)()
+
+
+def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None) -> Any:
+    """A schema of columns by the words of `type_of`, which tells Hugging Face's readers which of them are pictures."""
+    pa = arrow()
+    pictures = {name: {"_type": "Image"} for name, word in columns.items() if word == IMAGE}
+    told = {"huggingface": json.dumps({"info": {"features": pictures}})} if pictures else {}
+    return pa.schema([(name, type_of(word)) for name, word in columns.items()], metadata=told | dict(also or {}))
+
+
+def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]) -> int:
+    """Write rows, each group of them as one row group.
+
+    Returns:
+        number of rows.
+    """
+    pa = arrow()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    count = 0
+    with pa.parquet.ParquetWriter(file, schema, compression="zstd") as out:
+        for rows in groups:
+            out.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=schema))
+            count += len(rows)
+    return count
+
+
+def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
+    """Columns of a file, those of the wanted ones that it has.
+
+    Raises:
+        InputError: pyarrow is absent, no Parquet file, or these columns unpack to more than `LARGEST`.
+    """
+    pa = arrow()
+    try:
+        with pa.parquet.ParquetFile(file) as found:
+            names = [name for name in wanted if name in found.schema_arrow.names]
+            said = found.metadata
+            size = sum(said.row_group(k).total_byte_size for k in range(said.num_row_groups))
+            if size > LARGEST:
+                raise InputError(
+                    f"{file} unpacks to {size >> 20} MiB; split it into files of less than {LARGEST >> 20}"
+                )
+            return dict(found.read(columns=names).to_pydict())
+    except (OSError, pa.ArrowException, MemoryError) as error:
+        raise InputError(f"{file} is no Parquet file that can be read: {error}") from None
