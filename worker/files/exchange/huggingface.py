@@ -112,7 +112,7 @@ def _grasps(lot: Lot) -> list[dict[str, Any]]:
             "joint_names": list(lot.hand.joint_names), "verdict": int(lot.verdict[row]),
             "verdict_level": str(said.get("verdict_level", "none")),
             "epsilon": float(np.asarray(arrays["quality/epsilon"], float)[row, at]),
-            "penetration_depth_mm": float(arrays["quality/penetration_depth_mm"][row]),  # type: ignore[arg-type]
+            "penetration_depth_mm": float(arrays["quality/penetration_depth_mm"][row]),
             "grasp_type": int(types[row]), "scene_kind": kind, "scene": -1, "object_pose": IDENTITY_POSE.tolist(),
         }  # fmt: skip
         if lot.placed is not None:

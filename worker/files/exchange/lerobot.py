@@ -149,7 +149,7 @@ class _Writer:
         self._size = colour.shape
         picture, number, count = png(colour), len(self.episodes), len(way) - 1
         rest = look.object_pose.astype(np.float32)
-        numbers = {
+        numbers: dict[str, NDArray[Any]] = {
             "timestamp": (np.arange(count) / FPS).astype(np.float32), "frame_index": np.arange(count),
             EPISODE: np.full(count, number), "index": self.frames + np.arange(count),
             "task_index": np.full(count, self.tasks[lot.name]),
