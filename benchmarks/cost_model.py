@@ -43,6 +43,8 @@ class Work:
     """Pictures of a placement: 2 is stereo."""
     job: int = 3200
     """Grasps of a job."""
+    pack: int = 1
+    """Base shards that are put as one object."""
 
     @property
     def batches(self) -> int:
@@ -156,8 +158,9 @@ def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker
     tasks = work.batches * work.stages
     jobs = math.ceil(work.grasps / work.job)
     rate = tasks / seconds
-    # A shard and its manifest for each task, a record for each job.
-    objects = 2 * tasks + jobs
+    # A shard and its manifest for each task, or a pack for several batches; a record for each job.
+    base = 2 * work.batches if work.pack == 1 else math.ceil(work.batches / work.pack)
+    objects = base + 2 * (tasks - work.batches) + jobs
     size = (
         work.grasps * measured.base_bytes_per_grasp
         + scenes * measured.scene_bytes

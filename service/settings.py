@@ -76,6 +76,9 @@ class Settings(BaseSettings):
         pattern=r"^(auto|[1-9][0-9]{0,3})$",
         description="batches of one pair that a worker plans in one launch; auto: what fills its GPU, on a CPU 1",
     )
+    shard_pack: int = Field(
+        8, ge=0, description="so many shards of a worker that end together are put as one object; 0: each by itself"
+    )
     lease_s: float = Field(6.0, gt=0.5, description="a worker silent for this long has lost its task [s]")
     keeper_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the keeper [s]")
     keeper_name: str | None = Field(

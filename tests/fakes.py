@@ -19,8 +19,10 @@ from service.model.domain import AssetKind, JobRequest, Lane, Stage, TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.pipeline.backends import Parts
+from service.store import packs
 from service.store.library import publish_asset
 from service.store.manifests import ShardManifest, publish_shard
+from service.store.packs import find_manifest
 from service.store.store import Store
 from worker.process.selfcheck import EngineError
 from worker.stages.context import TaskContext
@@ -67,7 +69,8 @@ def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
     if message.request.in_scene:
         rows = 0
     else:
-        assert context.store.exists(names.shard_manifest(Stage.SYNTHESIZE, message.inputs[0]))
+        pair = (message.hand_digest, message.object_digest)
+        assert find_manifest(context.store, Stage.SYNTHESIZE, message.inputs[0], pair) is not None
     return Output(
         {
             "scene/object_pose": np.repeat(_POSE, scenes, axis=0),
@@ -139,12 +142,31 @@ def _pretend_to_work(context: TaskContext) -> None:
         time.sleep(0.01)
 
 
+def _die_after_a_pack(once: Path) -> None:
+    """Let this worker wait long for the shards of a pack, and be killed when it has put it, if no other one was."""
+    from service.queue.rq_queue import RqQueue
+    from worker.process import surroundings
+    from worker.stages import packing
+
+    def put_pack(*shards: Any) -> str:
+        key = packs.put_pack(*shards)
+        if not once.exists():
+            once.write_text(key)
+            os.kill(os.getpid(), 9)
+        return key
+
+    surroundings.WAIT_S, packing.put_pack = 600.0, put_pack  # type: ignore[misc]
+    # A keeper that is slow to say that it reads packs does so all the same.
+    RqQueue.announced = lambda *_: True  # type: ignore[method-assign]
+
+
 def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
     FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
     long each task holds the interpreter lock; while there is a file FAKE_HOLD no task ends, and while there is a file
-    FAKE_BROKEN nothing works. Of the options of `graspd worker` it takes `--burst` and `--idle`.
+    FAKE_BROKEN nothing works. With FAKE_PACKED the worker that puts the first pack is killed at once; a file of that
+    name says so. Of the options of `graspd worker` it takes `--burst` and `--idle`.
     """
     from service.cli import log_to_stderr
     from service.settings import Settings
@@ -171,6 +193,8 @@ def main() -> None:
         leaked.append(os.urandom(2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 
+    if once := os.environ.get("FAKE_PACKED"):
+        _die_after_a_pack(Path(once))
     options = argparse.ArgumentParser()
     options.add_argument("--burst", action="store_true")
     options.add_argument("--idle", type=int, default=0)

@@ -23,7 +23,7 @@ from service.model.domain import (
     TaskMessage,
 )
 from service.model.records import JobRecord
-from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, TASK_SCHEMA
+from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, SCHEMA_OF_PACKS, TASK_SCHEMA
 
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
@@ -100,10 +100,12 @@ def plan(job: JobRecord) -> Iterator[PlannedTask]:
             inputs = (output,)
 
 
-def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
-    """What a worker is told."""
+def message_of(
+    job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int, packed: bool = False
+) -> TaskMessage:
+    """What a worker is told; `packed` says that a shard it reads lies in a pack."""
     return TaskMessage(
-        schema_=needed_schema(job.request),
+        schema_=max(needed_schema(job.request), SCHEMA_OF_PACKS if packed else 0),
         newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,

@@ -12,7 +12,7 @@ from typing import Final
 
 from service.model.clock import timestamp
 from service.model.domain import AssetKind, Stage, State
-from service.model.errors import InputError, StoreUnavailable, UnavailableError
+from service.model.errors import DamagedError, InputError, StoreUnavailable, UnavailableError
 from service.model.names import attempt as attempt_key
 from service.model.planning import backoff
 from service.model.records import AttemptRecord
@@ -21,6 +21,7 @@ from service.pipeline.tally import Tally
 from service.queue.port import Event, EventKind
 from service.store.library import load_asset, load_check
 from service.store.manifests import ShardManifest, load_manifest
+from service.store.packs import pack_at, read_manifests
 from service.store.records import read_record
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,9 @@ class Indexer:
             if event.kind is EventKind.STARTED:
                 if event.stage is not Stage.INGEST:
                     started[event.task_id] = event.worker
-            elif event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST):
+            elif event.kind is EventKind.PACKED or (
+                event.kind is EventKind.FINISHED and event.stage not in (None, Stage.INGEST)
+            ):
                 finished.append(place)
             elif event.kind is EventKind.LEFT:
                 left.append(event.worker)
@@ -85,25 +88,30 @@ class Indexer:
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
         """Index what was made; returns the places of the events whose manifests the store does not give."""
-        made, waiting = [], []
+        made, waiting = list[ShardManifest](), []
         for place, found in zip(places, self._readers.map(self._load, (events[at] for at in places)), strict=True):
-            if isinstance(found, ShardManifest):
+            if isinstance(found, list):
                 self._deferrals.pop(events[place].task_id, None)
-                made.append(found)
+                made += found
             elif isinstance(found, StoreUnavailable):
                 waiting.append(place)
             else:
-                log.error("event finished of task %s is left out", events[place].task_id, exc_info=found)
+                what = events[place].pack or f"task {events[place].task_id}"
+                log.error("event %s of %s is left out", events[place].kind, what, exc_info=found)
         if waiting:
             log.warning("the store does not answer, and %d events wait for it", len(waiting))
-        self._index(made)
+        for first in range(0, len(made), _SHARDS_AT_ONCE):
+            self._index(made[first : first + _SHARDS_AT_ONCE])
         return waiting
 
-    def _load(self, event: Event) -> ShardManifest | Exception:
-        """The manifest of what was made. Many are read at once: most of the time the store is waited for."""
-        assert event.stage is not None
+    def _load(self, event: Event) -> list[ShardManifest] | Exception:
+        """The manifests of what was made. Many are read at once: most of the time the store is waited for."""
+        store = self._parts.store
         try:
-            return load_manifest(self._parts.store, event.stage, event.output)
+            if event.kind is EventKind.PACKED:
+                return _readable(read_manifests(store, pack_at(store, event.pack)))
+            assert event.stage is not None
+            return [load_manifest(store, event.stage, event.output)]
         except Exception as error:
             return error
 
@@ -138,15 +146,10 @@ class Indexer:
         while len(self._told) > _REMEMBERED_JOBS:
             self._told.popitem(last=False)
 
-    def finished(self, stage: Stage, output: str) -> None:
-        """Index a shard, or what the check of an asset found."""
-        if stage is Stage.INGEST:
-            kind, _, digest = output.partition("/")
-            self.checked(AssetKind(kind), digest)
-        else:
-            manifest = load_manifest(self._parts.store, stage, output)
-            self.tell(self._parts.index.write.add_manifest(manifest))
-            self._tally.made([manifest])
+    def made(self, manifest: ShardManifest) -> None:
+        """Index a shard."""
+        self.tell(self._parts.index.write.add_manifest(manifest))
+        self._tally.made([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
         """Index a hand or object as the store has it now."""
@@ -185,7 +188,8 @@ class Indexer:
 
     def _take_up(self, event: Event) -> None:
         if event.kind is EventKind.FINISHED:
-            self.finished(Stage.INGEST, event.output)
+            kind, _, digest = event.output.partition("/")
+            self.checked(AssetKind(kind), digest)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._parts.store, attempt_key(event.task_id, event.attempt)))
         elif event.kind is EventKind.DEFERRED:
@@ -206,6 +210,14 @@ class Indexer:
             self._parts.index.live.set_asset_waiting([digest], queued=False, not_before=not_before)
         else:
             self.tell(self._parts.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
+
+
+def _readable(found: Sequence[ShardManifest | DamagedError]) -> list[ShardManifest]:
+    """What is not damaged; the task of what is turns up missing, and fails."""
+    for one in found:
+        if isinstance(one, DamagedError):
+            log.error("%s", one)
+    return [one for one in found if isinstance(one, ShardManifest)]
 
 
 @contextmanager

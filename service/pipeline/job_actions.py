@@ -173,9 +173,10 @@ def queue_tasks(parts: Parts, ready: Sequence[ReadyTask], *, routes: Routes, aga
     """
     to_queue: dict[tuple[Lane, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
+    packed = parts.index.shards.packed([shard for task in ready for shard in task.task.inputs])
     for task in ready:
         attempts = {"attempt": task.last_attempt + 1, "max_attempt": task.retried_upto + parts.settings.task_attempts}
-        message = message_of(task.job, task.task, **attempts)
+        message = message_of(task.job, task.task, **attempts, packed=not packed.isdisjoint(task.task.inputs))
         place = routes.place(need_of(message))
         if place.held:
             held[place.held].append(task.task.id)

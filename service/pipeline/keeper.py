@@ -39,7 +39,7 @@ from service.pipeline.routes import Routes
 from service.pipeline.scrubber import Scrubber
 from service.pipeline.sharing import PART
 from service.pipeline.sweeper import Sweeper
-from service.queue.port import Event, EventKind, part_of
+from service.queue.port import READS_PACKS, Event, EventKind, part_of
 from service.store.library import publish_builtins, stored_assets
 
 log = logging.getLogger(__name__)
@@ -261,8 +261,9 @@ class Keeper:
         return [(event_id, event) for event_id, event in found if shards.has(event.job_id)]
 
     def _announce(self) -> None:
-        for shard in self._shards.held:
-            self._parts.queue.announce(part_of(PART, shard), 5 * self._parts.settings.keeper_interval_s + 5)
+        seconds = 5 * self._parts.settings.keeper_interval_s + 5
+        for part in (READS_PACKS, *(part_of(PART, shard) for shard in self._shards.held)):
+            self._parts.queue.announce(part, seconds)
 
     def _look_after_queue(self) -> None:
         # While Redis can be read but not written, as on a full disk, no worker can give a sign of life: then this fails

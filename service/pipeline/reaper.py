@@ -19,7 +19,7 @@ from service.model.records import AttemptRecord
 from service.pipeline.backends import Parts
 from service.pipeline.indexer import Indexer
 from service.queue.port import Holder, Lease
-from service.store.manifests import shard_exists
+from service.store.packs import Finder
 from service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
@@ -86,10 +86,9 @@ class Reaper:
 
     def _recover(self, missing: list[str]) -> None:
         """Make good a lost event from the store; what the store knows nothing of is queued again."""
-        again = []
-        for task, (stage, shard) in self._parts.index.feed.outputs(missing).items():
-            if shard_exists(self._parts.store, Stage(stage), shard):
-                self._find(task, Stage(stage), shard)
+        again, finder = [], Finder(self._parts.store)
+        for task, (stage, shard, pair) in self._parts.index.feed.outputs(missing).items():
+            if self._find(task, Stage(stage), shard, pair, finder):
                 continue
             known = self._parts.index.jobs.task(task).attempt
             try:
@@ -105,12 +104,19 @@ class Reaper:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
             self._indexer.tell(self._parts.index.live.set_waiting(again))
 
-    def _find(self, task_id: str, stage: Stage, shard: str) -> None:
-        """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again."""
+    def _find(self, task_id: str, stage: Stage, shard: str, pair: tuple[str, str], finder: Finder) -> bool:
+        """Index a shard that is there; one whose manifest is damaged fails its task, since it cannot be made again.
+
+        Returns:
+            whether it is there.
+        """
         try:
-            self._indexer.finished(stage, shard)
+            if (made := finder.manifest(stage, shard, pair)) is None:
+                return False
+            self._indexer.made(made)
         except DamagedError as error:
             self._fail(task_id, stage, error)
+        return True
 
     def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
         """End a task that a damaged record stands in the way of."""
@@ -154,8 +160,8 @@ class Reaper:
         self._parts.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
-        if shard_exists(self._parts.store, message.stage, message.output):
-            self._find(message.task_id, message.stage, message.output)
+        pair = (message.hand_digest, message.object_digest)
+        if self._find(message.task_id, message.stage, message.output, pair, Finder(self._parts.store)):
             return
         attempt = AttemptRecord(
             task_id=message.task_id,

@@ -14,6 +14,7 @@ from service.model.records import JobRecord
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Parts
 from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
+from service.pipeline.unpacking import unpack
 from service.store.records import read_record, task_attempts
 
 
@@ -44,6 +45,8 @@ def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
     if one.what == FOREIGN:
         parts.store.set_aside(one.key)
         return ""
+    if one.key.startswith(f"{names.PACKS}/") and one.key.endswith(".pack"):
+        return _take_apart(parts, one.key)
     if not one.shard:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
@@ -60,10 +63,28 @@ def _mend(parts: Parts, one: Damage, harmed: set[str]) -> str:
         return "its input is made again first; run it again when that is done"
     if one.what != MISSING:
         _clear(parts, one, stage)
-    number = len(task_attempts(parts.store, task.id)) + 1
-    message = message_of(job, task, attempt=number, max_attempt=number)
-    parts.queue.enqueue([message], Lane.BULK, again=True)
+    _queue(parts, job, task)
     return ""
+
+
+def _take_apart(parts: Parts, pack: str) -> str:
+    """Give each shard of a damaged pack its own file, and queue what is harmed; why some of it cannot be made again."""
+    harmed = unpack(parts, pack)
+    lost = []
+    for stage, shard in harmed:
+        planned = _planned(parts, stage, shard)
+        if isinstance(planned, str):
+            lost.append(f"{shard} of it: {planned}")
+        else:
+            _queue(parts, *planned)
+    return "; ".join(lost)
+
+
+def _queue(parts: Parts, job: JobRecord, task: PlannedTask) -> None:
+    number = len(task_attempts(parts.store, task.id)) + 1
+    packed = bool(parts.index.shards.packed(task.inputs))
+    message = message_of(job, task, attempt=number, max_attempt=number, packed=packed)
+    parts.queue.enqueue([message], Lane.BULK, again=True)
 
 
 def _clear(parts: Parts, one: Damage, stage: Stage) -> None:

@@ -17,6 +17,7 @@ from service.model.domain import Asset, Stage
 from service.model.errors import DamagedError, NotFoundError
 from service.model.records import AttemptRecord, JobEvent, JobRecord
 from service.store.manifests import ShardManifest
+from service.store.packs import DeadShards, pack_at, read_manifests
 from service.store.records import parse_record
 from service.store.store import Store
 
@@ -30,9 +31,13 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"datasets/[^/]+/events/[^/]+\.json", DatasetEvent),
     (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
     (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
+    (r"packs/[0-9a-f]{32}/[0-9a-f]{32}\.dead/[0-9a-f]{32}\.json", DeadShards),
 )
-FOLDERS: Final = (names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS)
+FOLDERS: Final = (
+    names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.PACKS
+)  # fmt: skip
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
+_PACK: Final = re.compile(r"packs/[0-9a-f]{32}/[0-9a-f]{32}\.pack")
 STAGES: Final[dict[str, Stage]] = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 MISSING: Final = "its file is gone"
@@ -67,14 +72,16 @@ def is_on_its_way(store: Store, one: Damage) -> bool:
 
 def is_checked(key: str) -> bool:
     """Whether `examine` knows what an object of this name must hold."""
-    return key.startswith(f"{names.SHARDS}/") or any(re.fullmatch(pattern, key) for pattern, _ in _RECORDS)
+    return key.startswith((f"{names.SHARDS}/", f"{names.PACKS}/")) or _model_of(key) is not None
 
 
 def examine(store: Store, key: str, *, read: Read = lambda size: None) -> Damage | None:
     """What is wrong with one object; of a shard, its file is examined with its manifest."""
     try:
-        if not key.startswith(f"{names.SHARDS}/"):
-            return _record(store, key)
+        if (model := _model_of(key)) is not None:
+            return _record(store, key, model)
+        if _PACK.fullmatch(key):
+            return _pack(store, key, read)
         if (match := _SHARD.fullmatch(key)) is None:
             return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
@@ -88,8 +95,29 @@ def examine(store: Store, key: str, *, read: Read = lambda size: None) -> Damage
         return None  # removed since it was listed
 
 
-def _record(store: Store, key: str) -> Damage | None:
-    model = next(model for pattern, model in _RECORDS if re.fullmatch(pattern, key))
+def _model_of(key: str) -> type[Any] | None:
+    """What the record of this name must hold; None for what is no record."""
+    return next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
+
+
+def _pack(store: Store, key: str, read: Read) -> Damage | None:
+    """Directory, manifests and files of those shards of a pack that are there."""
+    try:
+        pack = pack_at(store, key, anew=True)
+    except DamagedError as error:
+        return Damage(key, str(error))
+    harmed = []
+    for shard, made in zip(pack.living, read_manifests(store, pack), strict=True):
+        digest = hashlib.sha256()
+        for chunk in store.stream(pack.place(shard)):
+            digest.update(chunk)
+            read(len(chunk))
+        if isinstance(made, DamagedError) or digest.hexdigest() != shard.sha256:
+            harmed.append(shard.id)
+    return Damage(key, f"{len(harmed)} of its {len(pack.shards)} shards: {', '.join(harmed)}") if harmed else None
+
+
+def _record(store: Store, key: str, model: type[Any]) -> Damage | None:
     try:
         parse_record(model, store.get(key), key)
     except (DamagedError, ValidationError) as error:

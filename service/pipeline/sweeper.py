@@ -15,6 +15,7 @@ from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.planning import plan
 from service.pipeline.backends import Parts
 from service.pipeline.deletion import delete_job
+from service.pipeline.pack_removal import remove_packed
 from service.store.datasets import load_dataset
 from service.store.deletions import Deletion, Released, released_key
 from service.store.records import put_record, read_record
@@ -72,6 +73,8 @@ class Sweeper:
                 if self._clock() > deadline:
                     return True
                 self._remove_shard(stage, shard)
+            if not remove_packed(self._parts, released.job, lambda: self._clock() > deadline):
+                return True
             self._parts.store.delete(entry.key)
         return False
 

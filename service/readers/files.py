@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Final
 
 from service.model import names
-from service.model.errors import InputError, NotFoundError
+from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.planning import plan
 from service.model.records import JobRecord
 from service.readers.cache import DEFAULT_BYTES, ShardCache
 from service.store.datasets import newest_snapshot
 from service.store.integrity import check_file
-from service.store.manifests import load_manifest, shard_exists
+from service.store.packs import Finder
+from service.store.parts import is_part
 from service.store.records import read_record
 from service.store.shards import ShardKind, kind_of, open_shard
 from service.store.store import Store, open_store
@@ -86,7 +87,13 @@ class Shards:
             check_file(file.path)
             return file.path
         assert self.store is not None and self.cache is not None, "a shard without a path comes from a store"
-        return self.cache.fetch(self.store, file.key, file.sha256)
+        try:
+            return self.cache.fetch(self.store, file.key, file.sha256)
+        except DamagedShard:
+            # A damaged pack is mended by taking it apart, and a snapshot goes on to name its place there.
+            if not is_part(file.key):
+                raise
+            return self.cache.fetch(self.store, names.shard_file(_STAGES[file.kind], file.id), file.sha256)
 
 
 def open_shards(
@@ -153,9 +160,10 @@ def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str 
 
 def _of_job(store: Store, job: str) -> Iterator[ShardFile]:
     record = read_record(JobRecord, store, names.job_record(job))
+    finder = Finder(store)
     for task in plan(record):
-        if shard_exists(store, task.stage, task.output):
-            made = load_manifest(store, task.stage, task.output)
+        made = finder.manifest(task.stage, task.output, (record.hand_digest, record.object_digest))
+        if made is not None:
             yield ShardFile(
                 made.shard_id, made.kind, made.hand, made.object, made.batch, key=made.key, sha256=made.sha256
             )

@@ -135,7 +135,9 @@ def rebuild(
     try:
         found = differences(index, store)
         if check:
-            found += [f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS) if wrong is not None]
+            found += [
+                f"{wrong.key}: {wrong.what}" for _, wrong in scan(store, names.SHARDS, names.PACKS) if wrong is not None
+            ]
         counts: dict[str, int] = {} if check else make(index, store)
     except IndexDamaged:
         if check:

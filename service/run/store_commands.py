@@ -38,17 +38,22 @@ def verify(
     from service.pipeline.repair import repair as mend
     from service.pipeline.scrub import MISSING, scan
     from service.pipeline.scrubber import Turn
+    from service.store.packs import pack_at
 
     parts = Parts.open(load_settings(data_dir=data_dir))
     turn = Turn(parts, is_keeper=False)
     try:
         if not turn.is_mine():
             raise ConflictError("another `graspd store verify` reads this store; wait until it is done")
-        shards, found = 0, []
+        shards, unused, found = 0, 0, []
         for key, wrong in scan(parts.store, read=lambda size: turn.keep()):
             turn.keep()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
+            if key.endswith(".pack") and wrong is None:
+                pack = pack_at(parts.store, key)
+                shards += len(pack.living)
+                unused += sum(shard.length for shard in pack.shards if shard.id in pack.dead)
         parts.index.damage.replace(found)
         repaired, left = mend(parts, found) if repair else ([], found)
     finally:
@@ -59,6 +64,7 @@ def verify(
         emit(
             {
                 "shards": shards,
+                "unused_bytes": unused,
                 "damaged": [one for one in damaged if one["what"] != MISSING],
                 "missing": [one.shard for one in found if one.what == MISSING],
                 "repaired": [one.shard or one.key for one in repaired],
@@ -70,6 +76,7 @@ def verify(
             typer.echo(f"{one.key}: {one.what}; moved aside, and made again if a job needs it")
         for one in left:
             typer.echo(f"{one.key}: {one.what}")
-        typer.echo(f"{shards} shards, {len(found)} damaged or missing", err=True)
+        more = f", {unused} bytes in packs that no job needs any more" if unused else ""
+        typer.echo(f"{shards} shards, {len(found)} damaged or missing{more}", err=True)
     if left:
         raise typer.Exit(1)

@@ -19,7 +19,7 @@ from service.store.store import Stamp, Store
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
-_MEND: Final = "`graspd store verify --repair` makes it again where that is possible"
+MEND: Final = "`graspd store verify --repair` makes it again where that is possible"
 #: Bits may rot without a new time of change, so that what was found intact is not believed for ever [s].
 _BELIEVED_S: Final = 3600.0
 _REMEMBERED: Final = 100_000
@@ -43,12 +43,12 @@ def read_checked(store: Store, key: str, sha256: str) -> bytes:
 def check_digest(name: str, found: str, expected: str) -> None:
     """DamagedShard, with the shard's name, where the checksums differ."""
     if found != expected:
-        raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {_MEND}")
+        raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {MEND}")
 
 
 def gone(key: str) -> DamagedShard:
     """The error of a shard with a manifest and no file."""
-    return DamagedShard(f"{key} is gone from the store, and its manifest is there; {_MEND}")
+    return DamagedShard(f"{key} is gone from the store, and its manifest is there; {MEND}")
 
 
 class Checked:

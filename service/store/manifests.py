@@ -186,7 +186,7 @@ def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
     the bytes that are in the store, not those at hand.
     """
     if not store.put(manifest.key, data):
-        manifest = _describing(manifest, store.get(manifest.key))
+        manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 
 
@@ -210,15 +210,17 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
     return store.exists(names.shard_manifest(stage, shard))
 
 
-def _describing(manifest: ShardManifest, data: bytes) -> ShardManifest:
+def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
+    """The manifest of a file's bytes; what they do not tell is taken from a manifest of the same shard.
+
+    Args:
+        said: that manifest as JSON has it; its grasps are not needed.
+        data: HDF5 bytes of the shard.
+    """
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
-    shard = read_shard(data, without=pictures, name=manifest.key)
-    update = {
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "size_bytes": len(data),
-        **_contents(manifest.kind, shard.arrays, shard.attributes),
-    }
-    return manifest.model_copy(update=update)
+    shard = read_shard(data, without=pictures, name=said["key"])
+    told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
+    return ShardManifest.model_validate({**said, **told, **_contents(said["kind"], shard.arrays, shard.attributes)})
 
 
 def _numbers(values: NDArray[Any]) -> list[float | None]:

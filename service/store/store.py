@@ -1,6 +1,7 @@
 """The object store: create-only puts of immutable objects, on a local folder, S3, Google Cloud, Azure, or memory.
 
 Only what every back end offers is used: put if absent, get, range, list, delete; no overwrite, no compare-and-swap.
+What reads takes the name of a part of an object (`service.store.parts`) where it takes a key.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, from_url
 
 from service.model.errors import InputError, NotFoundError, StoreUnavailable
+from service.store.parts import part_of
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
@@ -89,11 +91,23 @@ class Store:
 
     def get(self, key: str) -> bytes:
         """All bytes of an object; NotFoundError if there is none."""
+        if (part := part_of(key)) is not None:
+            return self.get_range(key, 0, part.length)
         with _mapped(key, self.url):
             return bytes(obstore.get(self._backend, check_key(key)).bytes())
 
     def get_range(self, key: str, start: int, length: int) -> bytes:
-        """`length` bytes from offset `start`; NotFoundError if there is no such object."""
+        """`length` bytes from offset `start`; NotFoundError if there is no such object.
+
+        Of a part whose object was cut off it gives those that are left: its checksum then says that it is damaged.
+        """
+        if (part := part_of(key)) is not None:
+            try:
+                return self.get_range(part.key, part.start + start, max(0, min(length, part.length - start)))
+            except StoreUnavailable:
+                if self.size(part.key) > part.start + start:
+                    raise
+                return b""
         with _mapped(key, self.url):
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
@@ -101,12 +115,15 @@ class Store:
         """Chunks of an object from `start` on; never holds more than one chunk."""
         end = self.size(key) if length is None else start + length
         while start < end:
-            chunk = self.get_range(key, start, min(_STREAM_BYTES, end - start))
+            if not (chunk := self.get_range(key, start, min(_STREAM_BYTES, end - start))):
+                return
             start += len(chunk)
             yield chunk
 
     def size(self, key: str) -> int:
         """Bytes of an object; NotFoundError if there is none."""
+        if (part := part_of(key)) is not None:
+            return max(0, min(part.length, self.size(part.key) - part.start))
         with _mapped(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
@@ -120,8 +137,9 @@ class Store:
 
     def stamp(self, key: str) -> Stamp:
         """What tells whether an object was exchanged or written over; NotFoundError if there is none."""
+        part = part_of(key)
         with _mapped(key, self.url):
-            meta = obstore.head(self._backend, check_key(key))
+            meta = obstore.head(self._backend, check_key(part.key if part is not None else key))
             return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
 
     def exists(self, key: str) -> bool:
@@ -138,7 +156,9 @@ class Store:
                 yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
 
     def sign(self, key: str, *, seconds: int = 3600) -> str | None:
-        """URL from which anybody may read the object for a while; None where the store cannot make one."""
+        """URL from which anybody may read the object for a while; None where the store makes none, and of a part."""
+        if part_of(key) is not None:
+            return None
         check_key(key)
         try:
             return (

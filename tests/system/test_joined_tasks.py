@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +30,18 @@ def test_every_task_of_a_killed_worker_runs_again_and_its_result_appears_once(st
     assert sorted(attempt.kind for attempt in attempts) == ["WorkerLost"] * 3
     assert len({attempt.task_id for attempt in attempts}) == 3
     assert all(f"-{killed}-" in attempt.worker for attempt in attempts)
+
+
+def test_a_worker_killed_between_pack_and_event_has_its_tasks_done_all_the_same(start: Start, tmp_path: Path) -> None:
+    killed = tmp_path / "killed"
+    environment = {"FAKE_PACKED": str(killed), "FAKE_SECONDS": "0.5"}
+    system = start(environment=environment, join="4", shard_pack=3)
+    job = system.submit(wanted(grasps=96))
+    (done,) = system.finish(job, seconds=120)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 96)
+    assert [entry.key for entry in system.parts.store.list("packs")] == [killed.read_text()]
+    assert list(system.parts.store.list("shards")) == [], "nothing was made twice"
+    assert not system.parts.index.jobs.attempts(job=job), "no attempt was used up"
 
 
 def test_a_task_that_kills_its_worker_takes_no_other_one_down(start: Start) -> None:

@@ -13,13 +13,13 @@ from typing import Any
 from redis.exceptions import RedisError, ResponseError
 
 from service.model.domain import TaskMessage
-from service.queue.port import Event
+from service.queue.port import Event, EventKind, Events
 from service.queue.rq_queue import WORKERS
 from service.queue.taking import message_of, take_alike
-from worker.meeting import Meeting
 from worker.process.heartbeat import Hold
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
+from worker.stages.packing import Packer
 from worker.together import PER_LAUNCH
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,18 @@ class Held:
     error: Exception | None = None
 
 
-def run_together(held: Sequence[Held], meeting: Meeting, runner: Runner, close: Callable[[Held], None]) -> None:
+def tell_end(events: Events, outcome: Event, packer: Packer | None) -> None:
+    """Publish the end of a task; of those whose shards are in one pack one end, once all of them have ended."""
+    if packer is None or not outcome.pack:
+        events.publish(outcome)
+    elif tasks := packer.end(outcome.task_id, outcome.pack):
+        # It goes to the keeper of one of their jobs: most packs are of one.
+        facts = {"job_id": outcome.job_id, "worker": outcome.worker, "pack": outcome.pack}
+        events.publish(Event(kind=EventKind.PACKED, at=outcome.at, **facts))
+        events.forget_reports(tasks)
+
+
+def run_together(held: Sequence[Held], runner: Runner, close: Callable[[Held], None]) -> None:
     """Do tasks, each in a thread of its own, and close the books on each as it ends, in this thread."""
     ended: SimpleQueue[Held] = SimpleQueue()
 
@@ -86,7 +97,7 @@ def run_together(held: Sequence[Held], meeting: Meeting, runner: Runner, close: 
         except Exception as error:
             one.error = error
         finally:
-            meeting.leave()
+            one.context.depart()
             ended.put(one)
 
     log.info("%d tasks of one pair are done together", len(held))

@@ -37,7 +37,7 @@ from service.settings import Settings
 from service.store.store import open_store
 from worker.engines.devices import Device
 from worker.meeting import Meeting
-from worker.process.company import Alike, Company, Held, run_together
+from worker.process.company import Alike, Company, Held, run_together, tell_end
 from worker.process.fitness import Check, Fitness
 from worker.process.heartbeat import Heartbeat, Hold
 from worker.process.pulse import LEASE_KEPT_S
@@ -47,6 +47,7 @@ from worker.process.surroundings import Surroundings
 from worker.stages import alike_tasks, stage_table
 from worker.stages.context import StopReason, TaskContext
 from worker.stages.output import StageFunction
+from worker.stages.packing import Packer
 
 log = logging.getLogger(__name__)
 #: Reconnection attempts of a worker, about a minute's worth: longer than a Redis takes to come back.
@@ -147,6 +148,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 super().prepare_job_execution(one.job)
                 one.context.meeting = meeting
                 left.append(one)
+            packer = self._surroundings.packer([one.context for one in left], self._queue)
             self._hold(left)
 
             def close(one: Held) -> None:
@@ -157,9 +159,9 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                     self._closing = None
                 left.remove(one)
                 self._hold(left)
-                self._tell_outcome()
+                self._tell_outcome(packer)
 
-            run_together(list(left), meeting, self._runner, close)
+            run_together(list(left), self._runner, close)
 
     def _hold(self, held: Sequence[Held]) -> None:
         state = "stopping" if self._stop_requested else "busy" if held else "idle"
@@ -214,12 +216,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         else:
             super().handle_job_failure(job, *args, **options)
 
-    def _tell_outcome(self) -> None:
+    def _tell_outcome(self, packer: Packer | None = None) -> None:
         """Of a task whose books are closed."""
         self._surroundings.tasks_done += 1
         if self._outcome is not None:
             try:
-                self._queue.publish(self._outcome)
+                tell_end(self._queue, self._outcome, packer)
             except QueueUnavailable as error:
                 log.warning("the end of task %s is for the keeper to find: %s", self._outcome.task_id, error)
 

@@ -21,6 +21,7 @@ from service.model.errors import DamagedError, DamagedShard, InputError, TaskCan
 from service.model.records import AttemptRecord
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
+from service.store.packs import find_manifest
 from service.store.records import put_record
 from worker.engines.cuda_errors import DeviceLost, check_device
 from worker.pool.pool import ProcessLost
@@ -117,7 +118,7 @@ class Runner:
         made = self._stages[message.stage](message, context)
         if context.meeting is None:  # in a meeting each launch ends with it
             self._check_device(context.device)
-        seconds = time.perf_counter() - clock
+        seconds, pack = time.perf_counter() - clock, ""
         if made is not None and isinstance(message, TaskMessage):
             context.check()
             manifest, data = shard_of(
@@ -128,10 +129,12 @@ class Runner:
                     f"{lost.key} was made again and is not what it was: made on {lost.device} by graspd "
                     f"{lost.code_version}, again on {context.device}; put a copy in its place"
                 )
-            publish_shard(context.store, manifest, data)
+            pack = "" if lost is not None else context.pack(message.task_id, manifest, data)
+            if not pack:
+                publish_shard(context.store, manifest, data)
         if self._fitness is not None:
             self._fitness.passed()
-        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
+        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds, pack=pack)
 
     def _loss(self, error: Exception, context: TaskContext) -> str:
         """What became of the device, or of a process beside this one, if that is what the error comes from; else ""."""
@@ -152,8 +155,10 @@ class Runner:
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):
             return context.store.exists(names.asset_check(message.kind, message.digest))
-        done = shard_exists(context.store, message.stage, message.output)
-        return done and context.store.exists(names.shard_file(message.stage, message.output))
+        if shard_exists(context.store, message.stage, message.output):
+            return context.store.exists(names.shard_file(message.stage, message.output))
+        # The keeper looks through the packs before it queues a task again; here that pays where one was lost.
+        return message.attempt > 1 and _has_manifest(message, context)
 
     def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
         """The manifest of a shard that was made before and whose file is gone."""
@@ -221,10 +226,9 @@ def _on_device(context: TaskContext, work: Callable[[], Any]) -> Any:
 def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
     """Whether a readable manifest says that the task has succeeded; a damaged one says nothing."""
     try:
-        return (
-            shard_exists(context.store, message.stage, message.output)
-            and load_manifest(context.store, message.stage, message.output).shard_id == message.output
-        )
+        pair = (message.hand_digest, message.object_digest)
+        made = find_manifest(context.store, message.stage, message.output, pair)
+        return made is not None and made.shard_id == message.output
     except DamagedError:
         return False
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from service.model.domain import Stage
 from service.model.errors import QueueUnavailable
-from service.queue.port import Events, Report
+from service.queue.port import READS_PACKS, Events, Presence, Report
 from service.settings import Settings
 from service.store.store import Store
 from worker.engines.devices import Device
@@ -17,6 +17,7 @@ from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
+from worker.stages.packing import WAIT_S, Packer
 from worker.together import MODULES
 
 log = logging.getLogger(__name__)
@@ -65,6 +66,24 @@ class Surroundings:
         if self._pool is not None:
             self._pool.start()
         return self._pool
+
+    def packer(self, together: Sequence[TaskContext], queue: Presence) -> Packer | None:
+        """Where tasks that are done together leave their shards, as their contexts know from then on; None where each
+        puts its own."""
+        least = self.settings.shard_pack
+        if least < 2 or len(together) < least:
+            return None
+
+        def is_read() -> bool:
+            try:
+                return queue.announced(READS_PACKS)
+            except QueueUnavailable:
+                return False
+
+        packer = Packer(self.store, len(together), least=least, is_read=is_read, wait_s=WAIT_S)
+        for context in together:
+            context.packer = packer
+        return packer
 
     def close(self) -> None:
         """End what was started for tasks."""

@@ -9,10 +9,12 @@ from enum import StrEnum
 from typing import Final
 
 from service.model.errors import TaskCancelled
+from service.store.manifests import ShardManifest
 from service.store.store import Store
 from worker.meeting import Meeting
 from worker.pool.pool import Pool
 from worker.run import FirstJudge, Run
+from worker.stages.packing import Packer
 
 #: Pause between two reports where nobody asks for another [s]: enough for a smooth bar.
 _REPORT_EVERY_S: Final = 0.25
@@ -48,6 +50,9 @@ class TaskContext:
         self.pool = pool
         self.meeting: Meeting | None = None
         """Where the task is done beside others; None: by itself."""
+        self.packer: Packer | None = None
+        """Where it leaves its shard for those of others; None: nowhere."""
+        self._departed = False
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
@@ -61,6 +66,29 @@ class TaskContext:
             # A worker tells no more for having more tasks in hand.
             share = max(1, self.meeting.members) if self.meeting is not None else 1
             self._tell_again = now + share * (self._tell(done, total, message) or _REPORT_EVERY_S)
+
+    def depart(self) -> None:
+        """Ask for no more launches and leave no shard: the others need not wait for this task."""
+        if self._departed:
+            return
+        self._departed = True
+        if self.meeting is not None:
+            self.meeting.leave()
+        if self.packer is not None:
+            self.packer.leave()
+
+    def pack(self, task: str, manifest: ShardManifest, data: bytes) -> str:
+        """Put the shard of this task together with those of the tasks that end with this one.
+
+        Returns:
+            key of the pack that holds it; "" where it was not put: the task is done by itself, or too few end with it.
+        """
+        if self.packer is None or self._departed:
+            return ""
+        self._departed = True
+        if self.meeting is not None:
+            self.meeting.leave()
+        return self.packer.put(task, manifest, data)
 
     @property
     def run(self) -> Run:

@@ -9,7 +9,6 @@ from service.model.scene_kinds import supports_in
 from service.model.transforms import compose
 from service.store import standing
 from service.store.attributes import Attribute
-from service.store.manifests import load_shard
 from service.store.shards import Shard, json_attribute
 from worker.rendering import Extras, render
 from worker.rendering.hands import DrawnHand
@@ -17,6 +16,7 @@ from worker.rendering.pages.sheets import best_in_scenes
 from worker.scenes.neighbours import Neighbours
 from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
+from worker.stages.inputs import input_of
 from worker.stages.output import Output, batch_seed
 
 
@@ -24,7 +24,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     """Render `request.views` camera placements of each scene, with the hand too where grasps were planned in them."""
     request = message.request
     stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
-    shard = load_shard(context.store, stage, message.inputs[0])
+    shard = input_of(message, context, stage)
     obj = object_of(context.store, message)
     said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
     extras = Extras(channels=request.channels)

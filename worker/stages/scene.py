@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from service.model.domain import Stage, TaskMessage
 from service.model.errors import MeshError, SceneError
 from service.store.attributes import Attribute
-from service.store.manifests import load_shard
 from service.store.shards import json_attribute
 from worker.grasps import Posture
 from worker.scenes import drop, transfer
@@ -18,6 +17,7 @@ from worker.scenes.beside import scenes_of
 from worker.scenes.clearance import count_rejections
 from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
+from worker.stages.inputs import input_of
 from worker.stages.output import Output, batch_seed
 
 #: Columns of carried-over grasps in a shard of scenes that grasps are yet to be planned in.
@@ -62,7 +62,7 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
 
 def _after_grasps(message: TaskMessage, context: TaskContext) -> Output:
     """Drop the object `request.scenes` times and carry the grasps of the base shard over."""
-    base = load_shard(context.store, Stage.SYNTHESIZE, message.inputs[0])
+    base = input_of(message, context, Stage.SYNTHESIZE)
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
     context.progress(0.0, 1.0, "drops")

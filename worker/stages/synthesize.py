@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from service.model.domain import Stage, TaskMessage
 from service.model.errors import InputError, SceneError
 from service.store.attributes import Attribute
-from service.store.manifests import load_shard
 from worker.certified import Certified, certified_grasps
 from worker.files.base_attributes import base_attributes
 from worker.planners import planner
@@ -21,6 +20,7 @@ from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Scenes
 from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
 from worker.stages.context import TaskContext
+from worker.stages.inputs import input_of
 from worker.stages.output import Output
 from worker.stages.pieces import pieces_of
 
@@ -74,7 +74,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> dict[str, NDAr
         planner(request.method, request.options, in_scenes=True)
     except InputError as error:
         raise SceneError(str(error)) from None
-    shard = load_shard(context.store, Stage.SCENE, message.inputs[0])
+    shard = input_of(message, context, Stage.SCENE)
     return {name: np.asarray(shard[name], float) for name in _OF_SCENES if name in shard.arrays}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Connection, delete, select, update
 
 from service.index.bulk import upsert
 from service.index.changes.rows import asset_row, attempt_row, clean, grasp_rows, job_row, shard_row, task_rows
@@ -17,6 +17,7 @@ from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
 from service.model.domain import Asset, State
 from service.model.records import AttemptRecord, JobEvent, JobRecord
 from service.store.manifests import ShardManifest
+from service.store.parts import preference
 
 
 @dataclass(frozen=True)
@@ -83,13 +84,14 @@ class Changes:
                 found[row["id"]] = _outcome(row["worker"], row["device"], row["seconds"], row["created"])
         return found
 
-    def _add_manifests(self, connection: Connection, manifests: Sequence[ShardManifest]) -> dict[str, State]:
+    def _add_manifests(self, connection: Connection, given: Sequence[ShardManifest]) -> dict[str, State]:
+        manifests = _counting(connection, given)
         charged = self._askers(connection, [manifest.shard_id for manifest in manifests])
         rows = [shard_row(manifest) | {"charged": charged.get(manifest.shard_id, "")} for manifest in manifests]
         upsert(connection, shards, rows, keep=("charged",))
         upsert(connection, grasps, [row for manifest in manifests for row in grasp_rows(manifest)])
         touched: defaultdict[str, set[int]] = defaultdict(set)
-        for some in chunks([manifest.shard_id for manifest in manifests]):
+        for some in chunks([manifest.shard_id for manifest in given]):
             done = (
                 update(tasks)
                 .where(tasks.c.shard_id == shards.c.id, shards.c.id.in_(some))
@@ -143,6 +145,26 @@ class Changes:
                 connection.execute(update(tasks).where(*task, tasks.c.last_attempt <= upto).values(**fresh))
                 connection.execute(update(tasks).where(*task).values(retried_upto=upto))
         return settle(connection, job_id)
+
+
+def _counting(connection: Connection, given: Sequence[ShardManifest]) -> list[ShardManifest]:
+    """One manifest of each shard, where it counts before the one whose rows are there; those rows' grasps go.
+
+    A task that was done twice may have left its shard in a file of its own and in a pack: whichever comes first, the
+    rows are those of the same one.
+    """
+    best: dict[str, ShardManifest] = {}
+    for manifest in given:
+        rival = best.get(manifest.shard_id)
+        if rival is None or preference(manifest.key) <= preference(rival.key):
+            best[manifest.shard_id] = manifest
+    for some in chunks(list(best)):
+        for shard, key in connection.execute(select(shards.c.id, shards.c.key).where(shards.c.id.in_(some))).all():
+            if preference(key) < preference(best[shard].key):
+                del best[shard]
+            elif key != best[shard].key:
+                connection.execute(delete(grasps).where(grasps.c.shard_id == shard))
+    return list(best.values())
 
 
 _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created)

@@ -113,14 +113,15 @@ class Feed:
             checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
             return set(connection.scalars(of_tasks)), checks
 
-    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Stage and shard id of tasks."""
-        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
+    def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str, tuple[str, str]]]:
+        """Stage and shard id of tasks, with the digests of hand and object."""
+        of_job = (jobs.c.hand_digest, jobs.c.object_digest)
+        query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id, *of_job).join(jobs, jobs.c.id == tasks.c.job_id)
         with self.database.reading() as connection:
             return {
-                task: (stage, shard)
+                task: (stage, shard, (hand, obj))
                 for some in chunks(list(task_ids))
-                for task, stage, shard in connection.execute(query.where(tasks.c.id.in_(some)))
+                for task, stage, shard, hand, obj in connection.execute(query.where(tasks.c.id.in_(some)))
             }
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:

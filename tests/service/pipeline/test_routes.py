@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from service.model.ability import Need, own_ability
+from service.model.ability import FIRST_SCHEMA, Need, own_ability
 from service.model.domain import JobRequest, Lane, Stage
 from service.model.planning import needed_schema
 from service.model.worker_beat import WorkerBeat
@@ -85,7 +85,8 @@ def test_a_beat_without_abilities_is_one_of_the_version_before_they_were_told() 
 
 def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
     names = queue_names([Stage.SYNTHESIZE], ability=OWN)
-    assert names[:2] == [f"interactive-synthesize.2.{REVISION}", "interactive-synthesize"]
+    apart = [f"interactive-synthesize.{schema}.{REVISION}" for schema in range(FIRST_SCHEMA, OWN.schemas[1] + 1)]
+    assert names[: len(apart) + 1] == [*apart, "interactive-synthesize"]
     assert not any(is_apart(name) for name in queue_names([Stage.SYNTHESIZE], ability=UNTOLD.ability))
 
 

@@ -18,11 +18,12 @@ from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.queue.allowed import TASK_FUNCTION, AllowedJob
 from service.queue.lists import queue_name
-from service.queue.port import EventKind
+from service.queue.port import READS_PACKS, EventKind
 from service.queue.rq_queue import WORKERS, RqQueue
 from service.queue.taking import take_alike
 from service.settings import Settings
 from service.store.manifests import shard_exists
+from service.store.packs import pack_at
 from service.store.records import task_attempts
 from service.store.store import open_store
 from tests.fakes import alike_batches, fake_synthesize, request
@@ -48,8 +49,10 @@ def batches(count: int, *, obj: str = "b", attempt: int = 1, **changes: Any) -> 
 def work(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Callable[..., dict[str, list[EventKind]]]:
     """Lets a worker do what waits; gives the events of each task."""
 
-    def run(stage: Any, *, join: str = "4", ended_well: bool = True) -> dict[str, list[EventKind]]:
-        settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu", join=join)  # type: ignore[arg-type]
+    def run(stage: Any, *, join: str = "4", ended_well: bool = True, shard_pack: int = 8) -> dict[str, list[EventKind]]:
+        settings = Settings(
+            redis_url=redis_server, data_dir=tmp_path, device="cpu", join=join, shard_pack=shard_pack,
+        )  # type: ignore[arg-type]  # fmt: skip
         assert run_worker(settings, table={Stage.SYNTHESIZE: stage}, alike=alike_batches, burst=True) is ended_well
         told: dict[str, list[EventKind]] = {}
         for _, event in rq_queue.tail("0", limit=1000, wait_s=0):
@@ -95,6 +98,42 @@ def test_tasks_of_one_pair_are_done_together_and_each_leaves_its_shard(
     store = open_store((tmp_path / "store").as_uri())
     assert all(shard_exists(store, Stage.SYNTHESIZE, task.output) for task in (*same, *other))
     assert not rq_queue.connection.keys("rq:job:*")
+
+
+def test_shards_of_tasks_that_end_together_are_one_object_and_one_event(
+    rq_queue: RqQueue, work: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("worker.process.surroundings.WAIT_S", 600.0)
+    tasks = batches(5)
+
+    def fail_one(message: TaskMessage, context: TaskContext) -> Any:
+        if message.batch == 1:
+            raise ValueError("no grasp")
+        return None
+
+    rq_queue.announce(READS_PACKS, 600)
+    rq_queue.enqueue(tasks, Lane.BULK)
+    told = work(Meetings(fail_one), shard_pack=2)
+    failed = tasks.pop(1)
+    assert told[failed.task_id] == [EventKind.STARTED, EventKind.FAILED]
+    assert [told[task.task_id] for task in tasks] == [[EventKind.STARTED]] * 4
+    (end,) = [event for _, event in rq_queue.tail("0", limit=99, wait_s=0) if event.kind is EventKind.PACKED]
+    store = open_store((tmp_path / "store").as_uri())
+    found = [shard.id for shard in pack_at(store, end.pack).shards]
+    assert sorted(found) == sorted(task.output for task in tasks)
+    assert list(store.list("shards")) == []
+    assert rq_queue.reports() == {}
+
+
+def test_where_no_keeper_reads_packs_each_shard_is_put_by_itself(
+    rq_queue: RqQueue, work: Callable[..., Any], tmp_path: Path
+) -> None:
+    tasks = batches(4)
+    rq_queue.enqueue(tasks, Lane.BULK)
+    told = work(Meetings(), shard_pack=2)
+    assert told == {task.task_id: [EventKind.STARTED, EventKind.FINISHED] for task in tasks}
+    store = open_store((tmp_path / "store").as_uri())
+    assert all(shard_exists(store, Stage.SYNTHESIZE, task.output) for task in tasks)
 
 
 @pytest.mark.parametrize("join", ["1", "auto"])
