@@ -1,13 +1,14 @@
 """How many workers keepers serve: real Redis, PostgreSQL, store and keepers, and workers that do no work.
 
-usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000] [--sqlite]
-                                  [--json FILE]
+usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000] [--pack 1]
+                                  [--sqlite] [--json FILE]
 
 For each number of workers and of keepers, two runs. First all workers hold tasks that end at --rate a second in all,
 beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
 all leases? Then their tasks take no time: how many a second come through keepers and index? Everything shares this
 machine, the workers too; the processor time of each part is counted beside its clock, and that of the busiest keeper.
-What the workers do is in `benchmarks.fleet_workers`.
+With --pack so many shards that end together are one object of the store. What the workers do is in
+`benchmarks.fleet_workers`.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from sqlalchemy import func, select
 
 from benchmarks.service_load import cpu_s, say
 from service.index.tables import tasks
+from service.model import names
 from service.model.domain import Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
@@ -68,6 +70,10 @@ class Result:
     """That of the keeper with most of it: so many tasks a second are a core of it."""
     database_ms: float
     redis_ms: float
+    events: float
+    """Events of the second run for a task."""
+    objects: float
+    """Objects that the keeper reads of the store for a task: manifests, or packs."""
 
 
 class Machine:
@@ -150,10 +156,10 @@ def _kept(parts: Parts) -> list[Keeping]:
 
 
 @contextmanager
-def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
+def fleet(settings: Settings, workers: int, task_s: float, pack: int = 1) -> Iterator[None]:
     """Workers that live for the block."""
     with ExitStack() as stack:
-        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s)]
+        command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s), str(pack)]
         _started(stack, command, environment(settings))
         yield
 
@@ -171,7 +177,7 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
     with machine(sqlite=given.sqlite, keepers=keepers) as at:
         task_s = workers / given.rate
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
-        with fleet(at.settings, workers, task_s):
+        with fleet(at.settings, workers, task_s, given.pack):
             held = at.queue.connection
             lists = [f"rq:wip:{lane.value}-synthesize" for lane in Lane]
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
@@ -181,10 +187,13 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
         at.submit(given.tasks)
         before = at.cpu()
         begun = time.perf_counter()
-        with fleet(at.settings, workers, 0.0):
+        with fleet(at.settings, workers, 0.0, given.pack):
             _wait(lambda: _finished(at.parts) >= given.tasks, "all tasks are in the index")
             seconds = time.perf_counter() - begun
             spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
+            streams = streams_kept(at.queue.connection)
+            events = sum(at.queue.connection.xinfo_stream(name)["entries-added"] for name in streams)
+            objects = sum(1 for folder in (names.SHARDS, names.PACKS) for _ in at.parts.store.list(folder))
     of_keepers = [used for name, used in spent.items() if name.startswith("keeper")]
     return Result(
         workers=workers,
@@ -197,6 +206,8 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
         busiest_ms=max(of_keepers),
         database_ms=spent.get("database", 0.0),
         redis_ms=spent["redis"],
+        events=events / given.tasks,
+        objects=objects / given.tasks,
     )
 
 
@@ -253,12 +264,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the lag is watched")
     parser.add_argument("--rate", type=float, default=100.0, help="tasks that end a second while it is watched")
     parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
+    parser.add_argument("--pack", type=int, default=1, help="shards that are put as one object; 1: each by itself")
     parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
     parser.add_argument("--json", type=Path, help="keep the figures there")
     given = parser.parse_args()
     say("| workers | keepers | lag of events, p95 | worst | lease sweep | tasks/s "
-        "| keepers, of a task | the busiest | database | Redis |")  # fmt: skip
-    say("| --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |")
+        "| keepers, of a task | the busiest | database | Redis | events | objects |")  # fmt: skip
+    say(f"|{' --: |' * 12}")
     results = []
     for workers, keepers in product(given.workers, given.keepers):
         one = measure(workers, keepers, given)
@@ -266,7 +278,7 @@ def main() -> None:
         say(
             f"| {workers:,} | {keepers} | {one.lag_s:.2f} s | {one.worst_lag_s:.2f} s | {one.sweep_ms:.0f} ms "
             f"| {one.tasks_per_s:.0f} | {one.keeper_ms:.1f} ms | {one.busiest_ms:.1f} ms | {one.database_ms:.1f} ms "
-            f"| {one.redis_ms:.1f} ms |"
+            f"| {one.redis_ms:.1f} ms | {one.events:.2f} | {one.objects:.3f} |"
         )
     if given.json:
         given.json.write_text(json.dumps([asdict(one) for one in results], indent=2) + "\n")

@@ -34,10 +34,9 @@ def test_every_task_of_a_killed_worker_runs_again_and_its_result_appears_once(st
 
 def test_a_worker_killed_between_pack_and_event_has_its_tasks_done_all_the_same(start: Start, tmp_path: Path) -> None:
     killed = tmp_path / "killed"
-    environment = {"FAKE_PACKED": str(killed), "FAKE_SECONDS": "0.5"}
-    system = start(environment=environment, join="4", shard_pack=3)
+    system = start(environment={"FAKE_PACKED": str(killed)}, join="4", shard_pack=3)
     job = system.submit(wanted(grasps=96))
-    (done,) = system.finish(job, seconds=120)
+    (done,) = system.finish(job)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 96)
     assert [entry.key for entry in system.parts.store.list("packs")] == [killed.read_text()]
     assert list(system.parts.store.list("shards")) == [], "nothing was made twice"
