@@ -1,7 +1,7 @@
 """How many workers keepers serve: real Redis, PostgreSQL, store and keepers, and workers that do no work.
 
 usage: python -m benchmarks.fleet [--workers 64 512 4096] [--keepers 1 2 4] [--seconds 20] [--tasks 6000] [--pack 1]
-                                  [--sqlite] [--json FILE]
+                                  [--sqlite] [--s3] [--json FILE]
 
 For each number of workers and of keepers, two runs. First all workers hold tasks that end at --rate a second in all,
 beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
@@ -43,7 +43,7 @@ from service.queue.streams import streams_kept
 from service.run.embedded import server_command
 from service.settings import Settings
 from tests.fakes import add_assets, request
-from tests.servers import PostgresServer
+from tests.servers import PostgresServer, S3Server
 
 #: Batches of a job, as a dataset's cell of 3,200 grasps has them.
 _BATCHES_A_JOB: Final = 100
@@ -125,7 +125,7 @@ class Machine:
 
 
 @contextmanager
-def machine(*, sqlite: bool, keepers: int = 1) -> Iterator[Machine]:
+def machine(*, sqlite: bool, s3: bool, keepers: int = 1) -> Iterator[Machine]:
     """A service of real processes that ends with the block; each keeper has one shard of the work."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspd-fleet-")))
@@ -136,6 +136,10 @@ def machine(*, sqlite: bool, keepers: int = 1) -> Iterator[Machine]:
             server = stack.enter_context(PostgresServer())
             assert server.process is not None
             options["index_url"], pids["database"] = server.url(), server.process.pid
+        if s3:
+            bucket = stack.enter_context(S3Server())
+            os.environ.update(bucket.environment)
+            options["store_url"] = f"{bucket.url}/fleet"
         settings = Settings(**options)
         redis = _started(stack, server_command(settings), {})
         parts = Parts.open(settings)
@@ -174,7 +178,7 @@ def environment(settings: Settings) -> dict[str, str]:
 
 def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
     """Both runs with one number of workers and of keepers."""
-    with machine(sqlite=given.sqlite, keepers=keepers) as at:
+    with machine(sqlite=given.sqlite, s3=given.s3, keepers=keepers) as at:
         task_s = workers / given.rate
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
         with fleet(at.settings, workers, task_s, given.pack):
@@ -183,7 +187,7 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
             time.sleep(given.seconds / 2)
             lags, sweeps = _looks(at, given.seconds)
-    with machine(sqlite=given.sqlite, keepers=keepers) as at:
+    with machine(sqlite=given.sqlite, s3=given.s3, keepers=keepers) as at:
         at.submit(given.tasks)
         before = at.cpu()
         begun = time.perf_counter()
@@ -266,6 +270,7 @@ def main() -> None:
     parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
     parser.add_argument("--pack", type=int, default=1, help="shards that are put as one object; 1: each by itself")
     parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
+    parser.add_argument("--s3", action="store_true", help="the store on an S3 server instead of files")
     parser.add_argument("--json", type=Path, help="keep the figures there")
     given = parser.parse_args()
     say("| workers | keepers | lag of events, p95 | worst | lease sweep | tasks/s "

@@ -26,6 +26,7 @@ from service.store.records import read_record
 
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
+_REMEMBERED_TASKS: Final = 100_000
 #: Shards indexed in one transaction: others who write wait for it, a fraction of a second.
 _SHARDS_AT_ONCE: Final = 200
 _READERS: Final = 8
@@ -200,6 +201,8 @@ class Indexer:
             self._wait_again(event, 0.0, None)
 
     def _defer(self, event: Event) -> None:
+        if len(self._deferrals) >= _REMEMBERED_TASKS:
+            self._deferrals.clear()
         count = self._deferrals[event.task_id] = self._deferrals.get(event.task_id, 0) + 1
         wait = backoff(self._parts.settings.retry_backoff_s, count)
         self._wait_again(event, time.time() + wait, f"waits: {event.message}")

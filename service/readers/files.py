@@ -132,6 +132,10 @@ def open_shards(
 def _paths(entry: Path) -> list[Path]:
     if entry.is_dir():
         found = sorted(entry.rglob("*.h5"))
+        if next(entry.rglob("*.pack"), None) is not None:
+            raise InputError(
+                f"{entry} has shards in packs: name the store, {entry.resolve().as_uri()}, and a job or dataset"
+            )
         if not found:
             raise NotFoundError(f"{entry} holds no .h5 file")
         return found

@@ -34,7 +34,7 @@ MAGIC: Final = b"graspd\x00\x01"
 _HEAD: Final = struct.Struct("<8sQ")
 #: More than the directory of the largest pack takes [bytes].
 _LONGEST: Final = 1 << 26
-_REMEMBERED: Final = 1000
+_REMEMBERED: Final = 200
 #: More than a store takes as one object [bytes].
 _LARGEST: Final = 10**14
 
@@ -171,7 +171,8 @@ def read_manifests(store: Store, pack: Pack) -> list[ShardManifest | DamagedErro
     found: list[ShardManifest | DamagedError] = []
     for shard in pack.living:
         try:
-            found.append(_manifest(pack, shard, data[shard.manifest_start :][: shard.manifest_length]))
+            end = shard.manifest_start + shard.manifest_length
+            found.append(_manifest(pack, shard, data[shard.manifest_start : end]))
         except DamagedError as error:
             found.append(error)
     return found
