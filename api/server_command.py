@@ -8,6 +8,7 @@ import typer
 
 from service import tracing
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
+from service.model.imports import imports
 
 app = typer.Typer(add_completion=False)
 
@@ -19,7 +20,8 @@ def api(
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free one.")] = None,
 ) -> None:
     """Run the HTTP API and the dashboard."""
-    from api.server import serve
+    with imports():
+        from api.server import serve
 
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")

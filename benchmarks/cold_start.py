@@ -1,4 +1,4 @@
-"""How long the first grasps take: of a process that begins, and of a service that begins; prints Markdown.
+"""How long the first grasps take: of a command, of a process that plans, of a service; prints Markdown.
 
 usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object mug] [--runs 3] [--no-service]
 
@@ -13,6 +13,7 @@ import json
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -63,6 +64,22 @@ def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
     return {"clock": clock, "processor": spent, **laps}
 
 
+def first_command(root: Path, hand: str, obj: str) -> dict[str, float]:
+    """Seconds of `graspd synth -n 1`, from its start to its end."""
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "graspd", "synth", "--hand", hand, "--object", obj, "-n", "1", "--seed", "3"]
+        subprocess.run(
+            [*command, "-o", f"{folder}/g.h5"], cwd=root, env=environment_of(root), check=True, capture_output=True
+        )
+    clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {
+        "clock": clock,
+        "processor, user": after.ru_utime - before.ru_utime,
+        "processor, system": after.ru_stime - before.ru_stime,
+    }
+
+
 def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
     """Seconds of a service in an empty folder: until a worker waits, and from there until 32 valid grasps are there."""
     with service_of(root) as service:
@@ -102,9 +119,12 @@ def main() -> None:
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--object", default="mug")
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--no-service", action="store_true", help="the process alone")
+    parser.add_argument("--no-service", action="store_true", help="command and process alone")
     given = parser.parse_args()
-    stages: list[tuple[str, Any]] = [("first valid grasp of a process, s", first_grasp)]
+    stages: list[tuple[str, Any]] = [
+        ("`graspd synth -n 1`, s", first_command),
+        ("first valid grasp of a process, s", first_grasp),
+    ]
     if not given.no_service:
         stages.append(("32 valid grasps, the first job of a service, s", first_job))
     for title, measure in stages:

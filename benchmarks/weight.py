@@ -17,42 +17,38 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, Final
 
 from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPOSITORY / "docker"))
+import pin  # noqa: E402
+
 EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
+_COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
+_OURS: Final = "from service.model.imports import imports, own_process; own_process()\nwith imports(): {}"
+_ENGINE: Final = "import worker.certified, worker.planners.fast_graspd.method"
 #: What somebody waits for, and what does it.
 STARTS: Final = {
     "Python alone": "pass",
     "`import graspd`": "import graspd",
-    "`graspd --help`": "import sys; sys.argv = ['graspd', '--help']; import graspd.cli; graspd.cli.main()",
-    "a client's command": "import api.client.commands",
-    "the API": "import api.app",
-    "planning grasps": "import worker.certified",
-    "a worker": "import worker.process.main",
+    "`graspd --help`": _COMMAND.format("'--help'"),
+    "`graspd jobs --help`": _COMMAND.format("'jobs', '--help'"),
+    "`graspd api --help`": _COMMAND.format("'api', '--help'"),
+    "the API": "import api.server",
+    "the API, as its command imports it": _OURS.format("import api.server"),
+    "the planner": _ENGINE,
+    "the planner, as commands import it": _OURS.format(_ENGINE),
 }
 
 
 def closure(extra: str) -> set[str]:
     """Names of the installed packages that `graspd[extra]` requires, directly or not."""
-    seen: set[tuple[str, str]] = set()
-    waiting = [("graspd", extra)]
-    while waiting:
-        name, wanted = one = waiting.pop()
-        if one in seen or not _installed(name):
-            continue
-        seen.add(one)
-        needs = (Requirement(text) for text in distribution(name).requires or [])
-        for need in needs:
-            if need.marker is None or need.marker.evaluate({"extra": wanted}):
-                waiting += [(canonicalize_name(need.name), inner) for inner in ("", *need.extras)]
-    return {name for name, _ in seen} - {"graspd"}
+    return pin.closure([Requirement(f"graspd[{extra}]" if extra else "graspd")]).keys() - {"graspd"}
 
 
 def size_mb(name: str) -> float:
@@ -106,14 +102,6 @@ def lines(found: dict[str, Any]) -> Iterator[str]:
     for name, told in found["starts"].items():
         parts = ", ".join(f"{package} {ms:.0f}" for package, ms in told["parts_ms"])
         yield f"| {name} | {told['seconds']:.2f} | {parts} |"
-
-
-def _installed(name: str) -> bool:
-    try:
-        distribution(name)
-    except PackageNotFoundError:
-        return False
-    return True
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 from graspd import shadows
+from service.model.imports import imports
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasp, Grasps, Postures, open
@@ -91,7 +92,8 @@ def __getattr__(name: str) -> Any:
         return import_module("service.model.version").PACKAGE_VERSION
     if name not in _LIVES_IN:
         raise AttributeError(f"module 'graspd' has no attribute {name!r}")
-    found = getattr(import_module(_LIVES_IN[name]), name)
+    with imports():
+        found = getattr(import_module(_LIVES_IN[name]), name)
     globals()[name] = found
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
@@ -9,6 +10,7 @@ from typing import Any, Final
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from service.model.imports import imports, own_process
 from service.model.version import PACKAGE_VERSION
 
 #: Command, module of its group, panel of the overview, help.
@@ -120,7 +122,8 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
             f"graspd: `graspd {name}` is not part of this install; run pip install 'graspd[{missing}]'", err=True
         )
         raise typer.Exit(1)
-    group: Any = typer.main.get_command(import_module(module).app)
+    with imports():
+        group: Any = typer.main.get_command(import_module(module).app)
     # A Typer with a single command is that command itself, not a group.
     command = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
     if isinstance(command, TyperGroup):
@@ -166,4 +169,7 @@ def _entry() -> None:
 
 def main() -> None:
     """Entry point of the `graspd` command."""
+    own_process()
+    # No command draws with MuJoCo; at import it would look for GLFW with a process of its own.
+    os.environ.setdefault("MUJOCO_GL", "disable")
     build()()

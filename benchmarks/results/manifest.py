@@ -100,7 +100,7 @@ def entered(study: Study, docs: Path) -> dict[str, Any]:
 
 def stage_revisions_at(revision: str) -> dict[str, int] | None:
     """`STAGE_REVISIONS` as a commit has them; None where it has none or is not there."""
-    text = _git("grep", "-h", "-A4", "STAGE_REVISIONS.*= {", revision, "--", "*.py", check=False)
+    text = _git("grep", "-h", "-A4", "STAGE_REVISIONS.*= {", revision, "--", "*.py")
     found = _REVISIONS.search(text)
     return json.loads(found[1].replace(",}", "}").replace("'", '"')) if found else None
 
@@ -119,12 +119,16 @@ def _sha256(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def _git(*arguments: str, check: bool = True) -> str:
-    done = subprocess.run(["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=check)
-    return done.stdout.strip()
+def _git(*arguments: str) -> str:
+    """What git says of this checkout; empty where it is none, or says nothing."""
+    try:
+        done = subprocess.run(["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return ""
+    return "" if done.returncode else done.stdout.strip()
 
 
 def revision_of_today() -> str:
     """The commit that stands there, with `+` where files differ from it."""
     changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":!docs")
-    return _git("rev-parse", "--short", "HEAD") + ("+" if changed else "")
+    return (_git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")

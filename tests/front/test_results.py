@@ -12,7 +12,7 @@ import pytest
 import graspd.cli
 from benchmarks.results import manifest, page
 from benchmarks.results.__main__ import main
-from benchmarks.results.manifest import DOCS, INDEX, digests, entered, faults, load, staleness, there
+from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
 from benchmarks.results.running import Runner
 from benchmarks.results.studies import BY_NAME, STUDIES, Study
 from service.model.version import STAGE_REVISIONS
@@ -59,7 +59,7 @@ def test_the_index_says_what_the_manifest_says() -> None:
 
 def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     study = BY_NAME["robust"]
-    record = entered(study, DOCS) | {"stage_revisions": STAGE_REVISIONS | {"synthesize": 1}}
+    record = load(DOCS)["robust"] | {"stage_revisions": STAGE_REVISIONS | {"synthesize": 1}}
     assert staleness(study, record) == "of synthesize 1"
     assert "| **stale**: of synthesize 1 |" in page.index({"robust": record})
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""

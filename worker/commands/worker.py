@@ -15,6 +15,7 @@ from service import tracing
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
 from service.model.domain import Stage
 from service.model.errors import InputError, UnavailableError
+from service.model.imports import imports
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)
@@ -55,7 +56,8 @@ def worker(
             raise InputError("--burst, --once and --max-tasks are for a single worker")
         _run_several(workers, settings, stages)
         return
-    from worker.process.main import run_worker
+    with imports():
+        from worker.process.main import run_worker
 
     tracing.set_up("worker")
     ended_well = run_worker(

@@ -10,6 +10,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from service.model.errors import InputError
+from service.model.imports import imports
 from worker.planners.port import Joined, Method, Options, Planner
 
 #: Entry-point group of planners of other packages.
@@ -38,7 +39,8 @@ def method(name: str) -> Method:
     """
     if name in PLANNERS:
         module, attribute = PLANNERS[name]
-        own: Method = getattr(import_module(module), attribute)
+        with imports():
+            own: Method = getattr(import_module(module), attribute)
         return own
     offered = _offered()
     if name not in offered:

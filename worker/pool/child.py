@@ -18,6 +18,8 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any
 
+from service.model.imports import imports, own_process
+
 
 @dataclass(frozen=True)
 class Order:
@@ -46,8 +48,10 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 
     # Imports and work may take seconds: whether somebody still wants them is told by a thread of its own.
     threading.Thread(target=read, daemon=True).start()
-    for name in modules:
-        import_module(name)
+    own_process()
+    with imports():
+        for name in modules:
+            import_module(name)
     kept: dict[str, Any] = {}
     while True:
         answer = _answer(orders.get(), kept)

@@ -16,6 +16,7 @@ import numpy as np
 
 from service.model.domain import JobRequest, Stage
 from service.model.errors import GraspdError
+from service.model.imports import imports
 
 if TYPE_CHECKING:
     from worker.objects.model import ObjectModel
@@ -48,7 +49,8 @@ def check_engine(device: Callable[[], str], stages: Collection[Stage], *, thread
         of_device = device()
         for stage in stages:
             name = stage.value
-            importlib.import_module(f"worker.stages.{name}")
+            with imports():
+                importlib.import_module(f"worker.stages.{name}")
             if stage in _CHECKS:
                 _CHECKS[stage](Run(of_device, threads))
     except Exception as error:
