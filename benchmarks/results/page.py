@@ -15,7 +15,7 @@ from benchmarks.results.studies import STUDIES
 from service.model.version import STAGE_REVISIONS
 
 PAGES: Final = (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")))
-_BLOCK: Final = re.compile(r"(<!-- (results/[^ ]+) -->\n).*?\n(<!-- /\2 -->)", re.DOTALL)
+_BLOCK: Final = re.compile(r"(<!-- (results/[^ ]+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
 _CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)?(?:docs/)?((?:results|images)/[^)#\"]+)")
 
 
