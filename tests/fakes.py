@@ -190,7 +190,7 @@ def main() -> None:
         hold_interpreter(float(os.environ.get("FAKE_LOCK_S", "0")))
         if str(message.batch) == poison:
             os.kill(os.getpid(), 9)
-        leaked.append(os.urandom(2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
+        leaked.append(b"1" * (2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 
     if once := os.environ.get("FAKE_PACKED"):
