@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from service.index.rebuild import differences, rebuild
 from service.index.sample import compare, draw
 from service.model import names
 from service.model.ability import need_of
+from service.model.clock import timestamp
 from service.model.domain import Stage, State
-from service.model.errors import DamagedError
+from service.model.errors import DamagedError, InputError
 from service.model.records import JobRecord
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
@@ -24,8 +27,9 @@ from service.pipeline.keeper import Keeper
 from service.pipeline.repair import repair
 from service.pipeline.scrub import scan
 from service.pipeline.sweeper import Sweeper
-from service.queue.port import READS_PACKS, EventKind
+from service.queue.port import READS_PACKS, Event, EventKind
 from service.readers import open_shards
+from service.run.store_commands import app
 from service.settings import Settings
 from service.store import packs
 from service.store.manifests import publish_shard
@@ -108,6 +112,9 @@ def test_one_event_and_one_object_index_all_shards_of_a_pack(bench: Bench) -> No
     assert bench.parts.index.jobs.get(job).grasps == 96
     assert all(shard.key.startswith(f"{key}@") for shard in bench.parts.index.shards.page(job=job).items)
     rows_are_of_the_store(bench.parts)
+    if bench.parts.store.url.startswith("file:"):
+        with pytest.raises(InputError, match="name the store"):
+            open_shards(bench.parts.settings.data_dir / "store")
     assert rebuild(bench.parts.index, bench.parts.store)["shards"] == 3
     rows_are_of_the_store(bench.parts)
 
@@ -154,16 +161,27 @@ def graceless(parts: Parts) -> Sweeper:
     )
 
 
-def test_shards_go_from_a_pack_one_by_one_and_the_pack_with_the_last(bench: Bench) -> None:
+def verified(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+    """What `graspd store verify` counts in a store without damage."""
+    monkeypatch.setenv("GRASPD_STORE_URL", parts.store.url)
+    told = CliRunner().invoke(app, ["store", "verify", "--json", "--data-dir", str(parts.settings.data_dir)])
+    assert told.exit_code == 0, told.output
+    said = json.loads(told.stdout.splitlines()[-1])
+    return {name: said[name] for name in ("shards", "unused_bytes")}
+
+
+def test_shards_go_from_a_pack_one_by_one_and_the_pack_with_the_last(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parts = bench.parts
     jobs = [submit(parts, 2), submit(parts, 1, seed=7)]
     in_hand = take_all(parts)
     messages = [message for job in jobs for message in tasks_of(record_of(parts, job))]
     key = pack(parts.store, messages)
-    for made in read_manifests(parts.store, pack_at(parts.store, key)):
-        assert not isinstance(made, DamagedError)
-        parts.index.write.add_manifest(made)
+    parts.queue.publish(Event(kind=EventKind.PACKED, at=timestamp(), worker="w", pack=key))
+    made = pack_at(parts.store, key).shards
     end(parts, in_hand)
+    bench.pass_time(1)
 
     def delete(job: str) -> None:
         delete_job(parts, job)
@@ -172,6 +190,7 @@ def test_shards_go_from_a_pack_one_by_one_and_the_pack_with_the_last(bench: Benc
         rows_are_of_the_store(parts)
 
     delete(jobs[0])
+    assert verified(parts, monkeypatch) == {"shards": 1, "unused_bytes": sum(one.length for one in made[:2])}
     assert len(keys(parts, names.PACKS)) == 2, "the pack and what says which of it is gone"
     assert [one.id for one in pack_at(parts.store, key).living] == [messages[2].output]
     assert parts.index.overview.stats().grasps == 32
