@@ -157,7 +157,7 @@ class Runner:
             return context.store.exists(names.asset_check(message.kind, message.digest))
         if shard_exists(context.store, message.stage, message.output):
             return context.store.exists(names.shard_file(message.stage, message.output))
-        # The keeper looks through the packs before it queues a task again; here that pays where one was lost.
+        # A listing of packs for every task would cost more than a task that is done twice after a loss of Redis.
         return message.attempt > 1 and _has_manifest(message, context)
 
     def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:

@@ -37,7 +37,7 @@ class _Batch:
 
 
 class Packer:
-    """Gathers the shards of tasks that end within a short time. Safe between threads: each task has one."""
+    """Gathers the shards of tasks that end within a short time; each task comes in a thread of its own."""
 
     def __init__(
         self,
@@ -47,7 +47,6 @@ class Packer:
         least: int,
         is_read: Callable[[], bool],
         wait_s: float,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """
         Args:
@@ -56,11 +55,9 @@ class Packer:
             least: fewer shards are put each by itself.
             is_read: whether the keeper that will be told knows packs; asked before one is put.
             wait_s: how long a shard waits for others [s].
-            clock: of these seconds.
         """
         self._store, self._least, self._is_read = store, least, is_read
-        self._wait_s, self._clock = wait_s, clock
-        self._awaited = members
+        self._wait_s, self._awaited = wait_s, members
         self._changed = threading.Condition()
         self._batch: _Batch | None = None
         self._untold: dict[str, tuple[tuple[str, ...], set[str]]] = {}
@@ -83,13 +80,13 @@ class Packer:
         """
         with self._changed:
             self._awaited -= 1
-            batch = self._batch = self._batch or _Batch(self._clock() + self._wait_s)
+            batch = self._batch = self._batch or _Batch(time.monotonic() + self._wait_s)
             batch.tasks.append(task)
             batch.shards.append((manifest, data))
             batch.size += len(data)
             self._changed.notify_all()
             while not (batch.taken or self._is_due(batch)):
-                self._changed.wait(max(0.0, batch.until - self._clock()))
+                self._changed.wait(max(0.0, batch.until - time.monotonic()))
             is_mine, batch.taken = not batch.taken, True
             if is_mine:
                 self._batch = None
@@ -109,7 +106,7 @@ class Packer:
     def _is_due(self, batch: _Batch) -> bool:
         """Whether nothing more comes, or it has been waited for long enough."""
         cannot = len(batch.shards) + self._awaited < self._least
-        return cannot or self._awaited <= 0 or batch.size >= LARGEST or self._clock() >= batch.until
+        return cannot or self._awaited <= 0 or batch.size >= LARGEST or time.monotonic() >= batch.until
 
     def _carry_out(self, batch: _Batch) -> None:
         try:

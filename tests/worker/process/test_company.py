@@ -119,6 +119,7 @@ def test_shards_of_tasks_that_end_together_are_one_object_and_one_event(
     assert [told[task.task_id] for task in tasks] == [[EventKind.STARTED]] * 4
     (end,) = [event for _, event in rq_queue.tail("0", limit=99, wait_s=0) if event.kind is EventKind.PACKED]
     store = open_store((tmp_path / "store").as_uri())
+    assert end.job_id == failed.job_id, "it goes to the keeper of their job"
     found = [shard.id for shard in pack_at(store, end.pack).shards]
     assert sorted(found) == sorted(task.output for task in tasks)
     assert list(store.list("shards")) == []
