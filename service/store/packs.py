@@ -35,6 +35,8 @@ _HEAD: Final = struct.Struct("<8sQ")
 #: More than the directory of the largest pack takes [bytes].
 _LONGEST: Final = 1 << 26
 _REMEMBERED: Final = 200
+#: Head and directory of some two hundred shards [bytes].
+_FIRST_READ: Final = 1 << 16
 #: More than a store takes as one object [bytes].
 _LARGEST: Final = 10**14
 
@@ -147,9 +149,14 @@ _known: dict[str, Pack] = {}
 
 
 def _read_directory(store: Store, key: str) -> Pack:
-    head = store.get(str(Part(key, 0, _HEAD.size)))
+    first = store.get(str(Part(key, 0, _FIRST_READ)))
+    head, data = first[: _HEAD.size], first[_HEAD.size :]
     magic, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (b"", 0)
-    data = store.get(str(Part(key, _HEAD.size, length))) if magic == MAGIC and 0 < length <= _LONGEST else b""
+    if magic != MAGIC or length > _LONGEST:
+        length = 0
+    if length > len(data):
+        data += store.get(str(Part(key, len(first), length - len(data))))
+    data = data[:length]
     if not data or digest_bytes(data) != key.rpartition("/")[2].removesuffix(".pack"):
         raise DamagedError(f"the directory of the pack {key} is damaged; {MEND}")
     return Pack(key, _HEAD.size + length, parse_record(Directory, data, key).shards)

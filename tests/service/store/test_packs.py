@@ -139,3 +139,10 @@ def test_what_is_no_place_is_refused(tmp_path: Path, place: str) -> None:
     with pytest.raises(InputError):
         store.delete("a@1+2")
     assert store.get(str(Part("a", 1, 2))) == b"12"
+
+
+def test_a_directory_of_any_length_is_read(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    key = pack(store, batches(2))
+    whole = pack_at(store, key, anew=True)
+    monkeypatch.setattr(packs, "_FIRST_READ", 100)
+    assert pack_at(store, key, anew=True) == whole
