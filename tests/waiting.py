@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
+import httpx
+
 #: Longest wait: what takes a second on a quiet machine has come by then on any [s].
 PATIENCE_S: Final = 120.0
 
@@ -16,3 +18,14 @@ def until(met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S, log
     while not met():
         assert time.monotonic() < end, f"after {seconds:g} s still not: {what}\n{logs()}"
         time.sleep(0.02)
+
+
+def until_a_worker_is_idle(address: str) -> None:
+    """Until a worker of the service at an address takes tasks: a ready service may have some that still check their
+    engine, which compiles kernels where none are kept."""
+
+    def idle() -> bool:
+        workers = httpx.get(f"{address}/v1/workers", timeout=60, trust_env=False).json()
+        return any(worker["state"] == "idle" for worker in workers)
+
+    until(idle, "a worker takes tasks")

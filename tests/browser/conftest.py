@@ -18,7 +18,7 @@ from api.server import bind
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.api.conftest import app, furnished, parts, settings
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
 __all__ = ["app", "furnished", "parts", "settings"]
 
@@ -100,6 +100,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     supervisor.start()
     try:
         supervisor.wait_ready(PATIENCE_S)
+        until_a_worker_is_idle(supervisor.api_url)
         yield supervisor.api_url
     finally:
         supervisor.stop()

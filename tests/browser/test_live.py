@@ -16,6 +16,7 @@ from service.pipeline.datasets.spec import DatasetRequest
 from service.store.study_records import publish
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+from tests.waiting import until
 
 pytestmark = pytest.mark.browser
 
@@ -97,7 +98,7 @@ def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, part
     page.select_option("#valid", "false")
     page.wait_for_selector("#found .badge:has-text('rejected')")
     page.wait_for_url("**valid=false**")
-    assert page.locator("#found .badge:has-text('valid')").count() == 0
+    until(lambda: page.locator("#found .badge:has-text('valid')").count() == 0, "the others are gone")
     assert page.evaluate("window.stayed") is True
 
 

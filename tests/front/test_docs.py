@@ -17,6 +17,7 @@ import pytest
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.conftest import REPOSITORY
+from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 from tests.worker.hands.my_hand import write_my_hand
 
 
@@ -24,7 +25,8 @@ from tests.worker.hands.my_hand import write_my_hand
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     settings = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0)
     with Supervisor(settings, workers=1) as supervisor:
-        supervisor.wait_ready(240)
+        supervisor.wait_ready(PATIENCE_S)
+        until_a_worker_is_idle(supervisor.api_url)
         kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
         yield kept | {"GRASPD_API_URL": supervisor.api_url, "GRASPD_DATA_DIR": str(settings.data_dir)}
 

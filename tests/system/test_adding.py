@@ -19,6 +19,7 @@ from service.index.rebuild import differences
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.store import open_store
+from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
 GRIPPER = """\
 <robot name="pincer">
@@ -81,7 +82,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Supervisor]:
     settings = Settings(data_dir=tmp_path_factory.mktemp("service"), port=0, device="cpu")
     with Supervisor(settings, workers=1) as supervisor:
-        supervisor.wait_ready(60)
+        supervisor.wait_ready(PATIENCE_S)
+        until_a_worker_is_idle(supervisor.api_url)
         yield supervisor
 
 
