@@ -3,16 +3,20 @@
 SHARDS is a folder with base, scene and views shards, `demo-out/shards` say. One run, warm: all ways in turn, five
 times; of each the best pass counts, by the clock and by processor time. A ratio is to plain h5py that reads the same
 samples as many at a time; pictures one by one, in an order drawn at random, are held against plain h5py in bulk.
+With `--s3` pictures alone: from an S3 server of this machine by ranges of bytes, against the same from its disk.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
+import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +24,11 @@ import h5py
 import numpy as np
 import typer
 
-from service.readers import Grasps, Pictures, Shards, open_shards, prefetched
+from service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
 from service.readers.grasps import DEFAULT_COLUMNS
 from service.readers.pictures import Place
+from service.store.store import open_store
+from tests.servers import S3Server
 
 ROUNDS = 5
 PICTURE = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
@@ -154,6 +160,33 @@ def rows_of(loaders: list[Any]) -> Callable[[], int]:
     return lambda: sum(len(batch["row"]) for batch in itertools.chain.from_iterable(loaders))
 
 
+def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Way]:
+    """Pictures of a store, read ahead by four threads, against the same on disk; of the store nothing is held when a
+    pass begins."""
+    store = open_store(url)
+    files = []
+    for file in local:
+        data = local.path(file).read_bytes()
+        key = f"shards/{file.kind}/{file.id}.h5"
+        store.put(key, data)
+        files.append(replace(file, path=None, key=key, sha256=hashlib.sha256(data).hexdigest()))
+    remote = Shards(tuple(files), store, ShardCache(scratch), stream=True)
+    here, there = Pictures(local, PICTURE), Pictures(remote, PICTURE)
+    order = np.random.default_rng(0).permutation(len(here)).tolist()
+
+    def fresh(order: Sequence[int] | None = None) -> int:
+        remote.ranges.forget()
+        return sum(1 for _ in prefetched(there, order, workers=4, ahead=16))
+
+    return {
+        "disk, in turn": Way(lambda: sum(1 for _ in here), "disk, in turn"),
+        "disk, in turn, 2 threads": Way(lambda: sum(1 for _ in prefetched(here)), "disk, in turn"),
+        "S3, in turn": Way(fresh, "disk, in turn"),
+        "disk, drawn": Way(lambda: sum(1 for i in order if here[i]), "disk, drawn"),
+        "S3, drawn": Way(lambda: fresh(order), "disk, drawn"),
+    }
+
+
 @dataclass(frozen=True)
 class Rate:
     """Samples per second."""
@@ -181,8 +214,19 @@ def main() -> None:
     folders = [argument for argument in sys.argv[1:] if not argument.startswith("--")]
     if len(folders) != 1:
         sys.exit("give one folder of shards")
-    chosen = ways(open_shards(Path(folders[0])))
-    found = run(chosen)
+    shards = open_shards(Path(folders[0]))
+    if "--s3" in sys.argv:
+        with S3Server() as server, tempfile.TemporaryDirectory() as scratch:
+            os.environ.update(server.environment)
+            chosen = streamed(shards, server.url, Path(scratch))
+            tell(chosen, run(chosen))
+        return
+    chosen = ways(shards)
+    tell(chosen, run(chosen))
+
+
+def tell(chosen: dict[str, Way], found: dict[str, Rate]) -> None:
+    """The table, or its figures."""
     if "--json" in sys.argv:
         typer.echo(json.dumps({name: round(rate.by_clock, 1) for name, rate in found.items()}))
         return

@@ -7,7 +7,7 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.store.integrity import check_content, check_digest, gone
@@ -22,17 +22,21 @@ class ShardCache:
 
     def __init__(self, folder: Path, *, limit_bytes: int = DEFAULT_BYTES) -> None:
         """Raises InputError if the folder cannot be made."""
-        self.folder, self.limit_bytes = folder, limit_bytes
+        self.folder, self.limit_bytes, self._process = folder, limit_bytes, os.getpid()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"the cache folder {folder} cannot be made: {error.strerror}") from None
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _process=os.getpid())
 
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
         """A file of the store on this machine.
 
         Raises:
             DamagedShard: the store has no such file, or its content is not what the checksum says.
+            InputError: this process was forked, see `check_not_forked`.
             StoreUnavailable: the store does not answer.
         """
         path = self.folder / f"{sha256}.h5"
@@ -55,6 +59,7 @@ class ShardCache:
         return True
 
     def _download(self, store: Store, key: str, sha256: str, path: Path) -> None:
+        check_not_forked(store, self._process)
         handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
         partial, digest = Path(name), hashlib.sha256()
         try:
@@ -68,3 +73,16 @@ class ShardCache:
             raise gone(f"{store.url}/{key}") from None
         finally:
             partial.unlink(missing_ok=True)
+
+
+def check_not_forked(store: Store, process: int) -> None:
+    """Refuse to ask a remote store in a fork of the process that asked it first: there it would never answer.
+
+    Raises:
+        InputError: this is another process than the one of that number.
+    """
+    if os.getpid() != process and not store.url.startswith(("file:", "memory:")):
+        raise InputError(
+            f"{store.url} cannot be read in a fork of the process that opened it; "
+            "start the processes anew: DataLoader(..., multiprocessing_context='spawn')"
+        )

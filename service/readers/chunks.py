@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +23,7 @@ from service.store.shards import read_column
 
 Array = NDArray[Any]
 #: (offset, length) pairs [bytes] to their bytes.
-ReadRanges = Callable[[list[tuple[int, int]]], list[bytes]]
+ReadRanges = Callable[[list[tuple[int, int]]], Sequence[bytes | memoryview]]
 
 _SHUFFLE: Final = h5py.h5z.FILTER_SHUFFLE
 _DEFLATE: Final = h5py.h5z.FILTER_DEFLATE
@@ -40,7 +40,7 @@ class _Packed:
     places: NDArray[np.int64]
     """(rows, 2) offset and length in the file [bytes]."""
 
-    def unpack(self, data: bytes) -> Array:
+    def unpack(self, data: bytes | memoryview) -> Array:
         """The row that these bytes are; zlib.error, ValueError: they are none."""
         raw = np.frombuffer(zlib.decompress(data), np.uint8)
         size = self.dtype.itemsize
@@ -86,6 +86,11 @@ class RowTable:
         """Whether it knows of all of these."""
         return all(name in self.packed or name in self.held for name in columns)
 
+    def ranges(self, row: int, columns: Iterable[str]) -> list[tuple[int, int]]:
+        """Offset and length [bytes] in the file of a row of those columns that are packed; none past the last row."""
+        found = (self.packed[name].places for name in columns if name in self.packed)
+        return [(int(places[row, 0]), int(places[row, 1])) for places in found if row < len(places)]
+
     def row(self, row: int, columns: Iterable[str], read: ReadRanges) -> dict[str, Array]:
         """One row of some columns, for the caller to keep.
 
@@ -94,9 +99,9 @@ class RowTable:
         """
         wanted = list(columns)
         packed = [name for name in wanted if name in self.packed]
-        ranges = [(int(start), int(length)) for start, length in (self.packed[name].places[row] for name in packed)]
+        ranges = self.ranges(row, packed)
         found: dict[str, Array] = {name: np.array(self.held[name][row])[()] for name in wanted if name in self.held}
-        for name, data in zip(packed, read(ranges) if packed else [], strict=True):
+        for name, data in zip(packed, read(ranges) if ranges else [], strict=True):
             try:
                 found[name] = self.packed[name].unpack(data)
             except (zlib.error, ValueError) as error:

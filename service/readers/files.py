@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Final
+
+import h5py
 
 from service.model import names
 from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.planning import plan
 from service.model.records import JobRecord
 from service.readers.cache import DEFAULT_BYTES, ShardCache
+from service.readers.ranges import RangeReader
 from service.store.datasets import newest_snapshot
 from service.store.integrity import check_file
 from service.store.packs import Finder
@@ -45,6 +50,8 @@ class Shards:
     files: tuple[ShardFile, ...]
     store: Store | None = None
     cache: ShardCache | None = None
+    stream: bool = False
+    """Pictures of the store are read by ranges, and not kept here."""
     _by_id: dict[str, ShardFile] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -74,7 +81,31 @@ class Shards:
             for file in self.files
             if (not of_hands or file.hand in of_hands) and (not of_objects or file.object in of_objects)
         )
-        return Shards(tuple(kept), self.store, self.cache)
+        return Shards(tuple(kept), self.store, self.cache, self.stream)
+
+    def streamed(self, file: ShardFile) -> bool:
+        """Whether a shard is read by ranges."""
+        return self.stream and file.path is None and file.kind == "views"
+
+    @cached_property
+    def ranges(self) -> RangeReader:
+        """What reads the shards that are `streamed`."""
+        assert self.store is not None, "a shard without a path comes from a store"
+        return RangeReader(self.store)
+
+    @contextmanager
+    def opened(self, file: ShardFile, *, whole: bool = False) -> Iterator[h5py.File]:
+        """The HDF5 file of a shard; `whole`: of one that is streamed, pictures will be wanted too.
+
+        Raises:
+            what `path`, `open_shard` and `RangeReader.open` raise.
+        """
+        if self.streamed(file):
+            with self.ranges.open(file.key, whole=whole) as found:
+                yield found
+        else:
+            with open_shard(self.path(file)) as found:
+                yield found
 
     def path(self, file: ShardFile) -> Path:
         """The file on this machine, fetched where it is not there yet, and checked.
@@ -104,6 +135,7 @@ def open_shards(
     snapshot: str | None = None,
     cache: Path | None = None,
     cache_bytes: int = DEFAULT_BYTES,
+    stream: bool = False,
 ) -> Shards:
     """The shards of a folder (searched whole), of files, or of a job or dataset in a store.
 
@@ -114,6 +146,8 @@ def open_shards(
         snapshot: digest of another snapshot of that dataset.
         cache: folder for files of a store; by default `$XDG_CACHE_HOME/graspd/shards`.
         cache_bytes: how much of them to keep [bytes].
+        stream: read pictures from the store by ranges of bytes, as they are wanted, and keep none here. Their bytes
+            are checked as they are unpacked, not against the SHA-256 of the shard.
 
     Raises:
         NotFoundError: no such file, job, dataset or snapshot.
@@ -124,7 +158,8 @@ def open_shards(
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
         store = source if isinstance(source, Store) else open_store(source)
         found = _of_store(store, job, dataset, snapshot)
-        return Shards(_ordered(found), store, ShardCache(cache or folder("shards"), limit_bytes=cache_bytes))
+        kept = ShardCache(cache or folder("shards"), limit_bytes=cache_bytes)
+        return Shards(_ordered(found), store, kept, stream)
     given = [source] if isinstance(source, str | Path) else list(source)
     return Shards(_ordered(_local(path) for entry in given for path in _paths(Path(entry))))
 

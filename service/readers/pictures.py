@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from service.model.errors import InputError
 from service.readers.chunks import RowTable, read_file
 from service.readers.files import ShardFile, Shards
 from service.store import standing
-from service.store.shards import SCHEMAS, open_shard, read_shard
+from service.store.shards import SCHEMAS, read_shard
 
 if TYPE_CHECKING:
     from service.readers.clouds import Clouds
@@ -131,10 +130,14 @@ class Pictures(Sequence[dict[str, Any]]):
         Raises:
             DamagedShard: they are not what was written.
         """
-        path = self.shards.path(place.file)
-        wanted = list(columns)
-        table = self._table(place.file, path, wanted)
-        return table.row(place.row, wanted, lambda ranges: read_file(path, ranges))
+        file, row, wanted = place.file, place.row, list(columns)
+        if not self.shards.streamed(file):
+            path = self.shards.path(file)
+            return self._table(file, wanted).row(row, wanted, lambda ranges: read_file(path, ranges))
+        table, reader = self._table(file, wanted), self.shards.ranges
+        return table.row(
+            row, wanted, lambda ranges: reader.read(file.key, ranges, row, lambda other: table.ranges(other, wanted))
+        )
 
     def scenes_of(self, place: Place) -> Scenes:
         """The scenes of the picture's shard with the grasps that this reader keeps."""
@@ -147,7 +150,7 @@ class Pictures(Sequence[dict[str, Any]]):
         return Clouds(self, points, **options)
 
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
-        with open_shard(self.shards.path(file)) as opened:
+        with self.shards.opened(file) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
             # Grasps that were planned in their scenes bring these along in their base shard.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
@@ -162,12 +165,12 @@ class Pictures(Sequence[dict[str, Any]]):
             if not with_grasps_only or held.count(int(scene)):
                 self._places.append(Place(file, scene_shard, int(scene), row))
 
-    def _table(self, file: ShardFile, path: Path, columns: Sequence[str]) -> RowTable:
+    def _table(self, file: ShardFile, columns: Sequence[str]) -> RowTable:
         table = self._tables.get(file.id)
         if table is None or not table.has(columns):
             known = table.columns if table else ()
-            with open_shard(path) as opened:
-                table = RowTable.of(opened, {*columns, *known}, str(path))
+            with self.shards.opened(file, whole=True) as opened:
+                table = RowTable.of(opened, {*columns, *known}, str(file.path or file.key))
             self._tables[file.id] = table
             if len(self._tables) > _TABLES:
                 self._tables.popitem(last=False)

@@ -374,14 +374,14 @@ def read_shard(
 
 
 @contextmanager
-def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
+def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterator[h5py.File]:
     """The HDF5 file of a shard, for reading what is needed of it; one in a folder is checked first: `check_file`.
 
     Raises:
         InputError: not HDF5.
         DamagedShard: it is not what its checksum says, or cannot be read, here or in the body.
     """
-    name = name or ("shard" if isinstance(source, bytes) else str(source))
+    name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():
         check_file(source)
     try:

@@ -41,6 +41,8 @@ def look_from(eye: list[float]) -> Floats:
 
 
 EYES = ([0.3, 0.1, 0.25], [-0.2, 0.25, 0.3], [0.0, -0.35, 0.2])
+#: Pictures of both scenes.
+VIEWS = len(EYES) * len(POSES)
 
 
 def picture(pose: Floats, extrinsics: Floats) -> tuple[Floats, NDArray[np.uint8]]:

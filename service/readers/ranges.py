@@ -1,0 +1,226 @@
+"""Pictures of a store read by ranges of bytes: nothing is put on this machine's disk, and what is read in turn is read
+ahead, so that a request brings several pictures."""
+
+from __future__ import annotations
+
+import io
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import h5py
+
+from service.model.errors import GraspdError, NotFoundError
+from service.readers.cache import check_not_forked
+from service.store.integrity import gone
+from service.store.shards import open_shard
+from service.store.store import Store
+
+Range = tuple[int, int]
+"""Offset and length [bytes]."""
+Span = tuple[int, memoryview]
+"""Offset, and the bytes from there on."""
+
+#: Bytes of one request, at most, where pictures are read in turn; a shard no larger than this is read whole.
+AHEAD_BYTES: Final = 4 << 20
+#: Bytes that are held of all shards together.
+HELD_BYTES: Final = 64 << 20
+_OBJECTS: Final = 256
+#: Ranges with no more than this between them are one request [bytes]: that much costs less than a request.
+GAP_BYTES: Final = 1 << 16
+#: Of what HDF5 says of itself, so much is read at once [bytes]; it lies at the beginning and here and there.
+_BLOCK_BYTES: Final = 1 << 14
+#: Threads ask for neighbouring pictures in nearly the order in which these are wanted.
+_NEARLY: Final = 16
+
+
+class RangeReader:
+    """Ranges of the objects of a store. Safe between threads; a copy in another process begins with nothing held."""
+
+    def __init__(self, store: Store) -> None:
+        self._store, self._process = store, os.getpid()
+        self._objects: OrderedDict[str, _Object] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[type[RangeReader], tuple[Store]]:
+        return RangeReader, (self._store,)
+
+    @contextmanager
+    def open(self, key: str, *, whole: bool) -> Iterator[h5py.File]:
+        """The HDF5 file of a shard.
+
+        Args:
+            whole: pictures will be wanted as well: a small shard is read whole.
+
+        Raises:
+            InputError: not HDF5, or this process was forked, see `check_not_forked`.
+            DamagedShard: it is gone, or cannot be read, here or in the body.
+            StoreUnavailable: the store does not answer.
+        """
+        held = self._of(key)
+        with held.lock:
+            held.size = held.size or self._size(key)
+            small = whole and held.size <= AHEAD_BYTES
+            if small and not _covers(held.spans, (0, held.size)):
+                held.spans = [self._get(key, (0, held.size))]
+            source = _Source(held.size, held.spans if small else [], lambda span: self._get(key, span))
+        self._make_room(key)
+        opened, problem = False, None
+        try:
+            with open_shard(source, name=self._name(key)) as file:
+                opened = True
+                yield file
+        except GraspdError as error:
+            if opened and source.failed is None:
+                raise
+            # HDF5 only says that it could not read; why, the store said. The error is a new one: who kept the old one
+            # would keep what HDF5 could not open, which crashes when the process ends (h5py 3.16).
+            told = source.failed or error
+            problem = type(told)(*told.args)
+            del told
+        if problem is not None:
+            raise problem
+
+    def read(self, key: str, wanted: Sequence[Range], row: int, further: Callable[[int], Sequence[Range]]) -> list[Any]:
+        """The bytes of some ranges, in their order.
+
+        Args:
+            row: which of the object's rows they are of.
+            further: from the number of another row to its ranges; none past the last.
+
+        Raises:
+            DamagedShard: the object is gone.
+            InputError: this process was forked, see `check_not_forked`.
+            StoreUnavailable: the store does not answer.
+        """
+        held = self._of(key)
+        with held.lock:
+            if not all(_covers(held.spans, one) for one in wanted):
+                in_turn = row == 0 if held.row is None else 0 < abs(row - held.row) <= _NEARLY
+                ranges = list(wanted)
+                bytes_, next_row = sum(length for _, length in ranges), row + 1
+                while in_turn and (more := further(next_row)) and bytes_ < AHEAD_BYTES:
+                    ranges += more
+                    bytes_, next_row = bytes_ + sum(length for _, length in more), next_row + 1
+                held.spans = [self._get(key, one) for one in joined(ranges)]
+            held.row = row
+            found = [_cut(held.spans, one) for one in wanted]
+        self._make_room(key)
+        return found
+
+    def forget(self) -> None:
+        """Hold nothing any more."""
+        with self._lock:
+            self._objects.clear()
+
+    def _of(self, key: str) -> _Object:
+        with self._lock:
+            held = self._objects.setdefault(key, _Object())
+            self._objects.move_to_end(key)
+            return held
+
+    def _make_room(self, key: str) -> None:
+        with self._lock:
+            used = sum(held.bytes for held in self._objects.values())
+            for other in list(self._objects):
+                if used <= HELD_BYTES and len(self._objects) <= _OBJECTS:
+                    return
+                if other != key:
+                    used -= self._objects.pop(other).bytes
+
+    def _get(self, key: str, one: Range) -> Span:
+        check_not_forked(self._store, self._process)
+        try:
+            return one[0], memoryview(self._store.get_range(key, *one))
+        except NotFoundError:
+            raise gone(self._name(key)) from None
+
+    def _size(self, key: str) -> int:
+        check_not_forked(self._store, self._process)
+        try:
+            return self._store.size(key)
+        except NotFoundError:
+            raise gone(self._name(key)) from None
+
+    def _name(self, key: str) -> str:
+        return f"{self._store.url}/{key}"
+
+
+@dataclass
+class _Object:
+    """What is held of an object."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    size: int = 0
+    spans: list[Span] = field(default_factory=list)
+    row: int | None = None
+    """Which was asked for last."""
+
+    @property
+    def bytes(self) -> int:
+        return sum(len(data) for _, data in self.spans)
+
+
+class _Source(io.RawIOBase):
+    """An object as a file that HDF5 reads here and there, in part held already."""
+
+    def __init__(self, size: int, spans: Sequence[Span], get: Callable[[Range], Span]) -> None:
+        super().__init__()
+        self._size, self._spans, self._get, self._at = size, list(spans), get, 0
+        self.failed: GraspdError | None = None
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + (0, self._at, self._size)[whence]
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        wanted = (self._at, min(len(view), max(self._size - self._at, 0)))
+        if not _covers(self._spans, wanted):
+            first = wanted[0] // _BLOCK_BYTES * _BLOCK_BYTES
+            last = min(-(-sum(wanted) // _BLOCK_BYTES) * _BLOCK_BYTES, self._size)
+            try:
+                self._spans.append(self._get((first, last - first)))
+            except GraspdError as error:
+                # HDF5 would print an error of this function and go on: it gets zeros, which it cannot read.
+                self.failed = error.with_traceback(None)
+                self._spans.append((first, memoryview(bytes(last - first))))
+        data = _cut(self._spans, wanted)
+        view[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+
+def joined(ranges: Sequence[Range]) -> list[Range]:
+    """Ranges in order, those with little between them as one."""
+    found: list[Range] = []
+    for start, length in sorted(ranges):
+        if found and start - sum(found[-1]) <= GAP_BYTES:
+            begin = found[-1][0]
+            found[-1] = (begin, max(sum(found[-1]), start + length) - begin)
+        else:
+            found.append((start, length))
+    return found
+
+
+def _covers(spans: Sequence[Span], one: Range) -> bool:
+    return any(start <= one[0] and sum(one) <= start + len(data) for start, data in spans)
+
+
+def _cut(spans: Sequence[Span], one: Range) -> memoryview:
+    """The bytes of a range from the span with most of them; fewer than asked for where the object ends too early."""
+    parts = [data[one[0] - start : sum(one) - start] for start, data in spans if start <= one[0]]
+    return max(parts, key=len, default=memoryview(b""))

@@ -1,0 +1,222 @@
+"""Pictures read from a store by ranges of bytes: the same pictures, few requests, nothing on disk, faults by name."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from obstore.store import MemoryStore
+
+from service.model.errors import DamagedShard, InputError, StoreUnavailable
+from service.readers import Pictures, ShardCache, ShardFile, Shards, open_shards, prefetched, ranges
+from service.store.store import Store, open_store
+from tests.conftest import REPOSITORY
+from tests.service.readers import box_scenes
+from tests.service.readers.box_scenes import VIEWS
+
+VIEWS_KEY = f"shards/views/{'c' * 32}.h5"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return box_scenes.write(tmp_path_factory.mktemp("box"))
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, int, int]]]:
+    """Every range that a store is asked for."""
+    found: list[tuple[str, int, int]] = []
+    get_range = Store.get_range
+
+    def counted(self: Store, key: str, start: int, length: int) -> bytes:
+        found.append((key, start, length))
+        return get_range(self, key, start, length)
+
+    monkeypatch.setattr(Store, "get_range", counted)
+    yield found
+
+
+def streamed(folder: Path, store: Store, cache: Path) -> Shards:
+    """The shards of a folder, put into a store."""
+    files = []
+    for file in open_shards(folder):
+        assert file.path is not None
+        data, key = file.path.read_bytes(), f"shards/{file.kind}/{file.id}.h5"
+        store.put(key, data)
+        digest = hashlib.sha256(data).hexdigest()
+        files.append(ShardFile(file.id, file.kind, file.hand, file.object, file.batch, key=key, sha256=digest))
+    return Shards(tuple(files), store, ShardCache(cache), stream=True)
+
+
+def same(first: Any, second: Any) -> None:
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        assert one.keys() == other.keys()
+        for name, value in one.items():
+            np.testing.assert_array_equal(value, other[name])
+
+
+@pytest.mark.parametrize("largest", [0, 60_000, 1 << 22], ids=["row by row", "some ahead", "whole"])
+def test_the_samples_are_those_of_the_files(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest: int
+) -> None:
+    monkeypatch.setattr(ranges, "AHEAD_BYTES", largest)
+    local = Pictures(open_shards(folder))
+    remote = Pictures(streamed(folder, open_store("memory://"), tmp_path))
+    same(remote, local)
+    same([remote[k] for k in (5, 0, 3, 3)], [local[k] for k in (5, 0, 3, 3)])
+    same(list(prefetched(remote, workers=4, ahead=4)), local)
+    same(remote.clouds(64, noise="stereo", fuse=True), local.clouds(64, noise="stereo", fuse=True))
+
+
+def test_pictures_leave_nothing_on_the_disk(folder: Path, tmp_path: Path) -> None:
+    pictures = Pictures(streamed(folder, open_store("memory://"), tmp_path / "cache"))
+    assert sum(1 for _ in pictures) == VIEWS
+    (base,) = (tmp_path / "cache").iterdir()
+    assert base.read_bytes() == (folder / "base.h5").read_bytes()
+
+
+def test_a_request_brings_all_that_is_read_in_turn(
+    folder: Path, tmp_path: Path, asked: list[tuple[str, int, int]]
+) -> None:
+    shards = streamed(folder, open_store("memory://"), tmp_path)
+    pictures = Pictures(shards, ["image/rgb", "image/depth"])
+    pictures[0]
+    asked.clear()
+    shards.ranges.forget()
+    assert sum(1 for _ in pictures) == VIEWS
+    assert [key for key, _, _ in asked] == [VIEWS_KEY]
+
+
+def test_a_picture_drawn_from_a_large_shard_brings_its_own_bytes(
+    folder: Path, tmp_path: Path, asked: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranges, "GAP_BYTES", 0)
+    shards = streamed(folder, open_store("memory://"), tmp_path)
+    pictures = Pictures(shards, ["image/rgb", "image/depth"])
+    pictures[0]
+    shards.ranges.forget()
+    asked.clear()
+    pictures[4]
+    size = (folder / "views.h5").stat().st_size
+    assert len(asked) == 2
+    assert sum(length for _, _, length in asked) < size / VIEWS
+
+
+def test_what_is_held_is_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = ranges.RangeReader(open_store("memory://"))
+    for number in range(6):
+        reader._store.put(f"object-{number}", bytes(1000))
+    monkeypatch.setattr(ranges, "HELD_BYTES", 2500)
+    for number in range(6):
+        reader.read(f"object-{number}", [(0, 1000)], 0, lambda row: [])
+        assert sum(held.bytes for held in reader._objects.values()) <= 2500
+    assert set(reader._objects) == {"object-4", "object-5"}
+
+
+def test_damage_is_told_with_the_row_and_what_is_gone_with_its_name(folder: Path, tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path / 'store'}")
+    shards = streamed(folder, store, tmp_path / "cache")
+    pictures = Pictures(shards, ["image/depth"])
+    pictures[0]
+    table = pictures._table(shards.of("views")[0], ["image/depth"])
+    (start, length) = table.ranges(2, ["image/depth"])[0]
+    path = tmp_path / "store" / VIEWS_KEY
+    data = bytearray(path.read_bytes())
+    data[start + length // 2] ^= 0x10
+    path.write_bytes(data)
+    shards.ranges.forget()
+    with pytest.raises(DamagedShard, match="row 2 of image/depth"):
+        pictures[2]
+    path.write_bytes(data[: start + 5])
+    shards.ranges.forget()
+    with pytest.raises((DamagedShard, StoreUnavailable)):
+        pictures[2]
+    path.unlink()
+    shards.ranges.forget()
+    with pytest.raises(DamagedShard, match="is gone from the store"):
+        pictures[1]
+
+
+@pytest.mark.parametrize("largest", [0, 1 << 22], ids=["ranges", "whole"])
+def test_a_store_that_is_away_is_told_and_not_taken_for_damage(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest: int
+) -> None:
+    monkeypatch.setattr(ranges, "AHEAD_BYTES", largest)
+    shards = streamed(folder, open_store("memory://"), tmp_path)
+    pictures = Pictures(shards)
+
+    def away(*_: object) -> bytes:
+        raise StoreUnavailable("the store is away")
+
+    monkeypatch.setattr(Store, "get_range", away)
+    shards.ranges.forget()
+    with pytest.raises(StoreUnavailable, match="away"):
+        pictures[0]
+
+
+def test_a_process_that_keeps_the_error_of_a_shard_that_is_none_ends_well() -> None:
+    """HDF5 crashes at the end of a process in which something still holds a file that it could not open."""
+    code = """
+from service.model.errors import InputError
+from service.readers.ranges import RangeReader
+from service.store.store import open_store
+store = open_store("memory://")
+store.put("shards/views/none.h5", bytes(100_000))
+try:
+    with RangeReader(store).open("shards/views/none.h5", whole=False):
+        pass
+except InputError as error:
+    kept = error
+    print(kept)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    assert (done.returncode, "not a readable HDF5 file" in done.stdout) == (0, True), done.stderr[-1000:]
+
+
+def test_a_reader_goes_to_another_process_and_begins_there_with_nothing(folder: Path, tmp_path: Path) -> None:
+    store = open_store(f"file://{tmp_path / 'store'}")
+    pictures = Pictures(streamed(folder, store, tmp_path / "cache"))
+    first = pictures[3]
+    again = pickle.loads(pickle.dumps(pictures))
+    assert not again.shards.ranges._objects
+    same([again[3]], [first])
+
+
+@pytest.mark.parametrize("stream", [True, False])
+def test_a_fork_is_told_to_start_anew_instead_of_waiting_for_ever(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stream: bool
+) -> None:
+    remote = Store(MemoryStore(), "s3://bucket/graspd")
+    shards = replace(streamed(folder, remote, tmp_path), stream=stream)
+    pictures = Pictures(shards)
+    pictures[0]
+    shards.ranges.forget()
+    for path in tmp_path.iterdir():
+        path.unlink()
+    here = os.getpid()
+    monkeypatch.setattr(os, "getpid", lambda: here + 1)
+    with pytest.raises(InputError, match="spawn"):
+        pictures[0]
+
+
+def test_ranges_with_little_between_them_are_one() -> None:
+    gap = ranges.GAP_BYTES
+    assert ranges.joined([(gap + 15, 5), (0, 10), (10, 5)]) == [(0, gap + 20)]
+    assert ranges.joined([(0, 10), (gap + 11, 5)]) == [(0, 10), (gap + 11, 5)]
+    assert ranges.joined([(0, 100), (20, 10)]) == [(0, 100)]
+
+
+@pytest.mark.s3
+def test_pictures_of_s3_are_those_of_the_files(folder: Path, tmp_path: Path, s3_url: str) -> None:
+    remote = Pictures(streamed(folder, open_store(s3_url), tmp_path))
+    same(list(prefetched(remote, workers=4)), Pictures(open_shards(folder)))
