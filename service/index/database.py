@@ -19,6 +19,7 @@ from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlche
 
 from service.index.metric_columns import add_missing
 from service.index.sqlite_file import Identity, SqliteFile
+from service.index.write_turns import Concerns, take_turn
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
 log = logging.getLogger(__name__)
@@ -29,8 +30,6 @@ MIGRATIONS: Final = Path(__file__).parent / "migrations"
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
 _MIGRATION_LOCK: Final = 0x67727370
-#: The same for one writer at a time.
-_WRITE_LOCK: Final = 0x67727371
 #: Codes of SQLite for a file whose content makes no sense.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -67,11 +66,15 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self, within: Connection | None = None) -> Iterator[Connection]:
+    def writing(self, within: Connection | None = None, *, concerns: Concerns | None = None) -> Iterator[Connection]:
         """A transaction, or part of the one given: all of it is kept or nothing. Writers take turns, on every database.
 
         States are derived from facts that are read in the same transaction: two of these at once would each miss what
         the other brings.
+
+        Args:
+            concerns: finds the jobs of which it changes tasks and states, and nothing of others. On PostgreSQL it then
+                need not wait for writers that concern others.
         """
         if within is not None:
             yield within
@@ -82,7 +85,7 @@ class Database:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
-                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITE_LOCK})
+                take_turn(connection, concerns)
             yield connection
             connection.commit()
 

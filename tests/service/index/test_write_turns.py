@@ -1,0 +1,134 @@
+"""Several keepers write one index at once: right on every database; on PostgreSQL they do not wait for one another."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+
+from service.index.index import Index
+from service.index.rebuild import differences
+from service.model import names
+from service.model.clock import timestamp
+from service.model.domain import AssetKind, Lane, State
+from service.model.planning import message_of, plan
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.settings import Settings
+from service.store.records import put_record
+from service.store.store import open_store
+from tests.fakes import add_assets, make_shard, request
+from tests.indexes import empty_index
+from tests.memory_queue import MemoryQueue
+from tests.servers import PostgresServer
+from tests.waiting import PATIENCE_S, until
+
+KEEPERS = 4
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database of each kind in turn."""
+    if request.param == "postgres":
+        server: PostgresServer = request.getfixturevalue("postgres_server")
+        return server.database()
+    return f"sqlite:///{tmp_path / 'index.sqlite'}"
+
+
+@pytest.fixture
+def processes(url: str, tmp_path: Path) -> Iterator[list[Parts]]:
+    """The same service as several processes have it."""
+    with ExitStack() as stack:
+        store = open_store("memory://")
+        made = [Parts(Settings(data_dir=tmp_path), store, empty_index(url), MemoryQueue()) for _ in range(KEEPERS)]
+        for parts in made:
+            stack.callback(parts.index.close)
+        add_assets(made[0])
+        yield made
+
+
+def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord:
+    """A job whose id begins with a digit."""
+    hand, obj = (
+        parts.index.assets.get(kind, name).digest
+        for kind, name in ((AssetKind.HAND, "gripper"), (AssetKind.OBJECT, "ball"))
+    )
+    record = JobRecord(
+        id=f"{place:x}{seed:031x}", request=request(grasps=32 * batches, seed=seed), hand_digest=hand,
+        object_digest=obj, lane=Lane.BULK, created=timestamp(),
+    )  # fmt: skip
+    put_record(parts.store, names.job_record(record.id), record)
+    parts.index.write.add_job(record)
+    return record
+
+
+def test_keepers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Parts]) -> None:
+    """Each indexes the jobs of its shard, two of eight; each job wants what a job of another shard wants as well."""
+    jobs = [enter(processes[0], 2 * place, place % 4, batches=3) for place in range(8)]
+    messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}
+    made = {message.output: make_shard(processes[0].store, message) for job in jobs[:4] for message in messages[job.id]}
+    begun = threading.Barrier(KEEPERS)
+
+    def keep(number: int) -> None:
+        parts = processes[number]
+        tasks = [message for job in jobs[2 * number : 2 * number + 2] for message in messages[job.id]]
+        tasks = tasks if number % 2 else tasks[::-1]
+        begun.wait(PATIENCE_S)
+        for first in range(0, len(tasks), 2):
+            some = tasks[first : first + 2]
+            parts.index.live.set_queued([message.task_id for message in some])
+            parts.index.live.set_running({message.task_id: f"worker-{number}" for message in some})
+            parts.index.write.add_manifests([made[message.output] for message in some])
+
+    with ThreadPoolExecutor(KEEPERS) as pool:
+        for done in [pool.submit(keep, number) for number in range(KEEPERS)]:
+            done.result(PATIENCE_S)
+    assert {processes[0].index.jobs.get(job.id).state for job in jobs} == {State.SUCCEEDED}
+    assert differences(processes[0].index, processes[0].store) == []
+    ends = processes[0].index.outgoing.ends(0, limit=99)
+    assert sorted(end.subject for end in ends) == sorted(job.id for job in jobs), "each is told once"
+    assert len({end.seq for end in ends}) == len(jobs)
+
+
+@pytest.mark.postgres
+def test_on_postgresql_only_writers_of_the_same_jobs_wait(postgres_server: PostgresServer) -> None:
+    url = postgres_server.database()
+    first, second = Index(url), Index(url)
+
+    def waiting() -> bool:
+        with first.database.reading() as connection:
+            return bool(
+                connection.scalar(text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"))
+            )
+
+    def write(*jobs: str) -> Callable[[], None]:
+        def run() -> None:
+            with second.database.writing(concerns=lambda _: jobs):
+                pass
+
+        return run
+
+    def write_anything() -> None:
+        with second.database.writing():
+            pass
+
+    low, middle, high = ("0" * 32, "8" * 32, "f" * 32)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            for others, is_blocked in ((write(middle), False), (write(middle, high), True), (write_anything, True)):
+                with first.database.writing(concerns=lambda _: (high, low)):
+                    done: Future[None] = pool.submit(others)
+                    if is_blocked:
+                        until(waiting, "the other waits")
+                        assert not done.done()
+                    else:
+                        done.result(PATIENCE_S)
+                done.result(PATIENCE_S)
+    finally:
+        first.close()
+        second.close()
