@@ -10,13 +10,14 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.readers import Pictures, Shards, open_shards
+from service.readers.cloud_views import COLUMNS
 from service.readers.depth_noise import noise_of
 from service.store import standing
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
 from worker.files.choice import choose
 from worker.files.exchange.imported import plain_name
-from worker.files.exchange.lots import SEEN, Lot, held_out
+from worker.files.exchange.lots import Lot, held_out
 from worker.files.exchange.written import Written
 
 FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
@@ -62,7 +63,7 @@ def _write(
 
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
-    columns = SEEN if format_ in ("dexlearn", "dexgraspnet2") else (*SEEN, "image/rgb")
+    columns = COLUMNS if format_ in ("dexlearn", "dexgraspnet2") else (*COLUMNS, "image/rgb")
     pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unjudged=wishes.unjudged)
     if format_ == "lerobot":
         return lerobot.write(lots, pictures, folder, out)

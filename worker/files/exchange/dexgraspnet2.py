@@ -56,6 +56,8 @@ HELD_OUT: Final = (range(90, 100), range(100, 190))
 #: Keys of a file of grasps that are no joints.
 _PLACE: Final = ("translation", "rotation", "point")
 _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
+#: What NumPy's writer takes for arguments of its own.
+_NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
 #: A `meta` file takes two kilobytes; unpacked it is at most a thousand times as large [bytes].
 _LARGEST_META: Final = 64 * 2**10
 
@@ -151,7 +153,7 @@ def _camera(look: Look) -> Floats:
 
 def _write_grasps(look: Look, lot: Lot, folder: Path) -> None:
     names = lot.hand.joint_names
-    if taken := set(names) & {*_PLACE, *_OURS}:
+    if taken := set(names) & {*_PLACE, *_OURS, *_NUMPYS}:
         raise InputError(f"{lot.hand.name} has a joint {sorted(taken)[0]!r}, which is a key of DexGraspNet 2.0's files")
     in_camera = compose(pose_from_matrix(look.extrinsics), look.object_pose)
     some = {name: getattr(lot.grasps, name).take(look.rows) for name in ("pregrasp", "grasp", "squeeze")}

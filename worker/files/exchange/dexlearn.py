@@ -112,7 +112,7 @@ def _clouds(
     written: dict[Path, int] = {}
     for look in looks(pictures):
         scene = scenes.get((look.base, look.scene if on_table.get(look.base) else _FREE))
-        if scene is None or not len(points := _points(pictures, look, noise, on_table=on_table[look.base])):
+        if scene is None or not len(points := points_of(pictures, look, noise, on_table=on_table[look.base])):
             continue
         number = written[scene] = written.get(scene, -1) + 1
         place = folder / VISION / _scene_id(scene)
@@ -125,7 +125,8 @@ def _clouds(
     return sum(number + 1 for number in written.values()), len(bare)
 
 
-def _points(pictures: Pictures, look: Look, noise: DepthNoise | None, *, on_table: bool) -> Floats:
+def points_of(pictures: Pictures, look: Look, noise: DepthNoise | None, *, on_table: bool) -> Floats:
+    """(P, 3) what a picture shows of its object, in the table's frame, or where it is none in the object's own [m]."""
     points = object_points(pictures[look.index], look.index, noise)
     return points if on_table else apply(invert(look.object_pose), points)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.transforms import compose, invert, pose_from_matrix
 from service.readers import DepthNoise, Pictures
-from service.readers.cloud_views import COLUMNS, CloudView
+from service.readers.cloud_views import CloudView
 from service.store.shards import Shard
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -20,9 +20,6 @@ from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
-
-#: Columns of a picture that writers of clouds and depth take.
-SEEN: Final = (*COLUMNS, "camera/eye")
 
 
 @dataclass(frozen=True)
@@ -83,15 +80,16 @@ class Look:
 
 
 def looks(pictures: Pictures) -> Iterator[Look]:
-    """The pictures without their pixels. Of a pair the left one."""
-    for index in range(len(pictures)):
-        sample = pictures[index]
-        if sample["camera/eye"] == RIGHT:
+    """The pictures, none of whose pixels is read. Of a pair the left one."""
+    for index, place in enumerate(pictures.places):
+        camera = pictures.columns_of(place, ("camera/extrinsics", "camera/eye"))
+        if camera["camera/eye"] == RIGHT:
             continue
-        extrinsics = np.asarray(sample["camera/extrinsics"], float)
-        pose = compose(invert(pose_from_matrix(extrinsics)), sample["object/pose"])
-        rows = np.asarray(sample["grasp/base_row"], np.intp)
-        yield Look(index, sample["base_id"], sample["shard_id"], int(sample["scene"]), extrinsics, pose, rows)
+        extrinsics = np.asarray(camera["camera/extrinsics"], float)
+        found = pictures.scenes_of(place).grasps(place.scene, extrinsics)
+        pose = compose(invert(pose_from_matrix(extrinsics)), found["object/pose"])
+        rows = np.asarray(found["grasp/base_row"], np.intp)
+        yield Look(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
 
 
 #: The right eye of a pair, as `camera/eye` tells it.

@@ -12,12 +12,15 @@ import trimesh
 
 from service.model.errors import InputError
 from service.model.transforms import apply, compose, invert, pose_to_matrix
+from service.readers import Pictures, open_shards
+from service.readers.cloud_views import COLUMNS
+from service.readers.depth_noise import noise_of
 from service.store.shards import Shard, read_shard
 from tests.worker.files.exchange.conftest import run
 from tests.worker.files.exchange.dexlearn_loader import Data
-from worker.files.exchange import dexgraspbench
+from worker.files.exchange import dexgraspbench, dexlearn
 from worker.files.exchange.bench_hand import body_names
-from worker.files.exchange.lots import held_out
+from worker.files.exchange.lots import held_out, looks
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -86,6 +89,19 @@ def test_a_cloud_lies_on_the_object_where_its_scene_has_it(checkout: Path, block
         for cloud in sample.clouds:
             assert len(cloud) > 20
             assert np.abs(trimesh.proximity.closest_point(there, cloud)[1]).max() < POINT_M
+
+
+def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path, block: ObjectModel) -> None:
+    pictures = Pictures(open_shards(on_tables), COLUMNS, valid=False)
+    mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
+    seen = [look for look in looks(pictures) if look.base != "a" * 64]
+    assert len(seen) == 4
+    for look in seen:
+        points = dexlearn.points_of(pictures, look, None, on_table=False)
+        assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < POINT_M
+        noisy = dexlearn.points_of(pictures, look, noise_of("stereo"), on_table=False)
+        # A camera is off by some tenths of a millimetre and more, and has holes.
+        assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 
 
 def test_collected_grasps_come_back_with_their_scenes_and_verdicts(checkout: Path, stored: Shard) -> None:
