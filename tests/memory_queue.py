@@ -162,30 +162,33 @@ class MemoryQueue:
         return self._announced.get(part, 0.0) > self.clock()
 
     def take_share(self, holder: str, seconds: float, *, number: int, before: Collection[int] = ()) -> Share:
-        now = self.clock()
-        self._leases = {shard: held for shard, held in self._leases.items() if held[1] > now}
-        self._keepers = {one: until for one, until in self._keepers.items() if until > now}
-        self._keepers[number, holder] = now + seconds
-        if self._number != number:
-            if self._leases.get(0, (holder, now))[0] != holder:
-                return Share(self._number)
-            self._number = number
-        holds = Counter(by for shard, (by, _) in self._leases.items() if shard < number)
-        others = sorted((name for of, name in self._keepers if of == number), key=lambda name: (-holds[name], name))
-        fair = number // len(others) + (others.index(holder) < number % len(others))
-        held = {shard for shard, (by, _) in self._leases.items() if by == holder and shard < number}
-        free = [shard for shard in (*sorted(before), *range(number)) if shard not in self._leases]
-        held |= set(list(dict.fromkeys(free))[: max(0, fair - len(held))])
-        self._leases |= dict.fromkeys(held, (holder, now + seconds))
-        return Share(number, fair, frozenset(held))
+        with self._changed:
+            now = self.clock()
+            self._leases = {shard: held for shard, held in self._leases.items() if held[1] > now}
+            self._keepers = {one: until for one, until in self._keepers.items() if until > now}
+            self._keepers[number, holder] = now + seconds
+            if self._number != number:
+                if self._leases.get(0, (holder, now))[0] != holder:
+                    return Share(self._number)
+                self._number = number
+            holds = Counter(by for shard, (by, _) in self._leases.items() if shard < number)
+            others = sorted((name for of, name in self._keepers if of == number), key=lambda name: (-holds[name], name))
+            fair = number // len(others) + (others.index(holder) < number % len(others))
+            held = {shard for shard, (by, _) in self._leases.items() if by == holder and shard < number}
+            free = [shard for shard in (*sorted(before), *range(number)) if shard not in self._leases]
+            held |= set(list(dict.fromkeys(free))[: max(0, fair - len(held))])
+            self._leases |= dict.fromkeys(held, (holder, now + seconds))
+            return Share(number, fair, frozenset(held))
 
     def resign(self, holder: str, shards: Collection[int]) -> None:
-        for shard in shards:
-            if self._leases.get(shard, ("", 0.0))[0] == holder:
-                del self._leases[shard]
+        with self._changed:
+            for shard in shards:
+                if self._leases.get(shard, ("", 0.0))[0] == holder:
+                    del self._leases[shard]
 
     def leave(self, holder: str, *, number: int) -> None:
-        self._keepers.pop((number, holder), None)
+        with self._changed:
+            self._keepers.pop((number, holder), None)
 
     def keepers(self, part: str) -> list[Keeping]:
         return [

@@ -103,7 +103,8 @@ def test_a_lease_that_another_has_is_over_and_is_not_given_back() -> None:
     mine = sharing(queue)
     assert mine.wait(stop)
     with mine.held(stop) as over:
-        queue._leases[0] = ("another", queue.clock() + 600)
+        with queue._changed:
+            queue._leases[0] = ("another", queue.clock() + 600)
         assert over.wait(PATIENCE_S)
         stop.set()
     assert held_by(queue, "another") == {0}
