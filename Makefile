@@ -50,6 +50,9 @@ docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
 	$(BIN)/python -m benchmarks.results --pages
 
+docs-commands: $(STAMP) ## the commands that README and docs print, run as they are printed (hours; PAGE=name.md: one page)
+	$(BIN)/python -m tests.docs_commands $(PAGE)
+
 results: $(STAMP) ## every figure and picture of the docs again, resumable (DATA=, SOURCES=, BEFORE=; QUICK=1: 20 minutes)
 	$(BIN)/python -m benchmarks.results $(if $(QUICK),--quick) $(if $(DATA),--data $(DATA)) \
 		$(if $(SOURCES),--sources $(SOURCES)) $(if $(BEFORE),--before $(BEFORE))

@@ -1,0 +1,49 @@
+"""The command line knows what README and docs print, option by option; `make docs-commands` runs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of
+
+ALL = [line for page in PAGES for line in lines_of(page)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_a_page_are_those_of_the_command_line(page: Path) -> None:
+    faults = {line.text: line.fault() for line in lines_of(page)}
+    assert {text: fault for text, fault in faults.items() if fault} == {}
+
+
+def test_most_pages_have_commands_and_many_are_run() -> None:
+    assert len({line.page for line in ALL}) >= 12
+    assert sum(not line.reason for line in ALL) >= 60
+
+
+def test_every_exception_is_needed() -> None:
+    for what, why in NOT_RUN:
+        assert any(line.reason == why for line in ALL), f"nothing is left out for {what}"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("graspd synth --hand allegro --object mug -n 4 -o g.h5", ""),
+        ("graspd synth --hnd allegro", "synth has no --hnd"),
+        ("graspd synthesize mug", "no command synthesize"),
+        ("graspd datasets creat x", "datasets has no creat"),
+        ("A=1 graspd jobs | head && python -m benchmarks.no_such", "no module benchmarks.no_such"),
+        ("make no-such-verb DATA=x", "make has no no-such-verb"),
+    ],
+)
+def test_what_the_command_line_does_not_know_is_found(text: str, fault: str) -> None:
+    assert Line("page.md", text).fault() == fault
+
+
+def test_blocks_of_both_kinds_are_read_and_comments_are_not(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    fenced, indented = "```sh\ngraspd jobs   # list\n```\n", "    graspd synth \\\n        -n 4\n"
+    page.write_text(f"# T\n\n{fenced}\n{indented}\n    said: graspd\n\nEnd.\n")
+    assert [line.text for line in lines_of(page)] == ["graspd jobs", "graspd synth -n 4"]
