@@ -22,6 +22,7 @@ from tests.service.conftest import redis_server, rq_queue
 
 __all__ = ["redis_server", "rq_queue"]
 
+TODAY = "2026-11-20"
 BASE_URL = "http://127.0.0.1:8000"
 
 
@@ -36,16 +37,18 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+class _Noon(datetime):
+    """A clock that stands still."""
+
+    @classmethod
+    def now(cls, tz: tzinfo | None = None) -> _Noon:
+        return cls.fromisoformat(f"{TODAY}T12:00:00+00:00")
+
+
 @pytest.fixture
 def noon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is noon (UTC) to quotas: their day does not end while a test runs."""
-
-    class Noon(datetime):
-        @classmethod
-        def now(cls, tz: tzinfo | None = None) -> datetime:
-            return datetime(2026, 5, 1, 12, tzinfo=tz)
-
-    monkeypatch.setattr("api.access.quotas.datetime", Noon)
+    """It is noon (UTC) of `TODAY` to quotas: their day does not end while a test runs."""
+    monkeypatch.setattr("api.access.quotas.datetime", _Noon)
 
 
 @pytest.fixture

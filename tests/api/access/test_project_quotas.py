@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, tzinfo
 from typing import Any
 
 import pytest
@@ -20,26 +19,15 @@ from service.pipeline.backends import Parts
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.records import read_record
+from tests.api.conftest import TODAY
 from tests.api.factories import finish_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
-NOON = "2026-11-20"
 Ask = Callable[..., Any]
 
 
-class Noon(datetime):
-    """A clock of quotas that stands still: no test runs over midnight."""
-
-    @classmethod
-    def now(cls, tz: tzinfo | None = None) -> Noon:
-        return cls(2026, 11, 20, 12, tzinfo=UTC)
-
-
 @pytest.fixture
-def service(
-    settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[TestClient]:
-    monkeypatch.setattr("api.access.quotas.datetime", Noon)
+def service(settings: Settings, parts: Parts, redis_server: str, rq_queue: RqQueue, noon: None) -> Iterator[TestClient]:
     wanted = settings.model_copy(update={"redis_url": SecretStr(redis_server)})
     shared = Parts(wanted, parts.store, parts.index, parts.queue)
     with TestClient(create_app(wanted, shared), base_url="http://127.0.0.1:8000") as client:
@@ -64,7 +52,7 @@ def limit(settings: Settings, **limits: int) -> None:
     KeyFile(settings.resolved_keys_file).limit_project("red", ProjectLimits(**limits))
 
 
-def done(parts: Parts, job: str, *, seconds: float, device: str = "cuda:0", day: str = NOON) -> None:
+def done(parts: Parts, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
     """A job of a single task is done: on that day, in that time."""
     (made,) = finish_all(parts, read_record(JobRecord, parts.store, names.job_record(job)))
     values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
@@ -132,10 +120,10 @@ def test_usage_is_told_as_a_document_and_as_a_table_of_the_own_project_alone(
 
     def read(path: str, token: str) -> Any:
         headers = {"Authorization": f"Bearer {token}"}
-        return service.get(path, params={"since": NOON, "until": NOON}, headers=headers)
+        return service.get(path, params={"since": TODAY, "until": TODAY}, headers=headers)
 
     (own,) = read("/v1/usage", reader).json()
-    assert (own["project"], own["day"], own["grasps"], own["gpu_seconds"]) == ("red", NOON, 32, 2.5)
+    assert (own["project"], own["day"], own["grasps"], own["gpu_seconds"]) == ("red", TODAY, 32, 2.5)
     lines = read("/v1/usage.csv", reader).text.splitlines()
     assert lines == [",".join(own), ",".join(str(value) for value in own.values())]
     assert {day["project"] for day in read("/v1/usage", admin).json()} == {"red", "blue"}
