@@ -53,6 +53,7 @@ class Shards:
     stream: bool = False
     """Pictures of the store are read by ranges, and not kept here."""
     _by_id: dict[str, ShardFile] = field(default_factory=dict, repr=False)
+    _places: dict[str, str] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self._by_id.update({file.id: file for file in self.files})
@@ -93,6 +94,16 @@ class Shards:
         assert self.store is not None, "a shard without a path comes from a store"
         return RangeReader(self.store)
 
+    def place(self, file: ShardFile) -> str:
+        """Where a streamed shard lies in the store: in its pack, or by itself where that was taken apart since."""
+        if not is_part(file.key):
+            return file.key
+        assert self.store is not None, "a shard without a path comes from a store"
+        if file.id not in self._places:
+            own = names.shard_file(_STAGES[file.kind], file.id)
+            self._places[file.id] = file.key if self.store.exists(file.key) else own
+        return self._places[file.id]
+
     @contextmanager
     def opened(self, file: ShardFile, *, whole: bool = False) -> Iterator[h5py.File]:
         """The HDF5 file of a shard; `whole`: of one that is streamed, pictures will be wanted too.
@@ -101,7 +112,7 @@ class Shards:
             what `path`, `open_shard` and `RangeReader.open` raise.
         """
         if self.streamed(file):
-            with self.ranges.open(file.key, whole=whole) as found:
+            with self.ranges.open(self.place(file), whole=whole) as found:
                 yield found
         else:
             with open_shard(self.path(file)) as found:

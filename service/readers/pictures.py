@@ -134,9 +134,9 @@ class Pictures(Sequence[dict[str, Any]]):
         if not self.shards.streamed(file):
             path = self.shards.path(file)
             return self._table(file, wanted).row(row, wanted, lambda ranges: read_file(path, ranges))
-        table, reader = self._table(file, wanted), self.shards.ranges
+        table, reader, key = self._table(file, wanted), self.shards.ranges, self.shards.place(file)
         return table.row(
-            row, wanted, lambda ranges: reader.read(file.key, ranges, row, lambda other: table.ranges(other, wanted))
+            row, wanted, lambda ranges: reader.read(key, ranges, row, lambda other: table.ranges(other, wanted))
         )
 
     def scenes_of(self, place: Place) -> Scenes:
