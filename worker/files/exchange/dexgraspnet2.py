@@ -33,7 +33,7 @@ from service.model.transforms import apply, compose, invert, pose_from_matrix, p
 from service.readers import DepthNoise, Pictures
 from service.readers.cloud_views import CloudView
 from worker.files.exchange.archives import load_npz
-from worker.files.exchange.imported import Imported, completed, joints_by_name, plain_name
+from worker.files.exchange.imported import Imported, completed, joints_by_name, plain_name, verdicts
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
 from worker.files.exchange.objects import scaled_object
 from worker.files.exchange.written import Written
@@ -193,6 +193,8 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
         matrices[:, :3, :3], matrices[:, :3, 3] = found["rotation"], found["translation"]
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} is no file of grasps of DexGraspNet 2.0: {error}") from None
+    if not np.isfinite(matrices).all():
+        raise InputError(f"{path} has grasps whose place is no number")
     away = invert(_object_pose(path, number))
     model, thing = hand_from_path(hand), scaled_object(obj)
     names = [name for name in found if name not in (*_PLACE, *_OURS)]
@@ -206,7 +208,7 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Imported]:
     return [
         Imported(
             model, thing, completed(model, thing, grasp) if set_ is None else set_, path.stem,
-            published=None if published is None else np.asarray(published, np.int8).reshape(count),
+            published=None if published is None or len(np.ravel(published)) != count else verdicts(published),
         )
     ]  # fmt: skip
 

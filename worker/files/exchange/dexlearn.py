@@ -72,6 +72,7 @@ def write(
     if not clouds:
         done.notes.append("there are no pictures, so no clouds: put views beside the grasps (graspd render) to train")
     elif bare:
+        done.counts["scenes"] -= bare
         done.notes.append(f"{bare} scenes are seen by no picture; their grasps are left out")
     for group in _groups(lots):
         _write_group(group, scenes, folder, out, done, seen=bool(clouds))

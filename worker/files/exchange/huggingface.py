@@ -27,7 +27,7 @@ from service.readers.ways import scene_spec_of
 from service.store.manifests import INDEX_THRESHOLD_M
 from worker.files.exchange import parquet
 from worker.files.exchange.bench_scene import placed_of
-from worker.files.exchange.imported import Imported, joints_by_name
+from worker.files.exchange.imported import Imported, joints_by_name, verdicts
 from worker.files.exchange.lots import Lot
 from worker.files.exchange.objects import scaled_object
 from worker.files.exchange.written import Written
@@ -195,11 +195,14 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     needed = ["object", "joint_names", *(f"{name}_{what}" for name in POSTURES for what in ("pose", "joints"))]
     if missing := [name for name in needed if name not in columns]:
         raise InputError(f"{path} has no column {missing[0]!r}, so it is no table of grasps")
+    columns["object"] = list(map(str, columns["object"]))
     names = sorted(set(columns["object"]))
     if len(names) != 1 and object_name not in names:
         raise InputError(f"{path} has grasps on {', '.join(names[:8]) or 'nothing'}; name one object of them: --name")
     wanted = object_name or names[0]
-    kinds = columns.get("scene_kind", [FREE] * len(columns["object"]))
+    kinds = columns.get("scene_kind", [])
+    if len(kinds) != len(columns["object"]):
+        kinds = [FREE] * len(columns["object"])
     rows = [k for k, name in enumerate(columns["object"]) if name == wanted]
     if other := {kinds[k] for k in rows} - {FREE, TABLE}:
         raise InputError(f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only tables come back")
@@ -221,9 +224,9 @@ def _set(
             pose = np.array([columns[f"{what}_pose"][k] for k in rows], float).reshape(len(rows), 7)
             values = np.array([columns[f"{what}_joints"][k] for k in rows], float)
             parts[what] = Posture(pose, joints_by_name(model, order, values, what=str(path)))
-        verdict = np.array([columns["verdict"][k] for k in rows], np.int8) if "verdict" in columns else None
+        verdict = verdicts([columns["verdict"][k] for k in rows]) if "verdict" in columns else None
         place = np.array([columns["object_pose"][k] for k in rows], float) if on_table else None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no table of grasps: {error}") from None
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
     placed = None if place is None else placed_of(place)

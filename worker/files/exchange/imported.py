@@ -52,6 +52,11 @@ def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
     return GraspSet(grasp, pregrasp(hand, obj, grasp), squeeze(hand, obj, grasp), np.full(len(grasp), np.nan))
 
 
+def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
+    """(N,) what a file says of its grasps as 1 held, 0 dropped, -1: nothing that says so."""
+    return np.array([int(value) if value in (0, 1) else -1 for value in np.ravel(values).tolist()], np.int8)
+
+
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
     """(N, J) joint positions in the hand's order from (N, n) values in the order of `names`.
 

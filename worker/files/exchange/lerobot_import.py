@@ -13,7 +13,7 @@ from service.model.errors import InputError
 from service.model.transforms import compose, invert
 from worker.files.exchange import parquet
 from worker.files.exchange.bench_scene import placed_of
-from worker.files.exchange.imported import Imported, joints_by_name
+from worker.files.exchange.imported import Imported, joints_by_name, verdicts
 from worker.files.exchange.lerobot import ACTION, EPISODE, OBJECT, ROOT, STATE, VERDICT, task_of
 from worker.files.exchange.objects import scaled_object
 from worker.grasps import GraspSet, Posture
@@ -112,9 +112,9 @@ def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
 
 def _verdicts(path: Path, episodes: list[int]) -> NDArray[np.int8] | None:
     """(N,) as the list of episodes tells them."""
-    found: dict[int, int] = {}
+    found: dict[Any, Any] = {}
     for file in sorted((path / "meta" / "episodes").glob("*/*.parquet")):
         columns = parquet.read(file, (EPISODE, VERDICT))
         if VERDICT in columns and EPISODE in columns:
             found |= dict(zip(columns[EPISODE], columns[VERDICT], strict=True))
-    return np.array([found.get(number, -1) for number in episodes], np.int8) if found else None
+    return verdicts([found.get(number) for number in episodes]) if found else None

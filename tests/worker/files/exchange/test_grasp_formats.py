@@ -14,7 +14,7 @@ from service.model.errors import InputError
 from service.model.transforms import compose, quat_to_matrix
 from service.store.shards import read_shard
 from worker.files.exchange import ddgc, dexgraspbench, dexgraspnet, multidex
-from worker.files.exchange.imported import Origin
+from worker.files.exchange.imported import Origin, verdicts
 from worker.files.exchange.pickles import load_npy
 from worker.files.exchange.scoring import write_scored
 from worker.grasps import GraspSet
@@ -47,6 +47,21 @@ def test_what_is_no_numpy_file_is_told(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"x\.npy"):
         load_npy(path)
+
+
+def test_a_verdict_of_others_is_yes_no_or_none() -> None:
+    assert verdicts([1, 0, True, False, 1.0, None, "yes", 300, float("nan")]).tolist() == [
+        1,
+        0,
+        1,
+        0,
+        1,
+        -1,
+        -1,
+        -1,
+        -1,
+    ]
+    assert verdicts(np.array([[1], [0], [-1]])).tolist() == [1, 0, -1]
 
 
 def test_dexgraspbench_there_and_back_is_the_same_grasp_with_the_same_verdict(
