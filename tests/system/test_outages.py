@@ -50,9 +50,12 @@ def finish_and_compare(system: System, job: str, grasps: int) -> None:
 @pytest.mark.s3
 def test_a_store_killed_in_the_middle_is_waited_for(start: Start, own_s3: S3Server) -> None:
     system = start(workers=2, environment={"FAKE_SECONDS": "0.2"}, store_url=own_s3.url, retry_backoff_s=0.2)
+    system.finish(system.submit(request(seed=1)))
+    system.hold.touch()
     job = system.submit(request(grasps=32 * 20))
-    system.until(lambda: system.parts.index.jobs.get(job).grasps, "the first shard is there")
+    system.until(lambda: system.parts.index.jobs.get(job).state is State.RUNNING, "a task of it runs")
     own_s3.kill()
+    system.hold.unlink()
     system.until(lambda: any(m.startswith("waits: the store") for m in messages(system, job)), "tasks say so")
     assert system.parts.index.jobs.get(job).state is State.RUNNING
     own_s3.start()
