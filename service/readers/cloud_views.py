@@ -35,13 +35,18 @@ class CloudView:
     noise: DepthNoise | None
     seen: Floats
     """(H, W) depth as it is told [m]; not finite: nothing."""
+    angle: Floats | None
+    """(H, W) of incidence [rad]; None: without noise nobody asks."""
 
     @classmethod
     def of(cls, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> CloudView:
         """A picture; `draw` decides the noise."""
         depth = np.asarray(columns["image/depth"], float)
         k = np.asarray(columns["camera/intrinsics"], float)
-        return cls(columns, noise, depth if noise is None else noise.apply(depth, k, draw))
+        if noise is None:
+            return cls(columns, noise, depth, None)
+        angle = incidence(depth, k)
+        return cls(columns, noise, noise.apply(depth, k, draw, angle=angle), angle)
 
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
         """Rows and columns of what is seen of the object, or of the whole scene."""
@@ -62,11 +67,10 @@ class CloudView:
 
     def normals(self, row: Ints, column: Ints) -> Floats:
         """(P, 3) unit normals of some pixels, toward the camera, in the frame of the table."""
-        if self.noise is None:
+        if self.noise is None or self.angle is None:
             return transforms.quat_rotate(self._back[3:], self._normals[row, column])
         z = self._points[row, column, 2]
-        angle = incidence(self._true[..., 2], self._k)[row, column]
-        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self.noise.sigma(z, angle)
+        gap = _SLOPE * _RADIUS * z / self._k[0, 0] + _DEVIATIONS * self.noise.sigma(z, self.angle[row, column])
         fitted = fitted_normals(self._points, row, column, radius=_RADIUS, gap_m=gap)
         return transforms.quat_rotate(self._back[3:], fitted)
 

@@ -90,19 +90,22 @@ class DepthNoise:
             found = found + self.axial_angle / np.sqrt(depth) * _steepness(angle) ** 2
         return np.asarray(found)
 
-    def apply(self, depth: NDArray[Any], k: Floats, draw: np.random.Generator) -> Floats:
+    def apply(
+        self, depth: NDArray[Any], k: Floats, draw: np.random.Generator, *, angle: Floats | None = None
+    ) -> Floats:
         """What the camera tells of a picture.
 
         Args:
             depth: (H, W) true depth along the axis [m]; not finite: nothing there.
             k: (3, 3) intrinsics of the picture [px].
             draw: of all that is random; the same generator gives the same picture.
+            angle: (H, W) of incidence [rad], where it is known already.
 
         Returns:
             (H, W) depth [m]; nan: a hole.
         """
         true = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
-        angle = incidence(true, k)
+        angle = incidence(true, k) if angle is None else angle
         scale = float(k[0, 0]) / self.focal_px
         with np.errstate(invalid="ignore", divide="ignore"):
             seen = _beside(true, scale * (self.lateral_px + self.lateral_angle_px * _steepness(angle)), draw)
