@@ -148,7 +148,7 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
 
 
 def stand_ins(folder: Path) -> None:
-    """Files that the pages call the reader's own: a hand; meshes in metres, in millimetres, open, overlapping."""
+    """What the pages call the reader's own: a hand; meshes in metres, in millimetres, open, overlapping; shards."""
     import trimesh
 
     from tests.worker.hands.my_hand import write_my_hand
@@ -165,6 +165,14 @@ def stand_ins(folder: Path) -> None:
     trimesh.util.concatenate([box, box.copy().apply_translation((0.03, 0, 0))]).export(folder / "overlap.stl")
     box.update_faces(box.face_normals[:, 2] < 0.5)
     box.export(folder / "bowl.stl")
+    program = (sys.executable, "-m", "graspd")
+    few = ("-n", "8", "--hand", "allegro", "--object", "mug", "--fidelity", "draft")
+    for words in (
+        ("demo", "--out", "demo-out", "--scenes", "1", "--views", "1", *few),
+        ("synth", *few, "-o", "grasps.h5"),
+    ):
+        subprocess.run([*program, *words], cwd=folder, check=True, capture_output=True)
+    (folder / "shards").symlink_to("demo-out/shards")
 
 
 def run_page(page: Path) -> list[str]:
