@@ -69,7 +69,7 @@ def enter(parts: Parts, place: int, seed: int, *, batches: int = 1) -> JobRecord
 
 def test_keepers_that_index_at_once_leave_the_rows_that_follow_from_the_store(processes: list[Parts]) -> None:
     """Each indexes the jobs of its shard, two of eight; each job wants what a job of another shard wants as well."""
-    jobs = [enter(processes[0], 2 * place, place % 4, batches=3) for place in range(8)]
+    jobs = [enter(processes[0], 2 * place, place % 4, batches=2) for place in range(8)]
     messages = {job.id: [message_of(job, task, attempt=1, max_attempt=3) for task in plan(job)] for job in jobs}
     made = {message.output: make_shard(processes[0].store, message) for job in jobs[:4] for message in messages[job.id]}
     begun = threading.Barrier(KEEPERS)
