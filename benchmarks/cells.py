@@ -108,11 +108,15 @@ class Cell:
 
     def kept(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """What `make` finds, from the cell's folder where it was found before."""
-        file = self.folder / f"{name}.json"
-        if not file.is_file():
-            write_json(file, make())
-        found: dict[str, Any] = json.loads(file.read_text())
-        return found
+        return kept_json(self.folder / f"{name}.json", make)
+
+
+def kept_json(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a file has, or what `make` finds, which it then has."""
+    if not file.is_file():
+        write_json(file, make())
+    found: dict[str, Any] = json.loads(file.read_text())
+    return found
 
 
 def write_json(file: Path, value: object) -> None:

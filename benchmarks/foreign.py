@@ -33,8 +33,10 @@ from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
 from worker.quality.intervals import wilson
+from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
 from worker.quality.referee.judge import judge
+from worker.quality.referee.short import push_trial
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
 OTHER = "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"
@@ -91,10 +93,11 @@ class Bench:
 
     def tried(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
         """Of each plan and each model: which of the grasps hold."""
-        wanted = Wanted(count=count, fidelity=FIDELITIES["standard"], seed=seed)
+        pieces = decompose(obj)
         out: dict[str, dict[str, list[int]]] = {}
         for plan, hand in self.hands.items():
-            grasps = synthesize(hand, obj, wanted)
+            trial = push_trial(hand, obj, lambda: pieces)
+            grasps = synthesize(hand, obj, Wanted(count, FIDELITIES["standard"], seed, trial=trial))
             held = {
                 name: judge(model, obj, posed).success for name, (model, posed) in self.models(plan, grasps).items()
             }

@@ -20,7 +20,9 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
+from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.judge import judge
+from worker.quality.referee.short import push_trial
 from worker.quality.table import measure
 
 HANDS = {
@@ -47,10 +49,12 @@ class Results:
 
     def add(self, hand: HandModel, obj: ObjectModel, count: int) -> str:
         """Grasps of one more object; the cells of its row."""
-        found = synthesize(hand, obj, Wanted(count=count, fidelity=FIDELITIES["standard"], seed=SEED))
+        pieces = decompose(obj)
+        trial = push_trial(hand, obj, lambda: pieces)
+        found = synthesize(hand, obj, Wanted(count, FIDELITIES["standard"], SEED, trial=trial))
         self.seconds += found.seconds
-        self.success.append(judge(hand, obj, found).success)
-        self.hard.append(judge(hand, obj, found, hard=True).success)
+        self.success.append(judge(hand, obj, found, pieces=pieces).success)
+        self.hard.append(judge(hand, obj, found, hard=True, pieces=pieces).success)
         table = measure(hand, obj, found, friction=FRICTION, thresholds_m=[THRESHOLD_M])
         self.depth.append(table["quality/penetration_depth_mm"])
         order = np.argsort(table["quality/epsilon"][:, 0])[::-1][:BEST]

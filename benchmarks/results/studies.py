@@ -144,6 +144,12 @@ STUDIES: Final = (
         seeds=(101,), prints="results/success.md",
     ),
     Study(
+        "tried", "hands chosen by merit, and by a short test", ("results/tried.*",),
+        ("python -m benchmarks.tried DATA --work WORK --out OUT/results",),
+        (f"python -m benchmarks.tried DATA --work WORK {_LITTLE} --out OUT/results",),
+        seeds=(2027,),
+    ),
+    Study(
         "failures", "the failures that are left, with pictures", ("results/failures.*", "results/failures/*"),
         (f"python -m benchmarks.failures DATA --work WORK/cells --objects {_EIGHT} --out OUT/results",),
         (f"python -m benchmarks.failures DATA --work WORK/cells {_LITTLE} --out OUT/results",),

@@ -77,7 +77,7 @@ class Fidelity(Model):
     """How much is modelled, and so what a grasp costs. Each knob is priced by `graspd chart`."""
 
     name: str = Field("custom", max_length=64)
-    starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp, of which the best is kept")
+    starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp; half where they are tried")
     finalists: int = Field(2, ge=1, le=64, description="of these, hands that enter the fine phase")
     coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
     fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")

@@ -53,7 +53,7 @@ def synthesize(
     together = joined(method, options) if run.meeting is not None else None
     if run.meeting is None or together is None:
         return alone(hand, obj, wanted, run)
-    around = (wanted.placed.fixed, wanted.trial is not None) if wanted.placed is not None else ()
+    around = (wanted.trial is not None, wanted.placed.fixed if wanted.placed is not None else None)
     key = (hand.content, obj.content, method, repr(options), wanted.fidelity.model_dump_json(), run.device, *around)
 
     def work(asked: Sequence[Asked]) -> list[GraspSet | Exception]:

@@ -17,9 +17,9 @@ from worker.objects.model import ObjectModel
 from worker.run import Run
 from worker.simulation.surroundings import Placed
 
-#: Scores (N,) of N grasps in their scenes: the smaller the better, below 1 good enough to look at no other candidate.
-#: Called by several threads at once.
-Trial = Callable[[GraspSet, Placed], NDArray[np.float64]]
+#: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
+#: to look at no other candidate, from 2 on so bad that others are worth their time. Called by several threads at once.
+Trial = Callable[[GraspSet, Placed | None], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,7 @@ class Wanted:
     placed: Placed | None = None
     """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
     trial: Trial | None = None
-    """What several candidates of a grasp in a scene go through before one is chosen; None: the planner's own merit
-    chooses."""
+    """What several candidates of a grasp go through before one is chosen; None: the planner's own merit chooses."""
 
 
 class Planner(Protocol):

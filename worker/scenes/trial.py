@@ -29,7 +29,7 @@ TOUCHES: Final = 2.0
 
 def lift_trial(
     hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
-) -> Callable[[GraspSet, Placed], Floats]:
+) -> Callable[[GraspSet, Placed | None], Floats]:
     """A trial as `worker.planners.Wanted` takes it: (N,) scores, below 1 for grasps that hold the object when it hangs
     at half the friction, and below 2 at the whole of it, and whose way is clear.
 
@@ -41,7 +41,8 @@ def lift_trial(
     """
     lifts = ShortLifts(hand, obj, pieces, threads=threads)
 
-    def trial(grasps: GraspSet, placed: Placed) -> Floats:
+    def trial(grasps: GraspSet, placed: Placed | None) -> Floats:
+        assert placed is not None, "a lift needs a scene"
         score = lifts.scores(grasps, placed)
         held = np.flatnonzero(score < SLIPS + 1.0)
         if len(held):

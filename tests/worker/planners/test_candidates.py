@@ -18,8 +18,9 @@ from worker.objects.prepare import object_from_path
 from worker.planners import Wanted, synthesize
 from worker.planners.fast_graspd import candidates
 from worker.planners.fast_graspd.candidates import Seated
+from worker.planners.fast_graspd.planner import ATTEMPTS
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.short import SLIPS
+from worker.quality.referee.short import SLIPS, push_trial
 from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.trial import lift_trial
@@ -47,9 +48,9 @@ def taken(
     tries: list[int] = []
     seats: list[int] = []
 
-    def trial(grasps: GraspSet, placed: Placed) -> np.ndarray:
+    def trial(grasps: GraspSet, which: np.ndarray) -> np.ndarray:
         rows = grasps.stability_loss.astype(int)
-        assert (placed.index == rows // each).all()
+        assert (which == rows // each).all()
         tries.extend(rows.tolist())
         return flat[rows]
 
@@ -125,3 +126,45 @@ def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> 
     held, before = trial(one, placed) < 1.0 + SLIPS, trial(plain, placed) < 1.0 + SLIPS
     assert held.any()
     assert (held >= before).all()
+
+
+@pytest.fixture(scope="module")
+def free():
+    """A hand, an object, what is wanted of them, and the trial of free grasps."""
+    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
+    trial = push_trial(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
+    return hand, obj, Wanted(6, QUICK, seed=4), trial
+
+
+def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold(free) -> None:
+    hand, obj, wanted, trial = free
+    plain = synthesize(hand, obj, wanted, Run(threads=1))
+    tried = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=1))
+    before, after = trial(plain, None), trial(tried, None)
+    assert (before >= 1.0).any()
+    assert (after < 1.0 + SLIPS).sum() >= (before < 1.0 + SLIPS).sum()
+    assert (after < 1.0).sum() > (before < 1.0).sum()
+
+
+def test_what_a_trial_chooses_of_a_free_grasp_depends_on_no_other_grasp_and_no_thread(free) -> None:
+    hand, obj, wanted, trial = free
+    one = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=1))
+    threads = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=3))
+    fewer = synthesize(hand, obj, replace(wanted, count=2, trial=trial), Run(threads=1))
+    assert np.array_equal(one.grasp.hand_pose, threads.grasp.hand_pose)
+    assert np.array_equal(one.grasp.hand_pose[:2], fewer.grasp.hand_pose)
+
+
+def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad_hand_stays(free) -> None:
+    hand, obj, wanted, _ = free
+    scores: list[float] = []
+
+    def never(grasps: GraspSet, placed: Placed | None) -> np.ndarray:
+        assert placed is None
+        scores.extend(9.0 - 0.1 * (len(scores) + np.arange(len(grasps))))
+        return np.array(scores[-len(grasps) :])
+
+    found = synthesize(hand, obj, replace(wanted, count=1, trial=never), Run(threads=1))
+    # Half of the hands that set out without a trial, each tried, and as many again at each further attempt.
+    assert len(scores) == (1 + ATTEMPTS) * QUICK.starts // 2
+    assert len(found) == 1

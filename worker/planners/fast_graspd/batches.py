@@ -15,7 +15,7 @@ from service.model.errors import InputError, TaskCancelled
 from worker.grasps import GraspSet
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.scene_starts import free_ways
-from worker.planners.fast_graspd.schedule import in_scene
+from worker.planners.fast_graspd.schedule import in_scene, with_trial
 from worker.planners.fast_graspd.starts import start_generator
 from worker.planners.port import Asked
 from worker.planners.threads import Steps
@@ -33,7 +33,7 @@ class Batches:
         self.asked = asked
         wanted = [one.wanted for one in asked]
         in_scenes = wanted[0].placed is not None
-        self.fidelity: Fidelity = in_scene(wanted[0].fidelity) if in_scenes else wanted[0].fidelity
+        self.fidelity: Fidelity = _adapted(wanted[0].fidelity, in_scenes=in_scenes, tried=self.has_trial)
         counts = [one.count for one in wanted]
         self.owner = np.repeat(np.arange(len(asked)), counts)
         """(n,) the batch of each row."""
@@ -44,7 +44,6 @@ class Batches:
         self._steps = [Steps(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
         self.placed: Placed | None = placed_together(placed) if placed else None
-        self._owner_of_scene = np.repeat(np.arange(len(placed)), [len(scenes.object_pose) for scenes in placed])
         self.ways: list[Floats] = []
         """Free ways of each scene."""
         for owner, scenes in enumerate(placed):
@@ -60,8 +59,10 @@ class Batches:
 
     @property
     def has_trial(self) -> bool:
-        """Whether candidates go through a trial."""
-        return self.placed is not None and all(one.wanted.trial is not None for one in self.asked)
+        """Whether candidates go through a trial. Around a free object they do where the fidelity seats several."""
+        first = self.asked[0].wanted
+        several = first.placed is not None or first.fidelity.finalists > 1
+        return several and all(one.wanted.trial is not None for one in self.asked)
 
     def put_out(self, owner: int, error: Exception) -> None:
         """The batch is made no further; what became of it first stands."""
@@ -107,20 +108,27 @@ class Batches:
             start_generator(one.seed, one.batch, i, k) for one, i in zip(wanted, indices, strict=True) for k in each
         ]
 
-    def trial(self, grasps: GraspSet, placed: Placed) -> Floats:
-        """Scores (n,) of grasps in scenes of this launch, each by the trial of its own batch; of a batch that is out
-        every grasp is good enough."""
-        owners, scores = self._owner_of_scene[placed.index], np.zeros(len(grasps))
+    def trial(self, grasps: GraspSet, rows: Rows) -> Floats:
+        """Scores (n,) of grasps for these rows, each by the trial of its own batch; of a batch that is out every grasp
+        is good enough."""
+        owners, scores = self.owner[rows], np.zeros(len(grasps))
+        placed = self.placed.take(rows) if self.placed is not None else None
         for owner in np.unique(owners).tolist():
             trial, own = self.asked[owner].wanted.trial, np.flatnonzero(owners == owner)
             if trial is None or owner in self.errors:
                 continue
             try:
                 self._steps[owner](0, "trial")
-                scores[own] = trial(grasps.take(own), placed.take(own))
+                scores[own] = trial(grasps.take(own), placed.take(own) if placed is not None else None)
             except Exception as error:
                 self.put_out(owner, error)
         return scores
+
+
+def _adapted(fidelity: Fidelity, *, in_scenes: bool, tried: bool) -> Fidelity:
+    if in_scenes:
+        return in_scene(fidelity)
+    return with_trial(fidelity) if tried else fidelity
 
 
 def finalists(fidelity: Fidelity) -> int:

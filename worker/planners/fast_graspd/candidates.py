@@ -1,4 +1,4 @@
-"""Candidates of a grasp in its scene, tried one after another in the order of their merit until one is good enough."""
+"""Candidates of a grasp, tried one after another in the order of their merit until one is good enough."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.selection import posture_of, ranked
-from worker.planners.port import Trial
 from worker.quality.postures import pregrasp, squeeze
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed
@@ -53,6 +52,8 @@ class Seated:
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Seated]
 """Seats the hands of some grasps (n,): rows (n, each) of the hands that set out."""
+TrialOf = Callable[[GraspSet, NDArray[np.intp]], Floats]
+"""Scores (k,) of grasps for those that are numbered (k,); see `worker.planners.Trial`."""
 
 
 @dataclass
@@ -75,12 +76,12 @@ class Taken:
 
 
 def tried(
-    hand: HandModel, obj: ObjectModel, order: NDArray[np.intp], seat: Seat, placed: Placed, trial: Trial, *,
-    device: str = "cpu",
+    hand: HandModel, obj: ObjectModel, order: NDArray[np.intp], seat: Seat, placed: Placed | None, trial: TrialOf, *,
+    together: int = TOGETHER, device: str = "cpu",
 ) -> Taken:  # fmt: skip
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
 
-    `TOGETHER` of each grasp are seated and tried in the order of their merit, then, of grasps that have none yet, as
+    `together` of each grasp are seated and tried in the order of their merit, then, of grasps that have none yet, as
     many again. Hands that balance too badly are not tried, but for the first of each grasp.
 
     Args:
@@ -88,12 +89,13 @@ def tried(
         obj: the object.
         order: (n, each) rows of the hands of each grasp, the most promising first.
         seat: seats hands.
-        placed: scenes of the n grasps.
+        placed: scenes of the n grasps; None: free.
         trial: gives the scores.
+        together: hands of each grasp that are seated at once.
         device: finds the postures that the trial needs.
     """
     taken, left = Taken.none(len(order), hand.dofs), np.arange(len(order))
-    for wave in np.split(order, range(TOGETHER, order.shape[1], TOGETHER), axis=1):
+    for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
             break
         seated = seat(wave[left], left)
@@ -102,21 +104,21 @@ def tried(
             if not open_.any():
                 continue
             which = left[open_]
+            where = placed.take(which) if placed is not None else None
             found = with_postures(
-                hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], placed.take(which), device=device
-            )
-            _try(found, seated, rows[open_], which, placed, trial, taken)
+                hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
+            )  # fmt: skip
+            _try(found, seated, rows[open_], which, trial, taken)
         left = left[~(taken.score[left] < 1.0)]
     return taken
 
 
 def _try(
-    found: GraspSet, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp], placed: Placed, trial: Trial,
-    taken: Taken,
-) -> None:  # fmt: skip
+    found: GraspSet, seated: Seated, rows: NDArray[np.intp], which: NDArray[np.intp], trial: TrialOf, taken: Taken
+) -> None:
     """One hand each (k,) of the grasps `which` (k,), as grasps."""
     state, losses = seated.state[rows], seated.losses[rows]
-    score = np.nan_to_num(trial(found, placed.take(which)), nan=HOPELESS, posinf=HOPELESS)
+    score = np.nan_to_num(trial(found, which), nan=HOPELESS, posinf=HOPELESS)
     for k in np.flatnonzero(score < taken.score[which]):
         grasp = int(which[k])
         taken.grasps[grasp] = found.take(slice(k, k + 1))

@@ -19,7 +19,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd import scene_starts, starts
 from worker.planners.fast_graspd.batches import Batches, finalists
-from worker.planners.fast_graspd.candidates import Seated, tried, with_postures
+from worker.planners.fast_graspd.candidates import TOGETHER, Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import FRICTION, SCENE_FRICTION, best_of_each, merits, ranked
@@ -45,6 +45,10 @@ CHUNK: Final = 10
 PART: Final = 4
 #: A grasp whose merit is above this sets out once more: of such grasps a fifth (Shadow) to a half hold, of others most.
 SET_OUT_AGAIN: Final = 0.05
+#: The same of scores in a trial, see `worker.planners.port.Trial`: a tenth to a quarter of such grasps hold.
+FAILED: Final = 2.0
+#: How often grasps whose hands are tried may set out again.
+ATTEMPTS: Final = 4
 
 
 @dataclass
@@ -57,7 +61,7 @@ class Part:
     loss: Floats
     """(n,) L_stable."""
     merit: Floats
-    """(n,) of the hand that was chosen; 0 where there was nothing to choose from."""
+    """(n,) of the hand that was chosen, or its score in the trial; 0 where there was nothing to choose from."""
     curve: list[Floats] = field(default_factory=list)
     """(n,) L_stable of each grasp's hands in the mean, every `CHUNK` iterations."""
     grasps: GraspSet | None = None
@@ -68,6 +72,15 @@ class Part:
         grasps = None if self.grasps is None else self.grasps.take(which)
         curve = [one[which] for one in self.curve]
         return Part(self.rows[which], self.state[which], self.loss[which], self.merit[which], curve, grasps)
+
+    def followed_by(self, other: Part) -> Part:
+        """All grasps of both."""
+        curve = [np.concatenate(both) for both in zip(self.curve, other.curve, strict=True)]
+        both = [part.grasps for part in (self, other) if part.grasps is not None]
+        rows, loss, merit = (
+            np.concatenate([getattr(part, name) for part in (self, other)]) for name in ("rows", "loss", "merit")
+        )
+        return Part(rows, _joined_states([self.state, other.state]), loss, merit, curve, joined(both) if both else None)
 
 
 def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
@@ -241,28 +254,35 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
             merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
     seats = _Seats(launch, rows, state, losses, curve)
-    if last > 1 and placed is not None and batches.has_trial:
-        taken = tried(hand, obj, order, seats.seated, placed, batches.trial, device=pair.hand.device)
-        return Part(rows, taken.state, taken.losses, np.zeros(n), curve, taken.joined())
+    if batches.has_trial:
+
+        def trial(grasps: GraspSet, which: Rows) -> Floats:
+            return batches.trial(grasps, rows[which])
+
+        together = 1 if placed is None else TOGETHER
+        taken = tried(hand, obj, order, seats.seated, placed, trial, together=together, device=pair.hand.device)
+        return Part(rows, taken.state, taken.losses, taken.score, curve, taken.joined())
     seated = seats.seated(np.sort(order, axis=1), np.arange(n))
     winners = best_of_each(seated.merit, n, 1) if last > 1 else np.arange(n)
     return Part(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
 
 
 def _tried_again(launch: _Launch, part: Part) -> Part:
-    """Grasps of free objects that balance poorly set out once more; of both the better one stays."""
-    poor = np.flatnonzero(part.merit > SET_OUT_AGAIN)
-    if launch.batches.placed is not None or not len(poor):
+    """Grasps of free objects that balance poorly, or fail their trial, set out once more; the better one stays."""
+    if launch.batches.placed is not None:
         return part
-    begun = _set_out(launch, part.rows[poor], attempt=1)
-    again = _work(launch, begun)
-    lost = begun.depth.reshape(len(poor), -1).max(axis=1) > NO_PLACE
-    better = np.flatnonzero((again.merit < part.merit[poor]) & ~lost)
-    rows = poor[better]
-    for whole, new in [(part.state.pivot, again.state.pivot), (part.state.rotation, again.state.rotation),
-                       (part.state.q, again.state.q), (part.loss, again.loss), (part.merit, again.merit),
-                       *zip(part.curve, again.curve, strict=True)]:  # fmt: skip
-        whole[rows] = new[better]
+    limit, attempts = (FAILED, ATTEMPTS) if launch.batches.has_trial else (SET_OUT_AGAIN, 1)
+    for attempt in range(1, attempts + 1):
+        poor = np.flatnonzero(part.merit > limit)
+        if not len(poor):
+            break
+        begun = _set_out(launch, part.rows[poor], attempt)
+        again = _work(launch, begun)
+        lost = begun.depth.reshape(len(poor), -1).max(axis=1) > NO_PLACE
+        better = np.flatnonzero((again.merit < part.merit[poor]) & ~lost)
+        chosen = np.arange(len(part.rows))
+        chosen[poor[better]] = len(part.rows) + better
+        part = part.followed_by(again).take(chosen)
     return part
 
 

@@ -53,6 +53,12 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
     )
 
 
+def with_trial(fidelity: Fidelity) -> Fidelity:
+    """The fidelity of grasps of a free object whose hands are tried: those that fail are replaced by others, so half as
+    many set out at first."""
+    return fidelity.model_copy(update={"starts": -(-fidelity.starts // 2)})
+
+
 def _share(iterations: int, share: float) -> int:
     return int(np.ceil(share * iterations))
 

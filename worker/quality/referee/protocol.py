@@ -170,10 +170,11 @@ class Test:
         depth = np.maximum(0.0, -np.asarray(contact.dist))
         return float(depth[~within].max(initial=0.0)), float(depth[within].max(initial=0.0))
 
-    def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False) -> bool:
-        """From pregrasp over grasp to squeeze; False as soon as the object is lost, if told to give up."""
+    def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
+        """From pregrasp over grasp to squeeze, each in so many stages; False as soon as the object is lost, if told to
+        give up."""
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
-        for hand_pose, joints in self._way(grasps, row):
+        for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)
             self._run(STAGE_S)
             if give_up:
@@ -182,11 +183,11 @@ class Test:
                     return False
         return True
 
-    def _way(self, grasps: GraspSet, row: int) -> Iterator[tuple[Floats, Floats]]:
+    def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
         """Commanded postures (7,), (J,) from pregrasp over grasp to squeeze, one a stage."""
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
-            for stage in range(1, STAGES + 1):
-                yield blend(a, b, row, stage / STAGES)
+            for stage in range(1, stages + 1):
+                yield blend(a, b, row, stage / stages)
 
     def _save(self) -> None:
         mujoco.mj_getState(self.scene.model, self.data, self._saved, mujoco.mjtState.mjSTATE_INTEGRATION)

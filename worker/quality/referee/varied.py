@@ -91,13 +91,13 @@ class VariantTest(Test):
         super()._push(direction)
         self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
 
-    def _way(self, grasps: GraspSet, row: int) -> Iterator[tuple[Floats, Floats]]:
+    def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
         if self._lags is None:
-            yield from super()._way(grasps, row)
+            yield from super()._way(grasps, row, stages)
             return
         parts = (grasps.pregrasp, grasps.grasp, grasps.squeeze)
-        for stage in range(1, 2 * STAGES + 1):
-            even = stage / STAGES
+        for stage in range(1, 2 * stages + 1):
+            even = stage / stages
             part = int(even >= 1)
             pose, _ = blend(parts[part], parts[part + 1], row, even - part)
             # Who begins later moves faster: all are there at the end.

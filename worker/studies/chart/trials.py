@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -14,10 +15,12 @@ from service.model.domain import Fidelity
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners import Trial as Tried
 from worker.planners import Wanted, synthesize
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
+from worker.quality.referee.short import push_trial
 from worker.quality.table import measure
 from worker.run import ALONE, Run
 
@@ -63,12 +66,16 @@ class Setting:
     make: Make | None = None
     """Another way to make them than by method and fidelity: for sweeps of what no fidelity names."""
 
-    def grasps(self, hand: HandModel, obj: ObjectModel, count: int, seed: int, *, warm: bool = False) -> GraspSet:
-        """Make grasps."""
+    def grasps(
+        self, hand: HandModel, obj: ObjectModel, count: int, seed: int, *, trial: Tried | None = None,
+        warm: bool = False,
+    ) -> GraspSet:  # fmt: skip
+        """Make grasps; methods that try candidates do so by `trial`."""
         if self.make is not None:
             return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
-        return synthesize(hand, obj, Wanted(count, self.knobs, seed), self.run, method=self.method, options=options)
+        wanted = Wanted(count, self.knobs, seed, trial=trial)
+        return synthesize(hand, obj, wanted, self.run, method=self.method, options=options)
 
 
 @dataclass
@@ -93,15 +100,23 @@ class Trial:
     """Seconds of calls of `first_grasps` grasps."""
     first_grasps: int = 1
 
+    @cached_property
+    def tried(self) -> Tried | None:
+        """What candidates go through, as where grasps are made for users."""
+        return None if self.setting.run.device.startswith("cuda") else push_trial(self.hand, self.obj, self._pieces)
+
+    def _pieces(self) -> ConvexPieces:
+        return self.pieces
+
     def warm_up(self) -> None:
         """One call that is not counted: kernels, grids and samples are there afterwards."""
-        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, warm=True)
+        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, trial=self.tried, warm=True)
 
     def repeat(self) -> None:
         """One timed call, then quality and verdict of its grasps."""
         batch, run = self.setting.batch, self.setting.run
         began, used = time.perf_counter(), time.process_time()
-        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds))
+        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), trial=self.tried)
         self.seconds.append(time.perf_counter() - began)
         self.processor_seconds.append(time.process_time() - used)
         table = measure(
@@ -123,7 +138,7 @@ class Trial:
             self.first_calls.append(each * grasps)
             return
         began = time.perf_counter()
-        self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds))
+        self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), trial=self.tried)
         self.first_calls.append(time.perf_counter() - began)
 
     def values(self, key: str) -> Floats:

@@ -1,4 +1,4 @@
-"""The short lift against Coulomb's law and the lift test, on a gripper of two pads and a box on a table."""
+"""The short lift and the short pushes against Coulomb's law, on a gripper of two pads and a box."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.worker.quality.test_lift import BOX, HAND, PLACED, WHOLE, grasp
 from worker.grasps import GraspSet, joined
 from worker.quality.referee.model import OBJECT_MASS
 from worker.quality.referee.protocol import MAX_DISPLACEMENT_M, STAGE_S
-from worker.quality.referee.short import DEEP, HANGING, PHYSICS, PULL, SLIPS, ShortLifts
+from worker.quality.referee.short import DEEP, HANGING, PHYSICS, PULL, PUSHED, SLIPS, ShortLifts, push_trial
 from worker.simulation.surroundings import Placed
 
 #: Squeeze [m] whose two normal forces F = kp d hold the pull by friction: 2 mu F = PULL.
@@ -60,3 +60,43 @@ def test_threads_and_the_other_grasps_change_no_score() -> None:
     squeezes = (0.02, -0.005, 0.05)
     assert np.array_equal(scores(*squeezes, threads=3), scores(*squeezes))
     assert np.array_equal(scores(*squeezes)[1:2], scores(squeezes[1]))
+
+
+#: Of a push towards a corner what two pads must hold by friction, across their normals; the rest one of them carries.
+ACROSS = float(np.sqrt(2.0 / 3.0))
+
+
+def pushed(*squeezes: float, threads: int = 1) -> np.ndarray:
+    grasps: GraspSet = joined([grasp(squeeze) for squeeze in squeezes])
+    return push_trial(HAND, BOX, lambda: WHOLE, threads=threads)(grasps, None)
+
+
+def test_a_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
+    found = pushed(*(np.array([-0.2, 0.3, 0.6, 0.9, 1.2, 2.4]) * ACROSS * LEAST))
+    assert (np.diff(found) < 0).all()
+    # Nothing holds it, or less than a third of what is needed: at the whole friction as well.
+    assert (found[:2] >= SLIPS + 1.0).all()
+
+
+def test_a_free_box_hardly_moves_where_friction_carries_the_pushes() -> None:
+    # Twice the squeeze that holds at the whole friction holds at half of it; pads and their drives give a little.
+    assert pushed(2.4 * ACROSS * LEAST)[0] < 0.2
+
+
+def test_a_free_box_that_nothing_holds_flies_as_far_as_the_push_takes_it() -> None:
+    seconds = round(STAGE_S * PUSHED / PHYSICS.timestep) * PHYSICS.timestep
+    freely = 0.5 * PULL / OBJECT_MASS * seconds**2 / MAX_DISPLACEMENT_M
+    # Along the pads' normals they are in its way; it turns where it meets one.
+    assert pushed(-0.02)[0] - SLIPS >= 0.95 * ACROSS * freely
+
+
+def test_pads_that_start_in_a_free_box_are_no_candidates() -> None:
+    deep = grasp(0.05)
+    deep.pregrasp.joint_positions[:] += 0.02
+    assert push_trial(HAND, BOX, lambda: WHOLE)(deep, None) == [DEEP]
+
+
+def test_threads_and_the_other_grasps_change_no_score_of_a_push() -> None:
+    squeezes = (0.02, -0.005, 0.05)
+    assert np.array_equal(pushed(*squeezes, threads=3), pushed(*squeezes))
+    assert np.array_equal(pushed(*squeezes)[1:2], pushed(squeezes[1]))

@@ -1,0 +1,120 @@
+"""What it changes that hands are tried before one is taken: raw free grasps chosen by merit alone, and by the trial.
+
+usage: python -m benchmarks.tried DATA --work WORK --out FOLDER [--hands ...] [--objects ...] [--grasps 8]
+
+Both ways of a pair are made in one run; times are processor time of one thread, those of planning with the postures
+and, where hands are tried, the trials. DATA holds hands/ and objects/. A pair that WORK knows is not made again.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.cells import HANDS, cell_parser, kept_json, write_json
+from service.model.domain import FIDELITIES
+from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
+from worker.objects.prepare import object_from_path
+from worker.planners import synthesize
+from worker.planners.port import Wanted
+from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.judge import judge
+from worker.quality.referee.short import push_trial
+from worker.quality.table import measure
+from worker.run import Run
+
+#: Neither a seed that any setting was chosen with.
+SEED, WARM_SEED = 2027, 1
+FIDELITY = FIDELITIES["standard"]
+WAYS: Final = {"merit": "by merit", "trial": "tried"}
+#: Friction and threshold of ε as in the paper's table 2; its best ten are a third of these at most.
+FRICTION, THRESHOLD_M = 1.0, 0.005
+ONE = Run(threads=1)
+
+
+def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any]]:
+    """Of each of `WAYS`: counts, and seconds of all grasps."""
+    obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
+    pieces = decompose(obj)
+    trials = {"merit": None, "trial": push_trial(hand, obj, lambda: pieces)}
+    found: dict[str, dict[str, Any]] = {}
+    for way, trial in trials.items():
+        synthesize(hand, obj, Wanted(1, FIDELITY, WARM_SEED, trial=trial), ONE)
+        began = time.process_time()
+        grasps = synthesize(hand, obj, Wanted(count, FIDELITY, SEED, trial=trial), ONE)
+        planned, began = time.process_time() - began, time.process_time()
+        held = judge(hand, obj, grasps, pieces=pieces, run=ONE).success
+        judged = time.process_time() - began
+        hard = judge(hand, obj, grasps, pieces=pieces, hard=True, run=ONE).success
+        table = measure(hand, obj, grasps, friction=FRICTION, thresholds_m=[THRESHOLD_M])
+        best = np.argsort(-table["quality/epsilon"][:, 0])[: max(1, count // 3)]
+        found[way] = {
+            "grasps": count, "held": int(held.sum()), "hard": int((held & hard).sum()), "planned_s": planned,
+            "judged_s": judged, "depth_mm": float(np.median(table["quality/penetration_depth_mm"])),
+            "area_cm2": float(table["quality/contact_area_cm2"][best].mean()),
+            "epsilon": float(table["quality/epsilon"][best].mean()),
+        }  # fmt: skip
+    return found
+
+
+def row(hand: str, way: str, pairs: list[dict[str, Any]]) -> str:
+    """A line of the page: one hand's pairs, one way."""
+    grasps, held, hard = (sum(found[key] for found in pairs) for key in ("grasps", "held", "hard"))
+    planned, judged = (1e3 * sum(found[key] for found in pairs) for key in ("planned_s", "judged_s"))
+    worst = min(found["held"] / found["grasps"] for found in pairs)
+    cells = [hand, WAYS[way], f"{held / grasps:.2f}", f"{worst:.2f}", f"{hard / grasps:.2f}"]
+    cells += [f"{ms / grasps:.0f}" for ms in (planned, judged)]
+    cells += [f"{(planned + judged) / max(1, count):.0f}" for count in (held, hard)]
+    cells += [f"{np.median([found['depth_mm'] for found in pairs]):.2f}"]
+    cells += [f"{np.mean([found['area_cm2'] for found in pairs]):.0f}"]
+    cells += [f"{np.mean([found['epsilon'] for found in pairs]):.2f}"]
+    return f"| {' | '.join(cells)} |"
+
+
+def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
+    titles = ("hand", "hands chosen", "GSR", "worst object", "hard", "planner ms", "referee ms", "ms a valid grasp",
+              "ms a hard one", "PD mm", "CA cm²", "ε")  # fmt: skip
+    objects = len(next(iter(done.values())))
+    return "\n".join(
+        [
+            "# Hands that are tried",
+            "",
+            f"`python -m benchmarks.tried DATA --out docs/results`: {count} raw standard grasps of each hand on each "
+            f"of {objects} objects, seed {SEED}, free, judged by the certificate, both ways in one run. *By merit*: "
+            "the hand whose contacts balance best; *tried*: the first that holds in a short test. *hard*: holds at "
+            "half the friction, too. Times are core-ms of a raw grasp, then of one that holds. PD: median of objects' "
+            "medians; CA and ε: means of the best third by ε.",
+            "",
+            f"| {' | '.join(titles)} |",
+            f"| --- | --- |{' --: |' * (len(titles) - 2)}",
+            *(row(hand, way, [found[way] for found in pairs.values()]) for hand, pairs in done.items() for way in WAYS),
+            "",
+        ]
+    )
+
+
+def main() -> None:
+    parser = cell_parser(__doc__, grasps=8)
+    parser.add_argument("--out", type=Path, required=True)
+    asked = parser.parse_args()
+    names = asked.objects or sorted(path.parent.name for path in (asked.data / "objects").glob("*/clean.stl"))
+    kept = asked.work / f"tried-{SEED}-{asked.grasps}"
+    done: dict[str, dict[str, dict[str, Any]]] = {}
+    for hand_name in asked.hands:
+        hand = hand_from_path(asked.data / "hands" / HANDS[hand_name])
+        done[hand_name] = {}
+        for name in names:
+            mesh = asked.data / "objects" / name / "clean.stl"
+            make = partial(found_of, hand, mesh, asked.grasps)
+            done[hand_name][name] = kept_json(kept / f"{hand_name}-{name}.json", make)
+    write_json(asked.out / "tried.json", done)
+    (asked.out / "tried.md").write_text(page(done, asked.grasps))
+
+
+if __name__ == "__main__":
+    main()
