@@ -45,9 +45,12 @@ def address(app: FastAPI) -> Iterator[str]:
     listener.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """One browser for all tests; each gets a context of its own."""
+    """One browser for the tests of a module; each gets a context of its own.
+
+    While Playwright runs, its event loop does: `asyncio.run` fails in every other test of this process.
+    """
     playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra: pip install graspd[browser]")
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if program is None:
