@@ -35,10 +35,9 @@ from worker.quality.referee.lifting import judge_lifts, lift_key
 from worker.quality.referee.protocol import DIRECTIONS
 from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
-from worker.quality.referee.short import push_trial
 from worker.quality.table import measure
 from worker.run import ALONE, Run
-from worker.scenes.trial import lift_trial
+from worker.scenes.trial import trial_on
 from worker.scenes.verdicts import lift_level, scene_verdicts
 from worker.simulation.surroundings import Scenes
 
@@ -256,20 +255,10 @@ class _Work:
         return self.request.referee
 
     def _trial(self) -> Trial | None:
-        """What candidates go through, where there is a referee; the same one in all rounds.
-
-        Around free objects a GPU plans faster than the processor tries: there the planner's own merit chooses.
-        """
-        device = self._run.device.startswith("cuda")
-        if self.pieces is None or (device and self.scenes is None):
-            return None
-        if self._trials is None:
-            threads = self._run.apart().cores if device else 1
-            self._trials = (
-                push_trial(self.hand, self.obj, self.pieces.result, threads=threads)
-                if self.scenes is None
-                else lift_trial(self.hand, self.obj, self.pieces.result, threads=threads)
-            )
+        """What candidates go through, where there is a referee; the same one in all rounds."""
+        if self._trials is None and self.pieces is not None:
+            in_scenes = self.scenes is not None
+            self._trials = trial_on(self._run, self.hand, self.obj, self.pieces.result, in_scenes=in_scenes)
         return self._trials
 
     def _round(self, number: int, size: int) -> _Round:

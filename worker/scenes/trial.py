@@ -1,4 +1,5 @@
-"""The trial that candidates of a grasp go through in their scene: a short lift, and a free way in and out."""
+"""The trial that candidates of a grasp go through: in their scene a short lift, and a free way in and out; around a
+free object short pushes (`worker.quality.referee.short`)."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces
-from worker.quality.referee.short import SLIPS, ShortLifts
+from worker.quality.referee.short import SLIPS, ShortLifts, push_trial
+from worker.run import Run
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed
 
@@ -25,6 +27,18 @@ BLOCKED: Final = 8.0
 #: Added where only the referee sees the hand touch on its way, for the object's convex pieces stand out from it:
 #: the letter does not ask for the way.
 TOUCHES: Final = 2.0
+
+
+def trial_on(
+    run: Run, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, in_scenes: bool
+) -> Callable[[GraspSet, Placed | None], Floats] | None:
+    """The trial for what `run` plans on; None: the planner's own merit chooses.
+
+    Around free objects a GPU plans faster than the processor tries; in scenes it waits, for all threads that there are.
+    """
+    if not run.device.startswith("cuda"):
+        return lift_trial(hand, obj, pieces) if in_scenes else push_trial(hand, obj, pieces)
+    return lift_trial(hand, obj, pieces, threads=run.apart().cores) if in_scenes else None
 
 
 def lift_trial(

@@ -20,9 +20,9 @@ from worker.planners import Wanted, synthesize
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
-from worker.quality.referee.short import push_trial
 from worker.quality.table import measure
 from worker.run import ALONE, Run
+from worker.scenes.trial import trial_on
 
 Floats = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ class Trial:
     @cached_property
     def tried(self) -> Tried | None:
         """What candidates go through, as where grasps are made for users."""
-        return None if self.setting.run.device.startswith("cuda") else push_trial(self.hand, self.obj, self._pieces)
+        return trial_on(self.setting.run, self.hand, self.obj, self._pieces, in_scenes=False)
 
     def _pieces(self) -> ConvexPieces:
         return self.pieces
