@@ -18,7 +18,7 @@ from service.model.errors import IndexDamaged, UnavailableError
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)
-index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store.")
+index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store, or export its tables.")
 app.add_typer(index_app, name="index")
 
 _READY_S = 60.0
@@ -152,6 +152,29 @@ def rebuild(
     index.close()
     if check and found:
         raise typer.Exit(1)
+
+
+@index_app.command(epilog="graspd index export -o tables")
+@reporting_errors
+def export(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder that gets a file for each table.")],
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet files, for DuckDB or pandas."""
+    from service.index.export import export as write
+    from service.index.index import Index
+
+    index = Index(load_settings(data_dir=data_dir).resolved_index_url)
+    try:
+        rows = write(index.database, output)
+    finally:
+        index.close()
+    if json:
+        emit(rows)
+    else:
+        for name, count in rows.items():
+            typer.echo(f"{output / name}.parquet  {count} rows")
 
 
 @index_app.command(epilog="graspd index downgrade 0003")

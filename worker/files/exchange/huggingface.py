@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from service import parquet
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE
 from service.readers import DepthNoise, Pictures
 from service.readers.cloud_views import CloudView
 from service.readers.ways import scene_spec_of
 from service.store.manifests import INDEX_THRESHOLD_M
-from worker.files.exchange import parquet
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.imported import Imported, joints_by_name, verdicts
 from worker.files.exchange.lots import Lot

@@ -20,11 +20,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service import parquet
 from service.model.errors import InputError
 from service.model.transforms import compose
 from service.readers import Pictures
 from service.readers.ways import way_of
-from worker.files.exchange import parquet
 from worker.files.exchange.huggingface import png
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
 from worker.files.exchange.written import Written

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service import parquet
 from service.model.errors import InputError
 from service.model.transforms import compose, invert
-from worker.files.exchange import parquet
 from worker.files.exchange.bench_scene import placed_of
 from worker.files.exchange.imported import Imported, joints_by_name, verdicts
 from worker.files.exchange.lerobot import ACTION, EPISODE, OBJECT, ROOT, STATE, VERDICT, task_of

@@ -12,12 +12,13 @@ import pytest
 import yaml
 from PIL import Image
 
+from service import parquet
 from service.model.errors import InputError
 from service.model.transforms import apply, compose, pose_from_matrix
 from service.readers import Pictures, open_shards
 from service.store.shards import Shard, read_shard
 from tests.worker.files.exchange.conftest import run
-from worker.files.exchange import huggingface, parquet
+from worker.files.exchange import huggingface
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 

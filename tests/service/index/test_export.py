@@ -1,0 +1,50 @@
+"""Tables of the index as Parquet files, read by pyarrow itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from service.index.export import TABLES, export
+from service.model.errors import InputError
+from service.pipeline.backends import Parts
+from tests.service.index.test_projects import enter, make
+
+pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
+
+
+def test_every_row_and_value_of_a_table_is_in_its_file(parts: Parts, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("service.index.export.GROUP", 7)  # several groups of rows, the last one not full
+    make(parts, enter(parts, "vision", 1, batches=2))
+    counts = export(parts.index.database, tmp_path)
+    assert counts["grasps"] == 64 and counts["jobs"] == 1 and counts["shards"] == counts["tasks"] > 1
+    with parts.index.database.reading() as connection:
+        for name, table in TABLES.items():
+            stored = [
+                {key: json.dumps(value) if isinstance(value, dict | list) else value for key, value in row.items()}
+                for row in connection.execute(select(table).order_by(*table.primary_key.columns)).mappings()
+            ]
+            assert pq.read_table(tmp_path / f"{name}.parquet").to_pylist() == stored
+            assert len(stored) == counts[name]
+
+
+def test_an_empty_index_has_empty_tables_with_all_columns(parts: Parts, tmp_path: Path) -> None:
+    assert export(parts.index.database, tmp_path)["grasps"] == 0
+    assert pq.read_schema(tmp_path / "grasps.parquet").names == [c.name for c in TABLES["grasps"].columns]
+    assert str(pq.read_schema(tmp_path / "grasps.parquet").field("epsilon").type) == "double"
+
+
+def test_no_table_holds_what_is_secret(parts: Parts, tmp_path: Path) -> None:
+    columns = {column.name for table in TABLES.values() for column in table.columns}
+    assert not {name for name in columns if "secret" in name or "token" in name or "url" in name}
+
+
+def test_without_pyarrow_the_error_says_what_to_install(
+    parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"graspd\[parquet\]"):
+        export(parts.index.database, tmp_path)
