@@ -19,6 +19,7 @@ from worker.files.choice import choose
 from worker.files.exchange.imported import plain_name
 from worker.files.exchange.lots import Lot, held_out
 from worker.files.exchange.written import Written
+from worker.objects.families import families
 
 FORMATS: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 
@@ -52,7 +53,7 @@ def export_training(source: Path, format_: str, wishes: TrainingWishes, folder: 
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
     lots = _lots(shards, format_, wishes)
-    out = held_out({lot.name: lot.obj.digest for lot in lots}, wishes.held_out)
+    out = held_out(families({lot.name: lot.obj for lot in lots}), wishes.held_out)
     return _write(format_, lots, shards, wishes, folder, out)
 
 

@@ -46,19 +46,19 @@ class Lot:
         return hashlib.sha256(self.id.encode()).hexdigest()[:8]
 
 
-def held_out(digests: Mapping[str, str], share: float) -> frozenset[str]:
+def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
     """Objects that a network is tested on: `share` of them, at least one and not all, by the order of a hash.
 
     Args:
-        digests: of each object's files, by name. Objects of the same files come to the same side.
+        kinds: of each object by name what kind it is, see `worker.objects.families`. One kind comes to one side.
 
     Returns:
-        names; of a single object none, for there is nothing to hold out.
+        names; of a single kind none, for there is nothing to hold out.
     """
-    kinds = sorted(set(digests.values()), key=lambda digest: hashlib.sha256(digest.encode()).digest())
-    count = min(max(1, round(share * len(kinds))), len(kinds) - 1)
-    chosen = set(kinds[:count])
-    return frozenset(name for name, digest in digests.items() if digest in chosen)
+    order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
+    count = min(max(1, round(share * len(order))), len(order) - 1)
+    chosen = set(order[:count])
+    return frozenset(name for name, kind in kinds.items() if kind in chosen)
 
 
 @dataclass(frozen=True)
