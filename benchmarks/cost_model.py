@@ -87,7 +87,7 @@ class Measured:
     """Of the keeper while nothing happens [1/s]."""
     redis_ops_worker: float = 9.0
     """Signs of life of one busy worker [1/s]."""
-    keeper_core_s_per_task: float = 0.0011
+    keeper_core_s_per_task: float = 0.0013
     """CPU time of the keeper from queueing a task to its rows in the index [core s]."""
     store_reads_per_task: float = 4.0
     """Objects a task reads or asks for: its inputs, whether its output is there."""
