@@ -19,6 +19,7 @@ from service.store.store import open_store
 from tests.fakes import add_assets
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
+from tests.servers import PostgresServer
 from tests.waiting import until
 
 
@@ -54,6 +55,15 @@ def rq_queue(redis_server: str) -> Iterator[RqQueue]:
     queue.connection.flushdb()
     yield queue
     queue.close()
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
+def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database of each kind in turn."""
+    if request.param == "postgres":
+        server: PostgresServer = request.getfixturevalue("postgres_server")
+        return server.database()
+    return f"sqlite:///{tmp_path / 'index.sqlite'}"
 
 
 @pytest.fixture

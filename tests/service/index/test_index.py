@@ -40,15 +40,6 @@ from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
-def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database of each kind in turn."""
-    if request.param == "postgres":
-        server: PostgresServer = request.getfixturevalue("postgres_server")
-        return server.database()
-    return f"sqlite:///{tmp_path / 'index.sqlite'}"
-
-
 @pytest.fixture
 def index(index_url: str) -> Iterator[Index]:
     made = empty_index(index_url)

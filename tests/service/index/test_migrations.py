@@ -26,16 +26,13 @@ _CONFIG.set_main_option("script_location", str(MIGRATIONS))
 REVISIONS = [script.revision for script in ScriptDirectory.from_config(_CONFIG).walk_revisions()][::-1]
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+@pytest.fixture
+def url(index_url: str) -> str:
     """URL of an index with some data, of each kind in turn."""
-    made = f"sqlite:///{tmp_path / 'index.sqlite'}"
-    if request.param == "postgres":
-        made = request.getfixturevalue("postgres_server").database()
-    index = Index(made)
+    index = Index(index_url)
     fill(index, open_store("memory://"), grasps=600, jobs=20)
     index.close()
-    return made
+    return index_url
 
 
 @pytest.fixture

@@ -31,21 +31,14 @@ from tests.waiting import PATIENCE_S, until
 KEEPERS = 4
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database of each kind in turn."""
-    if request.param == "postgres":
-        server: PostgresServer = request.getfixturevalue("postgres_server")
-        return server.database()
-    return f"sqlite:///{tmp_path / 'index.sqlite'}"
-
-
 @pytest.fixture
-def processes(url: str, tmp_path: Path) -> Iterator[list[Parts]]:
+def processes(index_url: str, tmp_path: Path) -> Iterator[list[Parts]]:
     """The same service as several processes have it."""
     with ExitStack() as stack:
         store = open_store("memory://")
-        made = [Parts(Settings(data_dir=tmp_path), store, empty_index(url), MemoryQueue()) for _ in range(KEEPERS)]
+        made = [
+            Parts(Settings(data_dir=tmp_path), store, empty_index(index_url), MemoryQueue()) for _ in range(KEEPERS)
+        ]
         for parts in made:
             stack.callback(parts.index.close)
         add_assets(made[0])

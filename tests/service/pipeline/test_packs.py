@@ -30,31 +30,22 @@ from service.pipeline.sweeper import Sweeper
 from service.queue.port import READS_PACKS, Event, EventKind
 from service.readers import open_shards
 from service.run.store_commands import app
-from service.settings import Settings
 from service.store import packs
 from service.store.manifests import publish_shard
 from service.store.packs import pack_at, read_manifests
 from service.store.parts import part_of
 from service.store.records import read_record
-from service.store.store import open_store
 from tests.damage import flipped, overwrite
-from tests.fakes import add_assets, request
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.fakes import request
 from tests.packing import made_of, pack, packed_job, tasks_of
+from tests.service.pipeline.on_store import parts_on
 from tests.service.pipeline.test_keeper import Bench, Clock
 from tests.service.pipeline.test_scrub import work_off
 
 
 @pytest.fixture
 def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
-    on_s3 = getattr(request, "param", "files") == "s3"
-    url = request.getfixturevalue("s3_url") if on_s3 else (tmp_path / "store").as_uri()
-    settings = Settings(data_dir=tmp_path, store_url=url, retry_backoff_s=0.0)
-    made = Parts(settings, open_store(url), empty_index(settings.resolved_index_url), MemoryQueue())
-    add_assets(made)
-    yield made
-    made.close()
+    yield from parts_on(getattr(request, "param", "files"), request, tmp_path)
 
 
 @pytest.fixture

@@ -18,13 +18,10 @@ from service.pipeline.keeper import Keeper
 from service.pipeline.repair import repair
 from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
 from service.queue.port import EventKind
-from service.settings import Settings
 from service.store.manifests import ShardManifest, load_manifest, load_shard
-from service.store.store import open_store
 from tests.damage import cut, flip, overwrite, remove
-from tests.fakes import add_assets, fake_stages, request
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.fakes import fake_stages, request
+from tests.service.pipeline.on_store import parts_on
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
 
@@ -33,12 +30,7 @@ SHARDS = 6
 
 @pytest.fixture(params=["files", pytest.param("s3", marks=pytest.mark.s3)])
 def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
-    url = request.getfixturevalue("s3_url") if request.param == "s3" else (tmp_path / "store").as_uri()
-    settings = Settings(data_dir=tmp_path, store_url=url, retry_backoff_s=0.0)
-    made = Parts(settings, open_store(url), empty_index(settings.resolved_index_url), MemoryQueue())
-    add_assets(made)
-    yield made
-    made.close()
+    yield from parts_on(request.param, request, tmp_path)
 
 
 @pytest.fixture

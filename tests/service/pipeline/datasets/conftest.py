@@ -14,18 +14,13 @@ from service.store.store import open_store
 from tests.fakes import add_assets
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
-from tests.servers import PostgresServer
 from tests.service.pipeline.datasets.makers import add_asset
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
+@pytest.fixture
+def either(index_url: str, tmp_path: Path) -> Iterator[Parts]:
     """The service on an empty index of each kind in turn."""
-    url = f"sqlite:///{tmp_path / 'index.sqlite'}"
-    if request.param == "postgres":
-        server: PostgresServer = request.getfixturevalue("postgres_server")
-        url = server.database()
-    yield from _service(tmp_path, url)
+    yield from _service(tmp_path, index_url)
 
 
 @pytest.fixture

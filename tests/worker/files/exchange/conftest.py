@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from service.model.domain import FIDELITIES
-from service.store.shards import read_shard, write_shard
+from service.store.shards import Shard, read_shard, write_shard
 from worker.engines import backend
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -56,6 +56,12 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_shard("views", seen.arrays, {**seen.attributes, **mug, "shard_id": seen_id, "base_shard": base_id})
     )
     return folder
+
+
+@pytest.fixture(scope="session")
+def stored(on_tables: Path) -> Shard:
+    """The block's grasps among these."""
+    return read_shard(on_tables / "block.h5", kind="base")
 
 
 def run(*words: object) -> dict[str, Any]:

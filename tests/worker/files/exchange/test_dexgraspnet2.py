@@ -12,7 +12,7 @@ import trimesh
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
 from service.readers import Pictures, open_shards
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
 from tests.worker.files.exchange.dexgraspnet2_loader import sample, some_views
 from worker.files.exchange import archives, dexgraspnet2
@@ -34,11 +34,6 @@ def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     said = run("export", on_tables, "--format", "dexgraspnet2", "-o", folder)
     assert (said["scenes"], said["views"], said["files"]) == (4, 8, 4)
     return folder
-
-
-@pytest.fixture(scope="module")
-def stored(on_tables: Path) -> Shard:
-    return read_shard(on_tables / "block.h5", kind="base")
 
 
 @pytest.fixture(scope="module")

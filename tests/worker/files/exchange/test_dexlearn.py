@@ -15,7 +15,7 @@ from service.model.transforms import apply, compose, invert, pose_to_matrix
 from service.readers import Pictures, open_shards
 from service.readers.cloud_views import COLUMNS
 from service.readers.depth_noise import noise_of
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
 from tests.worker.files.exchange.dexlearn_loader import Data
 from worker.files.exchange import dexgraspbench, dexlearn
@@ -38,11 +38,6 @@ def checkout(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     said = run("export", on_tables, "--format", "dexlearn", "--all", "-o", folder)
     assert (said["grasps"], said["scenes"], said["clouds"]) == (16, 4, 8)
     return folder
-
-
-@pytest.fixture(scope="module")
-def stored(on_tables: Path) -> Shard:
-    return read_shard(on_tables / "block.h5", kind="base")
 
 
 def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:

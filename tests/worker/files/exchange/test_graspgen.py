@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE
 from service.store import standing
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
 from tests.worker.hands.grippers import OPENING, gripper
 from worker.files.exchange import graspgen
@@ -42,11 +42,6 @@ def data(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     said = run("export", on_tables, "--format", "graspgen", "-o", folder)
     assert (said["grasps"], said["objects"], said["files"]) == (16, 2, 1)
     return folder
-
-
-@pytest.fixture(scope="module")
-def stored(on_tables: Path) -> Shard:
-    return read_shard(on_tables / "block.h5", kind="base")
 
 
 def record_of(data: Path, uuid: str) -> dict[str, Any]:

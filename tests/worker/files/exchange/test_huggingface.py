@@ -16,7 +16,7 @@ from service import parquet
 from service.model.errors import InputError
 from service.model.transforms import apply, compose, pose_from_matrix
 from service.readers import Pictures, open_shards
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
 from worker.files.exchange import huggingface
 from worker.hands.kinematics import body_poses
@@ -33,11 +33,6 @@ def folder(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     said = run("export", on_tables, "--format", "huggingface", "--all", "-o", out)
     assert (said["grasps"], said["pictures"], said["files"]) == (16, 8, 4)
     return out
-
-
-@pytest.fixture(scope="module")
-def stored(on_tables: Path) -> Shard:
-    return read_shard(on_tables / "block.h5", kind="base")
 
 
 def configs(folder: Path) -> dict[str, dict[str, list[Path]]]:

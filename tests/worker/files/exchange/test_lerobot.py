@@ -21,7 +21,7 @@ from PIL import Image
 from service.model.errors import InputError
 from service.model.transforms import compose
 from service.readers import Pictures, open_shards
-from service.store.shards import Shard, read_shard
+from service.store.shards import Shard
 from tests.worker.files.exchange.conftest import run
 from worker.files.exchange import lerobot_import
 from worker.hands.kinematics import body_poses
@@ -38,11 +38,6 @@ def root(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     said = run("export", on_tables, "--format", "lerobot", "--all", "-o", folder)
     assert (said["grasps"], said["files"]) == (16, 1)
     return folder
-
-
-@pytest.fixture(scope="module")
-def stored(on_tables: Path) -> Shard:
-    return read_shard(on_tables / "block.h5", kind="base")
 
 
 def frames(root: Path) -> list[dict[str, Any]]:
