@@ -1,0 +1,255 @@
+"""Files of proposal networks: `.npz` of the schema `graspd/proposals@1`, arrays and one JSON text, nothing that runs.
+
+The architecture is fixed, so a file is checked whole against the shapes that its joints imply; what a network computes
+is in `worker.planners.learned.network`.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from service.model.errors import InputError, LimitError
+from service.model.labels import Digest, Name
+from service.store.descriptions import json_object
+
+SCHEMA: Final = "graspd/proposals@1"
+#: Most that a file may hold, packed or not; a network of 22 joints takes 5.4 MB [bytes].
+MAX_BYTES: Final = 64 << 20
+#: Numbers of a point, as the encoder takes them; widths of its layers, the last one before the maximum over points.
+ENCODER: Final = (7, 64, 128, 256)
+FEATURE: Final = 256
+#: The feature of the cloud, its height above the table, and the label.
+CONDITION: Final = FEATURE + 2
+#: Sines and cosines of time.
+TIME_FEATURES: Final = 8
+HIDDEN: Final = 512
+BLOCKS: Final = 2
+#: Numbers of a grasp besides its joints: position, two columns of the rotation, way in.
+POSE: Final = 12
+_META: Final = "meta"
+#: A text array keeps four bytes a letter; a header of its own comes before each array.
+_MOST_META: Final = 4 * (64 << 10)
+_HEADER: Final = 4096
+
+Floats32 = NDArray[np.float32]
+
+
+class _Meta(BaseModel):
+    """The JSON text of a file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+
+    schema_: Literal["graspd/proposals@1"] = Field(alias="schema")
+    hand: Name
+    hand_digest: Digest
+    joint_names: tuple[Annotated[str, Field(min_length=1, max_length=200)], ...] = Field(min_length=1, max_length=128)
+    points: int = Field(ge=16, le=16384)
+    steps: int = Field(ge=1, le=256)
+    sizes: dict[str, tuple[int, ...]]
+    about: str = Field("", max_length=4000)
+
+    @model_validator(mode="after")
+    def _fixed(self) -> _Meta:
+        if len(set(self.joint_names)) != len(self.joint_names):
+            raise ValueError("a joint is named twice")
+        if self.sizes != sizes(len(self.joint_names)):
+            raise ValueError(f"sizes of this schema are {sizes(len(self.joint_names))}")
+        return self
+
+
+@dataclass(frozen=True)
+class ProposalNetwork:
+    """A conditional flow that proposes grasps of one hand from a cloud; J joints, D = 12 + 3 J numbers a grasp."""
+
+    hand: str
+    hand_digest: str
+    """Of the hand's files: `HandModel.digest`."""
+    joint_names: tuple[str, ...]
+    """(J,) all moving joints, as in `HandModel.joint_names`."""
+    weights: Mapping[str, Floats32]
+    """As `weight_shapes` names them; `.weight` (out, in) and `.bias` (out,), as torch's `Linear` has them."""
+    mean: Floats32
+    """(D,) of the grasps that it learned; numbers are standardised by it and `std`."""
+    std: Floats32
+    """(D,) positive."""
+    points: int = 512
+    """P, points of a cloud."""
+    steps: int = 16
+    """Euler steps of the flow."""
+    about: str = field(default="", kw_only=True)
+    """What it learned from, in words."""
+
+    @property
+    def numbers(self) -> int:
+        """D."""
+        return numbers(len(self.joint_names))
+
+
+def numbers(joints: int) -> int:
+    """D, numbers of a grasp of a hand with so many moving joints."""
+    return POSE + 3 * joints
+
+
+def sizes(joints: int) -> dict[str, tuple[int, ...]]:
+    """Widths of the architecture, as a file repeats them for its reader."""
+    return {
+        "encoder": (*ENCODER, FEATURE),
+        "condition": (CONDITION,),
+        "flow": (numbers(joints) + TIME_FEATURES + CONDITION, *(HIDDEN,) * (1 + BLOCKS), numbers(joints)),
+    }
+
+
+def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
+    """Name of each weight array with its shape, for a hand with so many moving joints."""
+    count = numbers(joints)
+    layers = {f"encoder.{i}": (out, into) for i, (into, out) in enumerate(pairwise(ENCODER))}
+    layers["encoder.out"] = (FEATURE, ENCODER[-1])
+    layers["flow.in"] = (HIDDEN, count + TIME_FEATURES + CONDITION)
+    layers |= {f"flow.{i}.{part}": (HIDDEN, HIDDEN) for i in range(BLOCKS) for part in "ab"}
+    layers["flow.out"] = (count, HIDDEN)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, shape in layers.items():
+        shapes |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
+    return shapes
+
+
+def to_bytes(network: ProposalNetwork) -> bytes:
+    """A network's file.
+
+    Raises:
+        InputError: it is none that `from_bytes` would take.
+    """
+    joints = len(network.joint_names)
+    try:
+        meta = _Meta(
+            schema=SCHEMA, hand=network.hand, hand_digest=network.hand_digest, joint_names=network.joint_names,
+            points=network.points, steps=network.steps, sizes=sizes(joints), about=network.about,
+        )  # fmt: skip
+    except ValidationError as error:
+        raise InputError(f"the network cannot be written: {_first(error)}") from None
+    arrays = {name: np.asarray(array, np.float32) for name, array in _arrays(network).items()}
+    _check(arrays, joints, "the network cannot be written")
+    buffer = io.BytesIO()
+    members: dict[str, Any] = {_META: np.array(meta.model_dump_json(by_alias=True)), **arrays}
+    np.savez(buffer, **members)
+    return buffer.getvalue()
+
+
+def from_bytes(data: bytes, what: str) -> ProposalNetwork:
+    """The network of a file.
+
+    Args:
+        data: the file.
+        what: what errors call it.
+
+    Raises:
+        LimitError: more than `MAX_BYTES`, packed or unpacked.
+        InputError: not a file of this schema, whole and finite.
+    """
+    if len(data) > MAX_BYTES:
+        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            meta = _read_meta(archive, what)
+            joints = len(meta.joint_names)
+            expected = _expected(joints)
+            found = sorted(info.filename for info in archive.infolist())
+            if found != sorted(f"{name}.npy" for name in [_META, *expected]):
+                raise InputError(f"{what}: its arrays are not those of {SCHEMA}: {_difference(found, expected)}")
+            arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
+    except (OSError, ValueError, EOFError, KeyError, MemoryError, NotImplementedError, RuntimeError,
+            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
+        raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
+    _check(arrays, joints, what)
+    for array in arrays.values():
+        array.flags.writeable = False
+    weights = {name: arrays[name] for name in weight_shapes(joints)}
+    return ProposalNetwork(
+        meta.hand, meta.hand_digest, meta.joint_names, weights, arrays["mean"], arrays["std"], meta.points, meta.steps,
+        about=meta.about,
+    )  # fmt: skip
+
+
+def _expected(joints: int) -> dict[str, tuple[int, ...]]:
+    return {"mean": (numbers(joints),), "std": (numbers(joints),), **weight_shapes(joints)}
+
+
+def _arrays(network: ProposalNetwork) -> dict[str, Any]:
+    return {"mean": network.mean, "std": network.std, **network.weights}
+
+
+def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
+    data = _member(archive, _META, _MOST_META + _HEADER)
+    shape, dtype = _header(data)
+    if shape != () or dtype.kind != "U":
+        raise InputError(f"{what}: {_META} must be one text")
+    text = str(npy.read_array(io.BytesIO(data), allow_pickle=False)[()])
+    try:
+        return _Meta.model_validate(json_object(text, f"{what}: {_META}"))
+    except ValidationError as error:
+        raise InputError(f"{what}: {_META}: {_first(error)}") from None
+
+
+def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
+    """An array that is what the schema says before any of it is unpacked."""
+    data = _member(archive, name, 4 * int(np.prod(shape)) + _HEADER)
+    stands, dtype = _header(data)
+    if stands != shape or dtype != np.dtype("<f4"):
+        raise InputError(f"{what}: {name} is {dtype.name} {stands}; {SCHEMA} has float32 {shape}")
+    return np.asarray(npy.read_array(io.BytesIO(data), allow_pickle=False), np.float32)
+
+
+def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    """A member's bytes, of which there are no more than the archive's directory says."""
+    member = archive.getinfo(f"{name}.npy")
+    if member.file_size > limit:
+        raise ValueError(f"{name} unpacks to {member.file_size} bytes")
+    return archive.read(member)
+
+
+def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    file = io.BytesIO(data)
+    version = npy.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of NumPy's format")
+    shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
+    return shape, dtype
+
+
+def _check(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
+    expected = _expected(joints)
+    if set(arrays) != set(expected):
+        raise InputError(f"{what}: {_difference([f'{name}.npy' for name in arrays], expected)}")
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise InputError(f"{what}: {name} has shape {arrays[name].shape}; {joints} joints need {shape}")
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"{what}: {name} has a number that is not finite")
+    if not (arrays["std"] > 0).all():
+        raise InputError(f"{what}: std must be positive")
+
+
+def _difference(found: list[str], expected: Mapping[str, object]) -> str:
+    """Arrays that are missing, and files that are no arrays of the schema."""
+    wanted = {f"{name}.npy" for name in [_META, *expected]}
+    missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
+    parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
+    return "; ".join(parts) or "a name stands twice"
+
+
+def _first(error: ValidationError) -> str:
+    first = error.errors(include_input=False)[0]
+    where = ".".join(map(str, first["loc"]))
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{where}: {message}" if where else message

@@ -1,0 +1,27 @@
+"""Proposal networks for tests: of the right shapes, and of no skill."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from service.store.network_file import ProposalNetwork, numbers, weight_shapes
+
+DIGEST = "0" * 32
+
+
+def random_network(
+    joint_names: Sequence[str] = ("a", "b"), *, hand: str = "some_hand", digest: str = DIGEST, points: int = 64,
+    steps: int = 16, seed: int = 0,
+) -> ProposalNetwork:  # fmt: skip
+    """Weights as torch draws them for a fresh `Linear`: uniform within one over the root of the inputs."""
+    rng = np.random.default_rng(seed)
+    weights, bound = {}, 1.0
+    for name, shape in weight_shapes(len(joint_names)).items():
+        bound = shape[1] ** -0.5 if len(shape) == 2 else bound
+        weights[name] = rng.uniform(-bound, bound, shape).astype(np.float32)
+    count = numbers(len(joint_names))
+    mean = rng.normal(0, 0.1, count).astype(np.float32)
+    std = rng.uniform(0.05, 0.2, count).astype(np.float32)
+    return ProposalNetwork(hand, digest, tuple(joint_names), weights, mean, std, points, steps, about="drawn by chance")

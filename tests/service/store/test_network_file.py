@@ -1,0 +1,145 @@
+"""A network's file comes back as it was written; anything else is refused in a line before it is unpacked."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.model.errors import InputError, LimitError
+from service.store import network_file
+from service.store.network_file import ProposalNetwork, from_bytes, to_bytes
+from tests.networks import random_network
+
+Arrays = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def network() -> ProposalNetwork:
+    return random_network(["a", "b"])
+
+
+@pytest.fixture(scope="module")
+def arrays(network: ProposalNetwork) -> Arrays:
+    with np.load(io.BytesIO(to_bytes(network))) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def packed(arrays: Arrays) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def with_meta(arrays: Arrays, **change: Any) -> bytes:
+    return packed(arrays | {"meta": np.array(json.dumps(json.loads(str(arrays["meta"])) | change))})
+
+
+def test_a_network_comes_back_as_it_was_and_its_file_is_the_same_each_time(network: ProposalNetwork) -> None:
+    data = to_bytes(network)
+    back = from_bytes(data, "it")
+    assert to_bytes(back) == data == to_bytes(network)
+    assert (back.hand, back.joint_names, back.points, back.about) == ("some_hand", ("a", "b"), 64, "drawn by chance")
+    assert all(np.array_equal(back.weights[name], network.weights[name]) for name in network.weights)
+    assert np.array_equal(back.mean, network.mean) and np.array_equal(back.std, network.std)
+
+
+def test_the_text_of_a_file_says_what_it_is(arrays: Arrays) -> None:
+    meta = json.loads(str(arrays["meta"]))
+    assert meta["schema"] == "graspd/proposals@1"
+    assert meta["sizes"] == {"encoder": [7, 64, 128, 256, 256], "condition": [258], "flow": [284, 512, 512, 512, 18]}
+
+
+class Bomb:
+    """What a reader that runs pickles would run."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (Path("a pickle ran"),)
+
+
+def _without(arrays: Arrays) -> bytes:
+    return packed({name: array for name, array in arrays.items() if name != "flow.1.b.bias"})
+
+
+def _not_finite(arrays: Arrays) -> bytes:
+    mean = arrays["mean"].copy()
+    mean[3] = np.nan
+    return packed(arrays | {"mean": mean})
+
+
+def _lying_header(arrays: Arrays) -> bytes:
+    """A member whose header claims a petabyte."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "<f4", "fortran_order": False, "shape": (1 << 48,)})
+    return _replaced(arrays, "mean.npy", buffer.getvalue())
+
+
+def _bomb_of_zeros(arrays: Arrays) -> bytes:
+    return _replaced(arrays, "mean.npy", b"\0" * (8 << 20), zipfile.ZIP_DEFLATED)
+
+
+def _replaced(arrays: Arrays, member: str, data: bytes, how: int = zipfile.ZIP_STORED) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(packed(arrays))) as whole, zipfile.ZipFile(buffer, "w") as archive:
+        for info in whole.infolist():
+            archive.writestr(info.filename, data if info.filename == member else whole.read(info), how)
+    return buffer.getvalue()
+
+
+HOSTILE: dict[str, tuple[Callable[[Arrays], bytes], str]] = {
+    "no zip": (lambda arrays: b"PK\3\4 no archive", "no .npz"),
+    "a part of it": (lambda arrays: packed(arrays)[:-500], "no .npz"),
+    "pickled text": (lambda arrays: packed(arrays | {"meta": np.array([Bomb()], object)}), "one text"),
+    "pickled weights": (lambda arrays: packed(arrays | {"mean": np.array([Bomb()], object)}), "mean is object"),
+    "double": (lambda arrays: packed(arrays | {"mean": arrays["mean"].astype(float)}), "mean is float64"),
+    "transposed": (lambda arrays: packed(arrays | {"flow.out.weight": arrays["flow.out.weight"].T}), "flow.out.weight"),
+    "an array less": (_without, "without flow.1.b.bias"),
+    "an array more": (lambda arrays: packed(arrays | {"extra": np.zeros(3)}), "besides extra"),
+    "not finite": (_not_finite, "mean has a number that is not finite"),
+    "no spread": (lambda arrays: packed(arrays | {"std": 0 * arrays["std"]}), "std must be positive"),
+    "lying header": (_lying_header, "mean is float32"),
+    "zip bomb": (_bomb_of_zeros, "unpacks to 8388608 bytes"),
+    "another schema": (lambda arrays: with_meta(arrays, schema="graspd/proposals@2"), "schema"),
+    "another joint": (lambda arrays: with_meta(arrays, joint_names=["a", "b", "c"]), "sizes"),
+    "a joint twice": (lambda arrays: with_meta(arrays, joint_names=["a", "a"]), "named twice"),
+    "endless steps": (lambda arrays: with_meta(arrays, steps=10**9), "steps"),
+    "a long text": (lambda arrays: with_meta(arrays, about="x" * 5000), "about"),
+    "a path for a name": (lambda arrays: with_meta(arrays, hand="../up"), "hand"),
+    "deep JSON": (lambda arrays: packed(arrays | {"meta": np.array("[" * 9000)}), "JSON"),
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_file_that_is_no_network_is_refused_in_a_line(
+    what: str, arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make, message = HOSTILE[what]
+    with pytest.raises(InputError, match=message) as refused:
+        from_bytes(make(arrays), "net.npz")
+    assert "\n" not in str(refused.value) and str(refused.value).startswith("net.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_over_the_limit_is_not_even_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_file, "MAX_BYTES", 10)
+    with pytest.raises(LimitError, match="has more than"):
+        from_bytes(b"x" * 11, "net.npz")
+
+
+def test_what_no_reader_would_take_is_not_written(network: ProposalNetwork) -> None:
+    for wrong in (
+        replace(network, joint_names=("a",)),
+        replace(network, hand_digest="x"),
+        replace(network, mean=network.mean * np.float32(np.nan)),
+        replace(network, weights={}),
+    ):
+        with pytest.raises(InputError, match="cannot be written"):
+            to_bytes(wrong)
