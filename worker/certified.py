@@ -349,13 +349,17 @@ class _Work:
     def _in_models(self, grasps: GraspSet, held: NDArray[np.bool_]) -> Arrays:
         """Share of the models in which those that hold do, told whole of raw grasps, and what they fail first of."""
         assert self.pieces is not None
-        wish = self.request
+        wish, placed = self.request, None
+        if self.scenes is not None:
+            assert grasps.scene is not None
+            placed = self.scenes.placed(grasps.scene)
         found = robust(
-            self.hand, self.obj, grasps, held=held, models=wish.models, seed=wish.seed, pieces=self.pieces.result(),
-            wanted=wish.robust if wish.want == "valid" else 0, run=self._round_run.quiet(),
+            self.hand, self.obj, grasps, held=held, placed=placed, level=lift_level(wish.referee), models=wish.models,
+            seed=wish.seed, pieces=self.pieces.result(), wanted=wish.robust if wish.want == "valid" else 0,
+            run=self._round_run.quiet(),
         )  # fmt: skip
         self.seconds["referee"] += found.seconds
-        return {"quality/robust_share": found.share, "quality/robust_weakest": found.weakest}
+        return found.columns
 
     def _measured(self, grasps: GraspSet) -> Arrays:
         began = time.perf_counter()

@@ -275,8 +275,6 @@ class JobOptions(Model):
             raise ValueError(f"method {self.method} plans around free objects only: with a scene take fast_graspd")
         if self.robustness:
             raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
-        if self.models:
-            raise ValueError("robust grasps hold the six pushes of free grasps in other models: with scene free only")
         return self
 
     @model_validator(mode="after")

@@ -9,13 +9,14 @@ import numpy as np
 from typer.testing import CliRunner
 
 import graspd
-from worker.commands.synth import app
+from worker.commands.evaluate import app as evaluate
+from worker.commands.synth import app as synth
 
 
 def test_a_file_of_robust_grasps_says_so_to_every_reader(tmp_path: Path) -> None:
     file = tmp_path / "robust.h5"
     asked = ["--robust", "0.5", "--robust-models", "2", "--fidelity", "draft", "-n", "2", "--json"]
-    made = CliRunner().invoke(app, ["--hand", "allegro", "--object", "block", "-o", str(file), *asked])
+    made = CliRunner().invoke(synth, ["--hand", "allegro", "--object", "block", "-o", str(file), *asked])
     assert made.exit_code == 0, made.output
     said = json.loads(made.stdout.splitlines()[-1])
     grasps = graspd.open(file)
@@ -25,9 +26,30 @@ def test_a_file_of_robust_grasps_says_so_to_every_reader(tmp_path: Path) -> None
     assert len(grasps.where(lambda g: g.metric("robust_share") >= 0.5)) == 2
 
 
-def test_robust_goes_with_no_scene(tmp_path: Path) -> None:
-    file = str(tmp_path / "robust.h5")
-    asked = ["--hand", "allegro", "--object", "block", "-o", file, "--scene", "table", "--robust", "0.5"]
-    refused = CliRunner().invoke(app, asked)
-    assert refused.exit_code != 0
-    assert "scene free" in refused.output + refused.stderr
+def test_grasps_in_scenes_are_robust_if_they_lift_in_other_models(tmp_path: Path) -> None:
+    (tmp_path / "made").mkdir()
+    file, copies = tmp_path / "made" / "table.h5", tmp_path / "judged"
+    asked = ["--hand", "barrett", "--object", "block", "--scene", "table", "--scenes", "2", "--fidelity", "draft"]
+    wanted = ["-n", "2", "--want", "raw", "--robust-models", "2", "--json"]
+    made = CliRunner().invoke(synth, [*asked, *wanted, "-o", str(file)])
+    assert made.exit_code == 0, made.output
+    grasps = graspd.open(file)
+    lifted, share = grasps.column("quality/success") == 1, grasps.column("quality/robust_share")
+    assert lifted.any() and (np.isfinite(share) == lifted).all()
+    lift = ["--protocol", "lift", "--robust", "3", "--json"]
+    judged = CliRunner().invoke(evaluate, [str(tmp_path / "made"), *lift, "-o", str(copies)])
+    assert judged.exit_code == 0, judged.output
+    said, copy = json.loads(judged.stdout.splitlines()[-1]), graspd.open(copies / "table.h5")
+    again = copy.metric("robust_share")
+    assert said["robust_share"] == round(float(again[lifted].mean()), 6) and said["robust_n"] == lifted.sum()
+    assert [one["robust_share"] is None for one in said["verdicts"]] == (~lifted).tolist() == np.isnan(again).tolist()
+    assert json.loads(str(copy.attributes["robust"])) == {"models": 3, "wanted": 0}
+    assert copy.attributes["shard_id"] == grasps.attributes["shard_id"]
+    for path in ("grasp/hand_pose", "quality/success"):
+        assert np.array_equal(copy.column(path), grasps.column(path))
+    for wrong, words in (([], "its own test"), (["--protocol", "lift", "--hard"], "without --hard")):
+        refused = CliRunner().invoke(evaluate, [str(file), "--robust", "2", *wrong, "-o", str(tmp_path / "no.h5")])
+        assert refused.exit_code == 2 and words in refused.output + refused.stderr
+    refused = CliRunner().invoke(evaluate, [str(tmp_path / "made"), *lift, "-o", str(copies)])
+    assert refused.exit_code == 2 and "is there already" in refused.output + refused.stderr
+    assert not (tmp_path / "no.h5").exists()

@@ -17,6 +17,7 @@ from service.model.errors import InputError
 from service.model.robust import MEANINGS, MOST_MODELS
 from worker.files.cases import expand, load_case
 from worker.files.evaluate import Protocol, combine, evaluate
+from worker.files.robust_copies import copy_paths, write_copy
 from worker.hands.load import hand_from_path
 from worker.hands.same_hand import TOLERANCE_M, same_hand
 from worker.quality.referee.key import Level
@@ -74,6 +75,14 @@ def evaluate_command(
     judge_tolerance: Annotated[
         float, typer.Option(min=0.0, help="Fingertips of the two models that differ by more are refused [mm].")
     ] = 1e3 * TOLERANCE_M,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            help="With --robust: a copy of the shard, or folder of copies, with the shares of its grasps.",
+        ),
+    ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
@@ -84,8 +93,8 @@ def evaluate_command(
     level = level or ("lift" if protocol == "lift" else "certificate")
     if level not in levels:
         raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
-    if robust and protocol != "dexgraspbench":
-        raise InputError("--robust judges the six pushes in other models: it goes with --protocol dexgraspbench")
+    if robust and protocol == "displacement":
+        raise InputError("--robust judges pushes or lifts in other models: choose --protocol dexgraspbench or lift")
     if judge_hand is None and joint_map:
         raise InputError("--joint-map says which joints of --judge-hand are ours; name that hand")
     if judge_hand is not None and protocol != "dexgraspbench":
@@ -97,8 +106,12 @@ def evaluate_command(
                TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
-        for file in (one for path in files for one in expand(path)):
+        listed = [one for path in files for one in expand(path)]
+        copies = _copies(files, listed, out, robust=robust, hard=hard)
+        for file in listed:
             case = load_case(file, hand=hand, obj=object)
+            if copies and (case.placed is None) == (protocol == "lift"):
+                raise InputError(f"{file} keeps shares of its own test: of a lift in scenes, else of six pushes")
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
@@ -109,6 +122,7 @@ def evaluate_command(
                 judge_hand=None
                 if other is None
                 else same_hand(case.hand, other, twins, tolerance_m=judge_tolerance / 1e3),
+                tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
                 run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
@@ -125,6 +139,15 @@ def evaluate_command(
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)
+
+
+def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
+    """Where the copy of each file goes; nowhere without --out."""
+    if out is None:
+        return {}
+    if not robust or hard or len(paths) != 1:
+        raise InputError("-o keeps what --robust N finds, without --hard, of one file or folder")
+    return dict(zip(files, copy_paths(paths[0], files, out), strict=True))
 
 
 def _said_of_models(whole: dict[str, Any]) -> str:

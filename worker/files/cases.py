@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.errors import InputError, NotFoundError
-from service.store.shards import read_shard
+from service.store.shards import kind_of, open_shard, read_shard
 from worker.files.exchange import dexgraspbench, reference
 from worker.files.of_shard import hand_of_shard, object_of_shard, placed_of_shard
 from worker.grasps import GraspSet, Posture
@@ -45,7 +45,7 @@ class Case:
 
 
 def expand(path: Path) -> list[Path]:
-    """What a path stands for: itself; or, for a folder without `.npy` files, all shards and reference grasps below it.
+    """What a path stands for: itself; of a folder without `.npy` files, base shards and reference grasps below it.
 
     Raises:
         InputError: a folder without any grasps.
@@ -53,10 +53,17 @@ def expand(path: Path) -> list[Path]:
     if not path.is_dir() or any(path.rglob("*.npy")):
         return [path]
     # Beside shards lie JSON files that tell of them: snapshot.json, subset.json, card.json.
-    found = sorted([*path.rglob("*.h5"), *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
+    shards = (file for file in path.rglob("*.h5") if not _of_scenes(file))
+    found = sorted([*shards, *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
     if not found:
         raise InputError(f"{path} has no shards (.h5), reference grasps (.json) or DexGraspBench files (.npy)")
     return found
+
+
+def _of_scenes(path: Path) -> bool:
+    """Whether a file is a shard of scenes or of views, which has no grasps of its own."""
+    with open_shard(path) as file:
+        return kind_of(file, str(path)) != "base"
 
 
 def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal, cast
@@ -14,17 +15,18 @@ from numpy.typing import NDArray
 from service.model.errors import InputError, MeshError
 from service.model.robust import axis_word
 from worker.files.cases import Case
+from worker.grasps import GraspSet
 from worker.hands.same_hand import SameHand
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance, hand_points, nearest
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.foreign import foreign_verdicts, share_counts
 from worker.quality.referee.judge import Verdicts, judge
 from worker.quality.referee.key import Level
 from worker.quality.referee.lift import LiftOutcome
-from worker.quality.referee.lifting import LiftLevel, judge_lifts
+from worker.quality.referee.lifting import LiftLevel, LiftVerdicts, judge_lifts
 from worker.quality.referee.protocol import Outcome
 from worker.quality.referee.robust import Robustness, robust
 from worker.quality.table import DEFAULT_FRICTION, measure
@@ -49,6 +51,7 @@ def evaluate(
     friction: float | None = None,
     models: int = 0,
     judge_hand: SameHand | None = None,
+    tell: Callable[[Robustness], None] = lambda found: None,
     cache: Path | None = None,
     run: Run = ALONE,
 ) -> dict[str, Any]:
@@ -58,8 +61,9 @@ def evaluate(
     making and judging them; of making them alone: sgs_without_referee), pd_mm and spd_mm (penetration,
     self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance explained by
     the first principal component; nearest_mm: distance of the two grasps that are most alike.
-    verdicts, where somebody judged: see `told`. Judged in `models` models around the
-    nominal one: robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis.
+    verdicts, where somebody judged: see `told`. Judged in `models` models around the nominal one, by the same protocol:
+    robust_share, the mean of those that hold in it, robust_n, how many, robust_axes, the share by axis; `tell` gets
+    what became of each grasp.
     With protocol lift also clear_share (free of what stands in the scene, coming, closing and lifting). With another
     model of the hand as `judge_hand` also what `ForeignVerdicts.facts` tells, and in the verdicts held_foreign and
     reason_foreign.
@@ -89,14 +93,27 @@ def evaluate(
                     case.hand, case.obj, case.grasps, held=verdicts.success, models=models, hard=hard, pieces=pieces,
                     seed=MODELS_SEED, run=run,
                 )  # fmt: skip
-                row |= in_models(found, row["verdicts"] or [])
+                tell(found)
+                row |= in_models(found, row.get("verdicts", []))
             if judge_hand is not None:
                 both = foreign_verdicts(judge_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
                 row |= both.facts()
                 for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
                     one |= {"held_foreign": bool(held), "reason_foreign": reason}
         if protocol == "lift" and case.placed is not None:
-            row |= _lifted(case, case.placed, level, hard, pieces, run)
+            grasps, clear = _with_ways(case, case.placed)
+            chosen: LiftLevel = "letter" if level == "letter" else "lift"
+            lifts = judge_lifts(
+                case.hand, case.obj, grasps, case.placed, level=chosen, hard=hard, pieces=pieces, run=run
+            )  # fmt: skip
+            row |= _lifted(lifts, clear)
+            if models:
+                found = robust(
+                    case.hand, case.obj, grasps, held=lifts.success, placed=case.placed, level=chosen, models=models,
+                    hard=hard, pieces=pieces, seed=MODELS_SEED, run=run,
+                )  # fmt: skip
+                tell(found)
+                row |= in_models(found, row["verdicts"])
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
         row |= pieces.facts
     return row | _medians(case, table, sd)
@@ -127,19 +144,21 @@ def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str,
     return row
 
 
-def _lifted(case: Case, placed: Placed, level: str, hard: bool, pieces: ConvexPieces, run: Run) -> dict[str, Any]:
-    chosen: Any = "lift" if level == "certificate" else level
+def _with_ways(case: Case, placed: Placed) -> tuple[GraspSet, NDArray[np.bool_]]:
+    """The grasps with their way, and (N,) whether it is clear."""
     way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
         # Files of others say where a grasp is, seldom how the hand comes.
         grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
-    verdicts = judge_lifts(case.hand, case.obj, grasps, placed, level=chosen, hard=hard, pieces=pieces, run=run)
-    clear = way.clear
-    held = int(verdicts.success.sum())
+    return grasps, way.clear
+
+
+def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
+    count, held = len(clear), int(verdicts.success.sum())
     rows = zip(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, clear, strict=True)
     return {
         "level": verdicts.level,
-        "gsr": _plain(held / max(1, len(case.grasps))),
+        "gsr": _plain(held / max(1, count)),
         "osr": float(held > 0),
         "clear_share": _plain(float(clear.mean())) if len(clear) else None,
         "referee_seconds": _plain(verdicts.seconds),

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,10 @@ from service.model.errors import InputError
 from service.readers import Shards, open_shards
 from service.store.shards import SCHEMAS, Shard, read_shard, write_shard
 from service.store.store import open_store
+from worker.files.of_shard import carried
 
 #: From the base shards of one hand on one object to the mask (N,) of each.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
-#: Attributes that `write_shard` sets itself.
-_SET: Final = ("schema",)
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def _bytes(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
     arrays = {
         path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
     }
-    attributes = {name: value for name, value in shard.attributes.items() if name not in _SET}
+    attributes = carried(shard)
     if "shard_id" in attributes:
         attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
     return write_shard("base", arrays, attributes)

@@ -147,11 +147,9 @@ def synthesized(
         cancelled: asked often; True: the work stops.
 
     Raises:
-        InputError: unknown method, option, hand, object or device, or a scene without room or with other models.
+        InputError: unknown method, option, hand, object or device, or a scene without room.
         TaskCancelled: `cancelled` answered True.
     """
-    if request.models and place.kind != "free":
-        raise InputError("robust grasps hold the six pushes of free grasps in other models: with scene free only")
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     wanted = parse_join(str(join))
     options = dict(mesh or {})

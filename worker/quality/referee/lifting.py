@@ -88,10 +88,7 @@ def judge_lifts(
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
-    if level not in LEVELS:
-        raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
-    if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
-        raise InputError("the lift test needs a scene and, but for the letter, an approach of each grasp")
+    require_ways(grasps, placed, level)
     began = time.perf_counter()
     pieces = pieces or decompose(obj, cache=cache)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
@@ -126,6 +123,17 @@ def judge_lifts(
         terms=lift_key(hand, obj, placed, level, hard, pieces=pieces),
         seconds=time.perf_counter() - began,
     )
+
+
+def require_ways(grasps: GraspSet, placed: Placed, level: LiftLevel) -> None:
+    """
+    Raises:
+        InputError: unknown level, or no scene or approach to lift from.
+    """
+    if level not in LEVELS:
+        raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
+    if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
+        raise InputError("the lift test needs a scene and, but for the letter, an approach of each grasp")
 
 
 def lift_key(

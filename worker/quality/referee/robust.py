@@ -14,7 +14,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,12 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.decomposition import ConvexPieces, decompose
+from worker.quality.referee.lifting import LiftLevel, require_ways
 from worker.quality.referee.model import MujocoOptions
 from worker.quality.referee.variant import Variant, dealt, draw
 from worker.quality.referee.varied import Models
 from worker.run import ALONE, Run
+from worker.simulation.surroundings import Placed
 
 Floats = NDArray[np.float64]
 
@@ -64,6 +66,11 @@ class Robustness:
         first = failed.argmax(axis=1)
         return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
 
+    @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of a base shard."""
+        return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
+
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
         """Of each axis that was judged: models in which a grasp held, and all of them."""
         counts = {}
@@ -90,6 +97,8 @@ def robust(
     grasps: GraspSet,
     *,
     held: NDArray[np.generic] | None = None,
+    placed: Placed | None = None,
+    level: LiftLevel = "lift",
     models: int = MODELS,
     wanted: float = 0.0,
     seed: int = 0,
@@ -98,13 +107,15 @@ def robust(
     cache: Path | None = None,
     run: Run = ALONE,
 ) -> Robustness:
-    """Judge grasps in models around the nominal one, at the level of the certificate.
+    """Judge grasps in models around the nominal one: six pushes at the level of the certificate, or lifts.
 
     Args:
         hand: the hand.
         obj: the object.
         grasps: N grasps.
         held: (N,) verdicts of the nominal model; only grasps with 1 are tried. By default all.
+        placed: their scenes; the lift test out of these then judges. None: the six pushes do.
+        level: of the lift test.
         models: for each grasp.
         wanted: share of them; judging a grasp ends when it is sure whether it is reached. 0: all are judged.
         seed: of the models, with the grasp's own numbers.
@@ -114,9 +125,12 @@ def robust(
         run: told of grasps done; asked between models whether to stop.
 
     Raises:
+        InputError: no scene or way of each grasp to lift it from.
         MeshError: the object has no usable convex pieces.
         TaskCancelled: when `run.cancelled()` answers True.
     """
+    if placed is not None:
+        require_ways(grasps, placed, level)
     began = time.perf_counter()
     verdicts = np.full((len(grasps), models), NOT_JUDGED, np.int8)
     axes = np.zeros((len(grasps), models), np.uint8)
@@ -124,15 +138,21 @@ def robust(
     if not len(tried):
         return Robustness(verdicts, axes, wanted, 0.0)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
-    around = Models(hand, obj, pieces or decompose(obj, cache=cache), physics)
+    beside = (placed.supports, placed.neighbours) if placed is not None else ()
+    around = Models(hand, obj, pieces or decompose(obj, cache=cache), physics, *beside)
     least, done, lock = needed(wanted, models), 0, threading.Lock()
+
+    def holds(row: int, variant: Variant) -> bool:
+        if placed is None:
+            return around.certificate(grasps, row, variant).success
+        return around.lift(grasps, row, placed, variant, letter=level == "letter").success
 
     def work(row: int) -> None:
         nonlocal done
         for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
             run.check("robustness")
             axes[row, k] = axis
-            verdicts[row, k] = around.certificate(grasps, row, variant).success
+            verdicts[row, k] = holds(row, variant)
             ok, lost = (verdicts[row] == 1).sum(), (verdicts[row] == 0).sum()
             if wanted > 0 and (ok >= least or models - lost < least):
                 break

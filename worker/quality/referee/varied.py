@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -18,11 +18,13 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.quality.referee.compiled import scene_of
 from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.lift import Lift, LiftTrial
 from worker.quality.referee.model import MujocoOptions, Scene, blend, build
 from worker.quality.referee.protocol import STAGES, Test, Trial
 from worker.quality.referee.recoupled import Coupling, nearest, recoupled
 from worker.quality.referee.refit import Fit, refitted
 from worker.quality.referee.variant import Variant
+from worker.simulation.surroundings import Neighbour, Obstacle, Placed
 
 Floats = NDArray[np.float64]
 
@@ -36,12 +38,20 @@ _Build = tuple[Fit, float, Coupling]
 
 
 class Models:
-    """The models around a nominal one, of one hand and object; threads share it."""
+    """The models around a nominal one, of one hand and object, and of what stands around it; threads share it."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, physics: MujocoOptions) -> None:
+    def __init__(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        pieces: ConvexPieces,
+        physics: MujocoOptions,
+        supports: Sequence[Obstacle] = (),
+        neighbours: Sequence[Neighbour] = (),
+    ) -> None:
         self.hand, self.obj = hand, obj
-        self._pieces, self._physics = pieces, physics
-        self._scenes: dict[_Build, Scene] = {("own", 0.0, "own"): scene_of(hand, obj, pieces, physics)}
+        self._pieces, self._physics, self._around = pieces, physics, (supports, neighbours)
+        self._scenes: dict[_Build, Scene] = {("own", 0.0, "own"): scene_of(hand, obj, pieces, physics, *self._around)}
         self._hands: dict[_Build, HandModel] = {("own", 0.0, "own"): hand}
         self._lock = threading.Lock()
         self._fingers = _fingers(hand)
@@ -50,11 +60,39 @@ class Models:
         """The verdict on one grasp, at the level of the certificate, in a variant; the nominal one has the verdict of
         `judge` bit for bit."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
-        one = seen(self.obj, grasps, row, variant)
-        if test.scene.hand.dofs < self.hand.dofs:
+        return test.certificate(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
+
+    def lift(self, grasps: GraspSet, row: int, placed: Placed, variant: Variant, *, letter: bool = False) -> LiftTrial:
+        """What the lift test says of a grasp in a variant; the nominal one has that of `judge_lifts` bit for bit.
+
+        Args:
+            grasps: with, but for the letter, their way.
+            row: of the grasp.
+            placed: the scenes of all grasps; their supports and neighbours are those of these models.
+            variant: the model.
+            letter: the published test instead of the whole one.
+        """
+        number = int(placed.index[row])
+        variant = upright(variant, placed.scenes[number].up)
+        one, where = seen(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
+        if moves_object(variant):
+            pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
+            where = Placed(
+                placed.supports, pose[None], np.zeros(1, np.intp), placed.neighbours,
+                placed.neighbour_pose[number : number + 1],
+            )  # fmt: skip
+        test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
+        one = self._taken(test.scene, one)
+        return test.letter(one, 0) if letter else test.lift(one, 0)
+
+    def _taken(self, scene: Scene, one: GraspSet) -> GraspSet:
+        """The grasp as the hand of a scene can take it: one of fewer dofs cannot take all postures."""
+        if scene.hand.dofs < self.hand.dofs:
             for part in (one.grasp, one.pregrasp, one.squeeze):
-                part.joint_positions = nearest(test.scene.hand, part.joint_positions)
-        return test.certificate(one, 0)
+                part.joint_positions = nearest(scene.hand, part.joint_positions)
+            if one.coming is not None:
+                one.coming = nearest(scene.hand, one.coming)
+        return one
 
     def scene(self, variant: Variant) -> Scene:
         """The compiled model of a variant; its places are those of `place` and `command`."""
@@ -62,12 +100,12 @@ class Models:
         with self._lock:
             if built not in self._scenes:
                 self._hands[built] = recoupled(refitted(self.hand, *built[:2]), built[2])
-                self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics)
+                self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics, *self._around)
             scene = self._scenes[built]
         if any(variant.centre_m):
             # The body's frame stands in the centre of mass.
             obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
-            scene = build(self._hands[built], obj, self._pieces, self._physics)
+            scene = build(self._hands[built], obj, self._pieces, self._physics, *self._around)
         return _with_numbers(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
@@ -78,18 +116,11 @@ class Models:
         return np.asarray(lags[self._fingers + 1])
 
 
-class VariantTest(Test):
-    """The test of one grasp with another weight and order of closing."""
+class _OneByOne(Test):
+    """A test in which fingers may begin to close one after another."""
 
     __test__ = False
-
-    def __init__(self, scene: Scene, variant: Variant, lags: Floats | None) -> None:
-        super().__init__(scene)
-        self._weight, self._lags = variant.mass, lags
-
-    def _push(self, direction: int) -> None:
-        super()._push(direction)
-        self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
+    _lags: Floats | None = None
 
     def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
         if self._lags is None:
@@ -106,6 +137,34 @@ class VariantTest(Test):
             first, second = np.minimum(late, 1), np.maximum(late - 1, 0)
             closing = (1 - first) * joints[0] + first * joints[1]
             yield pose, np.where(late <= 1, closing, (1 - second) * joints[1] + second * joints[2])
+
+
+class VariantTest(_OneByOne):
+    """The test of one grasp with another weight and order of closing."""
+
+    __test__ = False
+
+    def __init__(self, scene: Scene, variant: Variant, lags: Floats | None) -> None:
+        super().__init__(scene)
+        self._weight, self._lags = variant.mass, lags
+
+    def _push(self, direction: int) -> None:
+        super()._push(direction)
+        self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
+
+
+class VariantLift(_OneByOne, Lift):
+    """The lift of one grasp with another weight and order of closing."""
+
+    __test__ = False
+
+    def __init__(self, scene: Scene, placed: Placed, variant: Variant, lags: Floats | None) -> None:
+        super().__init__(scene, placed)
+        self._weight, self._lags = variant.mass, lags
+
+    def _put(self, hand_pose: Floats, joints: Floats) -> None:
+        super()._put(hand_pose, joints)
+        self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
 
 
 def _with_numbers(scene: Scene, variant: Variant) -> Scene:
@@ -141,20 +200,42 @@ def _joint_of(model: Any, qpos: int) -> int:
 
 def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
     """One grasp as the object meets it where that, or the hand, is not quite where it was thought to be."""
-    turn = np.array(variant.object_turn)
-    shift, angle = np.array(variant.object_shift_m), float(np.linalg.norm(turn))
     one = grasps.take(np.array([row]))
-    if not (angle or shift.any() or any(variant.hand_shift_m)):
+    if not (moves_object(variant) or any(variant.hand_shift_m)):
         return one
-    turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
-    about = np.concatenate([obj.centre_of_mass + shift, turned])
-    motion = compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
-    off = np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
+    back, off = invert(motion_of(obj, variant)), np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
 
     def moved(part: Posture) -> Posture:
-        return Posture(compose(compose(invert(motion), part.hand_pose), off), part.joint_positions)
+        return Posture(compose(compose(back, part.hand_pose), off), part.joint_positions)
 
-    return GraspSet(moved(one.grasp), moved(one.pregrasp), moved(one.squeeze), one.stability_loss)
+    way = None if one.approach is None else compose(compose(back, one.approach), off)
+    return replace(
+        one, grasp=moved(one.grasp), pregrasp=moved(one.pregrasp), squeeze=moved(one.squeeze), approach=way, lift=None
+    )
+
+
+def moves_object(variant: Variant) -> bool:
+    """Whether the object stands elsewhere than it was thought to."""
+    return any((*variant.object_shift_m, *variant.object_turn))
+
+
+def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
+    """(7,) from where the object was thought to be to where it stands, in its frame."""
+    turn = np.array(variant.object_turn)
+    angle = float(np.linalg.norm(turn))
+    turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
+    about = np.concatenate([obj.centre_of_mass + variant.object_shift_m, turned])
+    return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
+
+
+def upright(variant: Variant, up: Floats) -> Variant:
+    """The variant for an object that stands on something: of where it may be, what lies along its support, and of how
+    it may be turned, what leaves it standing. `up` (3,) is against gravity, in its frame."""
+    if not moves_object(variant):
+        return variant
+    shift, turn = np.array(variant.object_shift_m), np.array(variant.object_turn)
+    level, about = shift - (shift @ up) * up, (turn @ up) * up
+    return replace(variant, object_shift_m=tuple(level.tolist()), object_turn=tuple(about.tolist()))
 
 
 def _fingers(hand: HandModel) -> NDArray[np.intp]:
