@@ -315,6 +315,15 @@ STUDIES: Final = (
         ALL, seeds=(0,),
     ),
     Study(
+        "lift", "the film of README: a hand on its way to lift a mug", ("images/lift.webp",),
+        (f"graspd synth --hand {_ALLEGRO} --object {_mesh('025_mug')} --scene table --faces all --scenes 8 -n 24 "
+         "--seed 5 -o WORK/lift.h5",
+         "graspd pictures WORK/lift.h5 --animate --row 13 -o OUT/images/lift.webp"),
+        ("graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/lift.h5",
+         "graspd pictures WORK/lift.h5 --animate --size 80 -o OUT/images/lift.webp"),
+        IN_SCENES, seeds=(5,),
+    ),
+    Study(
         "grasp-pictures", "grasps of all kinds of objects", ("images/grasps/*",),
         ("bash benchmarks/grasp_gallery.sh DATA OUT/images/grasps",),
         seeds=(4,),

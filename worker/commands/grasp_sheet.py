@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from service.model.scene_kinds import supports_in
+from service.model.scene_spec import SceneSpec
 from service.readers.ways import Waypoint, scene_spec_of, way_of
 from service.store.shards import Shard
 from worker.files.of_shard import neighbours_of_shard
@@ -50,8 +51,8 @@ class GraspSheet:
     @property
     def scene(self) -> str:
         """Kind of the scenes that the grasps were planned in; empty: none."""
-        spec = scene_spec_of(self.shard)
-        return "" if spec is None or spec.kind == "free" or "grasp/scene_index" not in self.shard.arrays else spec.kind
+        spec = _scene_of(self.shard)
+        return "" if spec is None else spec.kind
 
     def png(self, *, subtitle: str) -> bytes:
         """The sheet."""
@@ -89,17 +90,23 @@ class GraspSheet:
 
     def _drawn(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
         return way_pictures(
-            self.hand, self.obj, frames, self._around(), self.size, sides=sides, run=self.run,
+            self.hand, self.obj, frames, around_of(self.shard, self.rows), self.size, sides=sides, run=self.run,
             samples=LOOKS[self.kind][1],
         )  # fmt: skip
 
-    def _around(self) -> Around:
-        spec = scene_spec_of(self.shard)
-        if not self.scene or spec is None:
-            return Around()
-        poses = np.asarray(self.shard["scene/object_pose"], float)
-        index = np.asarray(self.shard["grasp/scene_index"], np.intp)[self.rows]
-        return Around(supports_in(spec), poses, index, neighbours_of_shard(self.shard, []))
+
+def around_of(shard: Shard, rows: NDArray[np.intp]) -> Around:
+    """Where grasps of a base shard are: in the scenes that they were planned in, or around a free object."""
+    if (spec := _scene_of(shard)) is None:
+        return Around()
+    poses = np.asarray(shard["scene/object_pose"], float)
+    index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
+    return Around(supports_in(spec), poses, index, neighbours_of_shard(shard, []))
+
+
+def _scene_of(shard: Shard) -> SceneSpec | None:
+    spec = scene_spec_of(shard)
+    return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec
 
 
 def _named(way: list[Waypoint], name: str) -> Waypoint:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
@@ -19,6 +20,7 @@ from service.model.transforms import compose
 from service.readers.ways import scene_spec_of
 from service.store import standing
 from service.store.shards import Shard, read_shard, write_shard
+from worker.commands.grasp_animation import GraspAnimation
 from worker.commands.grasp_sheet import GraspSheet
 from worker.engines.devices import Device
 from worker.files.choice import EveryOption, UnjudgedOption, choose
@@ -27,6 +29,7 @@ from worker.rendering.camera_file import SAMPLED, read_cameras
 from worker.rendering.cameras import BASELINE_M
 from worker.rendering.channels import parse_channels
 from worker.rendering.hands import DrawnHand
+from worker.rendering.pages.animation import animation_kind
 from worker.rendering.pages.sheets import best, best_in_scenes, best_kept, views_page
 from worker.rendering.pages.typography import with_palette
 from worker.rendering.standing import TABLE
@@ -112,38 +115,63 @@ def render(
 def pictures(
     grasps: Annotated[Path, typer.Argument(help="A base shard, as `graspd synth` writes it.")],
     count: Annotated[
-        int | None, typer.Option("--count", "-n", min=1, max=400, help="How many of the best grasps; 12, of ways 4.")
+        int | None,
+        typer.Option("--count", "-n", min=1, max=400, help="How many of the best; 12, of ways 4, of a film 1."),
     ] = None,
     three: Annotated[bool, typer.Option("--three-sides", help="Each grasp from three sides.")] = False,
     way: Annotated[bool, typer.Option("--way", help="Each grasp on its way: standoff, pregrasp, grasp, lift.")] = False,
+    animate: Annotated[
+        bool, typer.Option("--animate", help="A film as a robot runs it: come, close, lift; .gif, .webp or .png.")
+    ] = False,
+    row: Annotated[
+        list[int] | None, typer.Option("--row", min=0, help="This grasp, by its row in the file; several times.")
+    ] = None,
     palette: Annotated[bool, typer.Option("--palette", help="256 colours: a third of the bytes.")] = False,
     size: Annotated[
-        int | None, typer.Option(min=32, max=2048, help="Edge of one picture [px]; 300, with --three-sides 160.")
+        int | None,
+        typer.Option(min=32, max=2048, help="Edge of a picture [px]; 300, with --three-sides 160, a film 480."),
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The hand's file; default: found by its digest.")] = None,
     object: _Object = None,
     unjudged: UnjudgedOption = False,
     every: EveryOption = False,
     device: _Device = "auto",
-    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("grasps.png"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG or film to write.")] = Path("grasps.png"),
     json: JsonFlag = False,
 ) -> None:
     """Draw the best valid grasps by epsilon with their figures on one sheet, in their scenes where they have any."""
-    if way and three:
-        raise InputError("--way and --three-sides exclude each other")
+    if way + three + animate > 1:
+        raise InputError("--way, --three-sides and --animate exclude one another")
+    if animate:
+        animation_kind(output.suffix)
     base = read_shard(grasps, kind="base")
     chosen, word = choose(base, unjudged=unjudged, every=every)
-    rows = best(base.arrays, count or (4 if way else 12), chosen)
-    sheet = GraspSheet(
-        base, hand_of_shard(base, hand), object_of_shard(base, object), rows,
-        "way" if way else "three sides" if three else "one side", Run(Device(device).resolve()), size,
-    )  # fmt: skip
-    page = sheet.png(subtitle=f"{len(rows)} of {int(chosen.sum())} {word}, by epsilon at 5 mm")
-    output.write_bytes(with_palette(page) if palette else page)
-    if json:
-        emit({"file": str(output), "grasps": len(rows), "of": int(chosen.sum()), "kind": word, "rows": rows.tolist()})
+    if row:
+        rows = _named_rows(base, row, chosen, word)
     else:
-        typer.echo(f"{output}: the best {len(rows)} of {int(chosen.sum())} {word}")
+        rows = best(base.arrays, count or (1 if animate else 4 if way else 12), chosen)
+    among = int(chosen.sum())
+    models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
+    run = Run(Device(device).resolve())
+    if animate:
+        page = GraspAnimation(base, *models, run, size).file(output.suffix)
+    else:
+        sheet = GraspSheet(base, *models, "way" if way else "three sides" if three else "one side", run, size)
+        page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
+    output.write_bytes(with_palette(page) if palette and not animate else page)
+    if json:
+        emit({"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()})
+    else:
+        typer.echo(f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}")
+
+
+def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: str) -> NDArray[np.intp]:
+    for row in rows:
+        if row >= len(chosen):
+            raise InputError(f"{base.path} has the rows 0 to {len(chosen) - 1}: there is no row {row}")
+        if not chosen[row]:
+            raise InputError(f"row {row} of {base.path} is none of its {word}; --all takes any")
+    return np.array(rows, np.intp)
 
 
 def _scenes(path: Path) -> Shard:

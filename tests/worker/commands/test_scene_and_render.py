@@ -7,17 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 from typer.testing import CliRunner, Result
 
 from service.model.scene_spec import SceneSpec
 from service.store.shards import json_attribute, read_shard, write_shard
 from worker.commands import grasp_sheet
 from worker.commands.exchange import app as exchange
+from worker.commands.grasp_animation import AFTER_S, BEFORE_S
 from worker.commands.render import app as rendering
 from worker.commands.scene import app as scenes
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
+from worker.robots.timing import SHORTEST_S
 
 GRASPS = 3
 
@@ -112,7 +114,7 @@ def in_bin(base) -> Path:
         "grasp/scene_index": np.zeros(GRASPS, np.int32),
         "grasp/approach": np.repeat(pose[:, None], 2, axis=1),
         "grasp/approach_joint_positions": np.asarray(shard["grasp/joint_positions"]),
-        "grasp/lift": pose,
+        "grasp/lift": pose + np.array([0, 0, 0.1, 0, 0, 0, 0]),
     }
     spec = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
     path = base.with_name("bin.h5")
@@ -154,6 +156,40 @@ def test_pictures_of_a_way_show_each_posture_of_a_free_grasp(base):
         # Two rows of three pictures and their margins.
         assert image.width > 3 * 48 and image.height > 2 * 48 + 74
     assert CliRunner().invoke(rendering, [*arguments, "--way", "--three-sides"]).exit_code == 2
+
+
+def test_a_film_shows_the_way_of_the_grasp_that_is_named(in_bin):
+    output = in_bin.with_name("lift.webp")
+    arguments = ["pictures", str(in_bin), "--device", "cpu", "--json", "--size", "32", "--row", "1"]
+    result = CliRunner().invoke(rendering, [*arguments, "--animate", "-o", str(output)])
+    assert result.exit_code == 0, result.output
+    assert last_line(result)["rows"] == [1]
+    with Image.open(output) as film:
+        assert (film.format, film.size) == ("WEBP", (32, 24))
+        # How long a picture is shown is known once it is read.
+        shown = [frame.convert("RGB") and frame.info["duration"] for frame in ImageSequence.Iterator(film)]
+        # The lift alone is seen here: pictures that are the same are one, for as long as four motions of the shortest.
+        assert len(shown) > 3
+        assert sum(shown) >= 1000 * (BEFORE_S + 5 * SHORTEST_S + AFTER_S)
+    for more, said in (
+        (["--animate", "-o", "lift.mp4"], "an animation is written as .gif, .webp, .png, not as .mp4"),
+        (["--animate", "--way"], "exclude one another"),
+        (["--row", "3"], "has the rows 0 to 2: there is no row 3"),
+    ):
+        refused = CliRunner().invoke(rendering, [*arguments, *more])
+        assert refused.exit_code == 2 and said in " ".join(refused.output.split()), refused.output
+
+
+def test_a_row_that_is_no_valid_grasp_is_drawn_only_with_all(base):
+    shard = read_shard(base)
+    failed = base.with_name("failed.h5")
+    arrays = dict(shard.arrays) | {"quality/valid": np.array([1, 0, 1], np.uint8)}
+    failed.write_bytes(write_shard("base", arrays, shard.attributes))
+    arguments = ["pictures", str(failed), "--row", "1", "--size", "32", "--device", "cpu"]
+    arguments += ["-o", str(base.with_name("row.png")), "--json"]
+    refused = CliRunner().invoke(rendering, arguments)
+    assert refused.exit_code == 2 and "--all takes any" in refused.output
+    assert last_line(CliRunner().invoke(rendering, [*arguments, "--all"]))["rows"] == [1]
 
 
 def test_another_object_than_the_shards_is_refused(base):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -45,6 +47,16 @@ def test_the_lifted_object_is_higher_in_the_picture(block):
     frames = [[at("grasp"), at("lift", 0.1)]]
     (low, high) = way_pictures(HAND, block, frames, Around((HalfSpace(),), REST), (64, 64), samples=2)[0, 0]
     assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
+
+
+def test_the_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
+    frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
+    around = Around((HalfSpace(),), REST)
+    near, whole = (way_pictures(HAND, block, frames, around, (48, 48), whole=w, samples=2)[0, 0] for w in (False, True))
+    # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
+    assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
+    empty = way_pictures(HAND, block, [frames[0][1:]], around, (48, 48), samples=2)[0, 0, 0]
+    assert np.abs(whole[0][:2].astype(int) - empty[0, 0]).max() < 40
 
 
 @pytest.mark.parametrize("side", [0, 1, 2, 3])

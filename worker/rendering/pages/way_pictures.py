@@ -80,6 +80,7 @@ def way_pictures(
     size: tuple[int, int] = (300, 300),
     *,
     sides: int = 1,
+    whole: bool = False,
     run: Run = ALONE,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
@@ -92,6 +93,7 @@ def way_pictures(
         around: the scenes.
         size: width and height [px].
         sides: A sides of each grasp, those first that show most of object and fingers.
+        whole: all of the hand is in each picture; else what is far from the object may leave it.
         run: asked between passes whether to stop.
         samples: rays per pixel.
 
@@ -103,15 +105,16 @@ def way_pictures(
     """
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
-    stage = _Stage(hand, obj, around, len(frames[0]), run)
+    stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else _NEAR_M)
     return np.stack([stage.shoot(number, way, size, sides, samples) for number, way in enumerate(frames)])
 
 
 class _Stage:
     """One tracer for all grasps: the frames of one grasp are its worlds."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, around: Around, frames: int, run: Run) -> None:
+    def __init__(self, hand: HandModel, obj: ObjectModel, around: Around, frames: int, run: Run, near_m: float) -> None:
         self.hand, self.obj, self.around, self.frames, self.run = hand, obj, around, frames, run
+        self.near_m = near_m
         self.others = around.neighbours.objects if around.neighbours else ()
         self.lamp = TOWARD_LAMP
         self.boxes = slabs(around.supports) or [Box(FLOOR_SIZE)]
@@ -133,7 +136,7 @@ class _Stage:
         solid = np.stack([apply(pose, self.obj.hull_vertices) for pose in things])
         points = np.concatenate([solid, hand_points(self.hand, bodies)], axis=1)
         middles = 0.5 * (solid.min(axis=1) + solid.max(axis=1))
-        reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + _NEAR_M
+        reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + self.near_m
         near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
         self._place(scene, things, bodies, float(points[..., 2].min()), middles[0])
         above = middles[0] + np.array([0, 0, _HIGH_M])
