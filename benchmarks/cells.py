@@ -1,8 +1,8 @@
 """What the studies of quality share: raw grasps of a hand on an object and what is found out about them, kept on disk.
 
-A cell is one (hand, object) with a number of grasps. What a cell has found once is read again from its folder, so a
-study that was stopped goes on where it was, and two studies of as many grasps share them and their verdicts. Another
-folder begins anew.
+A cell is one (hand, object) with a number of grasps of one revision of synthesize, planned as a job plans them. What a
+cell has found once is read again from its folder, so a study that was stopped goes on where it was, and two studies of
+as many grasps share them and their verdicts. Another folder begins anew.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from service.model.domain import FIDELITIES
+from service.model.version import STAGE_REVISIONS
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
@@ -27,8 +28,11 @@ from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize
 from worker.planners.port import Wanted
+from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.judge import judge
 from worker.quality.referee.key import Level
+from worker.run import ALONE
+from worker.scenes.trial import trial_on
 
 HANDS = {
     "allegro": "allegro/allegro_hand_right.urdf",
@@ -69,10 +73,11 @@ class Cell:
                 parts = [Posture(stored[f"{name}_pose"], stored[f"{name}_joints"]) for name in POSTURES]
                 info: dict[str, object] = {"cpu_seconds": float(stored["cpu_seconds"])}
                 return GraspSet(*parts, stored["loss"], seconds=float(stored["seconds"]), info=info)
-        # Kernels are loaded before the clock starts.
-        synthesize(self.hand, self.obj, Wanted(count=1, fidelity=FIDELITIES["draft"], seed=1))
+        # Kernels are loaded and pieces made before the clock starts.
+        pieces = decompose(self.obj)
+        planned(self.hand, self.obj, pieces, count=1, seed=1, fidelity="draft")
         began, cpu = time.perf_counter(), time.process_time()
-        found = synthesize(self.hand, self.obj, Wanted(count=self.count, fidelity=FIDELITIES["standard"], seed=SEED))
+        found = planned(self.hand, self.obj, pieces, count=self.count, seed=SEED)
         found.seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
         found.info = {"cpu_seconds": cpu}
         arrays: dict[str, Any] = {
@@ -109,6 +114,14 @@ class Cell:
     def kept(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """What `make` finds, from the cell's folder where it was found before."""
         return kept_json(self.folder / f"{name}.json", make)
+
+
+def planned(
+    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, *, count: int, seed: int, fidelity: str = "standard"
+) -> GraspSet:
+    """Raw grasps of a free object as a job plans them: candidates go through the trial of `trial_on`."""
+    trial = trial_on(ALONE, hand, obj, lambda: pieces, in_scenes=False)
+    return synthesize(hand, obj, Wanted(count, FIDELITIES[fidelity], seed, trial=trial))
 
 
 def kept_json(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -148,7 +161,8 @@ def cell_parser(
 def cells(data: Path, work: Path, hand_name: str, count: int, objects: list[str] | None = None) -> Iterator[Cell]:
     """The cells of one hand, object by object; all objects of the data folder unless some are named."""
     hand = hand_from_path(data / "hands" / HANDS[hand_name])
+    folder = work / f"{hand_name}-{count}-{STAGE_REVISIONS['synthesize']}"
     for mesh in sorted((data / "objects").glob("*/clean.stl")):
         name = mesh.parent.name
         if not objects or name in objects:
-            yield Cell(work / f"{hand_name}-{count}" / name, hand_name, name, hand, mesh, count)
+            yield Cell(folder / name, hand_name, name, hand, mesh, count)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import cell_parser
+from benchmarks.cells import cell_parser, planned
 from service.model.domain import FIDELITIES
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
@@ -30,13 +30,10 @@ from worker.hands.model import HandModel
 from worker.hands.same_hand import SameHand, same_hand
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
 from worker.quality.referee.judge import judge
-from worker.quality.referee.short import push_trial
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
 OTHER = "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"
@@ -96,8 +93,7 @@ class Bench:
         pieces = decompose(obj)
         out: dict[str, dict[str, list[int]]] = {}
         for plan, hand in self.hands.items():
-            trial = push_trial(hand, obj, lambda: pieces)
-            grasps = synthesize(hand, obj, Wanted(count, FIDELITIES["standard"], seed, trial=trial))
+            grasps = planned(hand, obj, pieces, count=count, seed=seed)
             held = {
                 name: judge(model, obj, posed).success for name, (model, posed) in self.models(plan, grasps).items()
             }

@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
+from service.model.robust import MODELS
 from service.model.version import PACKAGE_VERSION
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
+from worker.quality.referee.robust import reaches, robust
 from worker.quality.table import measure
 
 FRICTION, THRESHOLD_M, TOP, CORES = 1.0, 0.005, 10, 2
+#: Share of the models that many certified grasps should reach.
+SHARE = 0.75
 #: Fast-Grasp'D, table 2 (YCB): means over the top 10 by epsilon of each object.
 PAPER = {
     "barrett": {"ca_cm2": 55.7, "iv_cm3": 4.70, "epsilon": 0.23, "wrench_volume": 5.09, "sd_cm": 1.40},
@@ -35,9 +39,9 @@ COLUMNS = {
 }  # fmt: skip
 #: Columns of the printed table: key, heading, digits.
 PRINTED = (
-    ("gsr", "GSR", 2), ("gsr_hard", "hard", 2), ("sgs", "SGS", 1), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2),
-    ("cdc_mm", "CDC", 2), ("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2),
-    ("sd_cm", "SD", 2), ("diversity", "D", 2),
+    ("gsr", "GSR", 2), ("gsr_hard", "hard", 2), ("robust", "robust", 2), ("sgs", "SGS", 1),
+    ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2), ("cdc_mm", "CDC", 2), ("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2),
+    ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2), ("sd_cm", "SD", 2), ("diversity", "D", 2),
 )  # fmt: skip
 
 
@@ -55,15 +59,25 @@ def metrics(cell: Cell) -> dict[str, Any]:
     return found
 
 
+def in_models(cell: Cell) -> dict[str, Any]:
+    """Of each grasp that the certificate holds: the share of models around the nominal one in which it does."""
+    held = np.array(cell.verdicts("certificate", False)["success"])
+    found = robust(cell.hand, cell.obj, cell.grasps, held=held, models=MODELS, seed=SEED, pieces=decompose(cell.obj))
+    return {"models": MODELS, "shares": found.share[held == 1].tolist(), "seconds": found.seconds}
+
+
 def row(cell: Cell) -> dict[str, Any]:
     """The numbers of one object; seconds are of two cores."""
     letter, hard = (np.array(cell.verdicts("letter", h)["success"]) == 1 for h in (False, True))
     certificate = cell.verdicts("certificate", False)
     quality = cell.kept("metrics", lambda: metrics(cell))
+    shares = np.array(cell.kept(f"models-{MODELS}", lambda: in_models(cell))["shares"])
     top = np.argsort(-np.array(quality["epsilon"]))[:TOP]
     made, judged = cell.cpu_seconds / CORES, certificate["cpu_seconds"] / CORES
     return {
         "object": cell.object_name, "n": len(letter), "gsr": float(letter.mean()), "gsr_hard": float(hard.mean()),
+        "robust": float(shares.mean()) if len(shares) else None, "robust_n": len(shares),
+        "robust_many": int(reaches(shares, SHARE).sum()),
         "osr": float(letter.any()), "osr_hard": float(hard.any()), "held": int(letter.sum()),
         "seconds": made, "referee_seconds": judged, "sgs": float(letter.sum() / (made + judged)),
         "sgs_without_referee": float(letter.sum() / made),
@@ -79,9 +93,13 @@ def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """All objects in one row: rates over all grasps, means of the objects' medians."""
     n, held = sum(r["n"] for r in rows), sum(r["held"] for r in rows)
     made, judged = sum(r["seconds"] for r in rows), sum(r["referee_seconds"] for r in rows)
-    out = {key: float(np.mean([r[key] for r in rows])) for key, _, _ in PRINTED}
+    out = {key: float(np.mean([r[key] for r in rows])) for key, _, _ in PRINTED if key != "robust"}
+    certified = sum(r["robust_n"] for r in rows)
+    known = [r for r in rows if r["robust_n"]]
     return out | {
         "object": "all", "n": n, "gsr": held / n, "gsr_hard": sum(r["gsr_hard"] * r["n"] for r in rows) / n,
+        "robust": sum(r["robust"] * r["robust_n"] for r in known) / certified if certified else None,
+        "robust_n": certified, "robust_many": sum(r["robust_many"] for r in rows),
         "osr": float(np.mean([r["osr"] for r in rows])), "osr_hard": float(np.mean([r["osr_hard"] for r in rows])),
         "sgs": held / (made + judged), "sgs_without_referee": held / made,
         "top": {key: float(np.mean([r["top"][key] for r in rows])) for key in PAPER["allegro"]},
@@ -89,10 +107,16 @@ def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
 def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], command: str) -> str:
     head = f"| object | {' | '.join(heading for _, heading, _ in PRINTED)} |"
     body = [
-        f"| {bold}{r['object']}{bold} | " + " | ".join(f"{bold}{r[key]:.{d}f}{bold}" for key, _, d in PRINTED) + " |"
+        f"| {bold}{r['object']}{bold} | "
+        + " | ".join(f"{bold}{shown(r[key], d)}{bold}" for key, _, d in PRINTED)
+        + " |"
         for r, bold in [*((r, "") for r in rows), (total, "**")]
     ]
     paper, ours = PAPER[hand], total["top"]
@@ -107,17 +131,19 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "",
             f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
             f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
-            f"{total['sgs_without_referee']:.1f} without the referee.**",
+            f"{total['sgs_without_referee']:.1f} without the referee. {total['robust_many']} of {total['robust_n']} "
+            f"that the certificate holds do in {SHARE} of {MODELS} models around the nominal one.**",
             "",
             head,
             "| --- |" + " --: |" * len(PRINTED),
             *body,
             "",
-            "GSR: share that holds, normal and at half the friction. SGS: holding grasps per second, made and judged "
-            "(level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, self-penetration mm. "
-            "CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm and μ = 1. IV cm³. "
-            "SD: simulated displacement cm. D: variance explained by the first component. Medians; the last row has "
-            "rates over all grasps and means of the medians.",
+            f"GSR: share that holds, normal and at half the friction. robust: share of {MODELS} models around the "
+            "nominal one in which a grasp that the certificate holds does, on average. SGS: holding grasps per second, "
+            "made and judged (level *certificate*), seconds being CPU time over two cores. PD, SPD: penetration, "
+            "self-penetration mm. CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm "
+            "and μ = 1. IV cm³. SD: simulated displacement cm. D: variance explained by the first component. Medians; "
+            "the last row has rates over all grasps and means of the medians.",
             "",
             f"Best {TOP} by ε of each object, means, as in table 2 of the paper (YCB objects there):",
             "",

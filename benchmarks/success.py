@@ -13,16 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.cells import planned
 from service.model.domain import FIDELITIES
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
-from worker.planners import synthesize
-from worker.planners.port import Wanted
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.judge import judge
-from worker.quality.referee.short import push_trial
 from worker.quality.table import measure
 
 HANDS = {
@@ -50,8 +48,7 @@ class Results:
     def add(self, hand: HandModel, obj: ObjectModel, count: int) -> str:
         """Grasps of one more object; the cells of its row."""
         pieces = decompose(obj)
-        trial = push_trial(hand, obj, lambda: pieces)
-        found = synthesize(hand, obj, Wanted(count, FIDELITIES["standard"], SEED, trial=trial))
+        found = planned(hand, obj, pieces, count=count, seed=SEED)
         self.seconds += found.seconds
         self.success.append(judge(hand, obj, found, pieces=pieces).success)
         self.hard.append(judge(hand, obj, found, hard=True, pieces=pieces).success)
