@@ -65,7 +65,7 @@ def synthesize(
         robust: share of models around the nominal one that a grasp must hold in to count (docs/quality.md).
         robust_models: how many such models; 0: 8 where a share is wanted, else none.
         method: the planner.
-        options: its own options, such as {"steps": 20000}.
+        options: its own options, such as {"steps": 20000} or, of learned, {"network": "net.npz"}.
         fidelity: draft, standard or fine.
         seed: with hand, object and options all that decides the result.
         friction: Coulomb coefficient of the quality metrics.
@@ -84,12 +84,13 @@ def synthesize(
     try:
         from service.store.asset_options import object_options
         from worker.files.synthesis import chosen_fidelity, synthesized
+        from worker.planners.registry import of_this_machine
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     try:
         request = JobOptions(
-            grasps=count, want=want, budget=budget, referee=referee, method=method, options=options or {}, seed=seed,
-            friction=friction, min_distance=min_distance, audits=0, robust=robust,
+            grasps=count, want=want, budget=budget, referee=referee, method=method, seed=seed, friction=friction,
+            options=of_this_machine(method, options), min_distance=min_distance, audits=0, robust=robust,
             robust_models=robust_models,
         )  # fmt: skip
     except ValidationError as error:

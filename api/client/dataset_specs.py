@@ -25,6 +25,8 @@ SpecOption = Annotated[
 class Spec(JobOptions):
     """The keys of a spec: those of a job's options, and these."""
 
+    SUBMITTED = True
+
     name: Name | None = None
     hands: tuple[Name, ...] = ()
     objects: str | tuple[str, ...] = Field((), description="as `--objects`; a folder is looked for beside the spec")

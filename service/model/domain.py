@@ -8,7 +8,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -140,12 +140,17 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
 
 #: Methods of graspd's own that know no scene; what those of other packages know, a worker tells.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
+#: Methods that need a file which the service does not keep: they run where the file is.
+LOCAL_METHODS: Final = ("learned",)
 #: Scenes of a batch that is planned in scenes, where the request does not say how many.
 SCENES: Final = 4
 
 
 class JobOptions(Model):
     """What a job says besides its hand and object: how many grasps, how made, with which scenes and views."""
+
+    SUBMITTED: ClassVar[bool] = False
+    """Whether it goes to a service, or is work of this process."""
 
     grasps: int = Field(32, ge=1, le=1_000_000, description="number of grasps to synthesize")
     method: Name = "fast_graspd"
@@ -278,6 +283,12 @@ class JobOptions(Model):
         return self
 
     @model_validator(mode="after")
+    def _made_where_its_files_are(self) -> Self:
+        if self.SUBMITTED and self.method in LOCAL_METHODS:
+            raise ValueError(f"method {self.method} needs a file of this machine: use graspd synth, services have none")
+        return self
+
+    @model_validator(mode="after")
     def _views_need_scenes(self) -> Self:
         if self.views and not self.scenes:
             raise ValueError("views need scenes: ask for scenes >= 1")
@@ -366,6 +377,8 @@ class JobOptions(Model):
 
 class JobRequest(JobOptions):
     """One hand x one object x a number of grasps x a method and fidelity, with the scenes and views to make of them."""
+
+    SUBMITTED = True
 
     hand: Name = Field(description="name of a hand known to the service")
     object: Name = Field(description="name of an object known to the service")

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -146,6 +147,22 @@ def to_bytes(network: ProposalNetwork) -> bytes:
     return buffer.getvalue()
 
 
+def read_file(path: Path) -> bytes:
+    """The bytes of a file that may be a network's.
+
+    Raises:
+        LimitError: it has more than `MAX_BYTES`.
+        InputError: it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"the network {path} cannot be read: {error.strerror}") from None
+    _check_size(data, str(path))
+    return data
+
+
 def from_bytes(data: bytes, what: str) -> ProposalNetwork:
     """The network of a file.
 
@@ -157,8 +174,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
         LimitError: more than `MAX_BYTES`, packed or unpacked.
         InputError: not a file of this schema, whole and finite.
     """
-    if len(data) > MAX_BYTES:
-        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
+    _check_size(data, what)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             meta = _read_meta(archive, what)
@@ -179,6 +195,11 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
         meta.hand, meta.hand_digest, meta.joint_names, weights, arrays["mean"], arrays["std"], meta.points, meta.steps,
         about=meta.about,
     )  # fmt: skip
+
+
+def _check_size(data: bytes, what: str) -> None:
+    if len(data) > MAX_BYTES:
+        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
 
 
 def _expected(joints: int) -> dict[str, tuple[int, ...]]:

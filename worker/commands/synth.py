@@ -24,7 +24,7 @@ from service.store.shards import write_shard
 from worker.files.of_shard import id_of_columns
 from worker.files.synthesis import chosen_fidelity, synthesized
 from worker.planners import PLANNERS
-from worker.planners.registry import parsed_options
+from worker.planners.registry import of_this_machine, parsed_options
 from worker.quality.referee.key import Level
 from worker.run import Progress as Report
 
@@ -98,7 +98,8 @@ def synth(
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     request = _request(want, budget, referee, robust, robust_models).model_copy(
         update={
-            "grasps": grasps, "method": method, "options": parsed_options(option or []), "seed": seed,
+            "grasps": grasps, "method": method, "seed": seed,
+            "options": of_this_machine(method, parsed_options(option or [])),
             "friction": friction, "min_distance": min_distance, "fidelity": chosen_fidelity(fidelity, contact_solver),
         }
     )  # fmt: skip

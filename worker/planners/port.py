@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -89,12 +90,17 @@ class Method:
     """From the options to the planner."""
     in_scenes: bool = False
     """Whether it plans grasps for the scenes they are in, or around free objects only."""
+    free: bool = True
+    """Whether it plans around free objects."""
     options: type[Options] = Options
     """The options it takes."""
     uses: tuple[str, ...] = ()
     """Knobs of `Fidelity` that move its grasps; the others are ignored."""
     joined: Callable[[Any], Joined] | None = None
     """From the options to what makes several batches in one launch; None: it makes them one after the other."""
+    files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)
+    """Options that are files to who has them: each with what keeps such a file in this process and gives its digest,
+    which is the option's value."""
     quick: Mapping[str, Any] = field(default_factory=dict)
     """Options with which a call is short: to warm up, and to try things out. Its grasps need not be good."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -22,6 +23,7 @@ PLANNERS: Final[dict[str, tuple[str, str]]] = {
     "graspit": ("worker.planners.graspit.method", "METHOD"),
     "graspd2022": ("worker.planners.graspd2022.method", "METHOD"),
     "dfc": ("worker.planners.dfc.method", "METHOD"),
+    "learned": ("worker.planners.learned.method", "METHOD"),
     "autograsp": ("worker.planners.autograsp.method", "METHOD"),
 }
 
@@ -64,6 +66,8 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
     if in_scenes and not known.in_scenes:
         able = ", ".join(one for one in method_names() if method(one).in_scenes)
         raise InputError(f"method {name} plans around free objects only; in scenes choose {able}, or scene free")
+    if not in_scenes and not known.free:
+        raise InputError(f"method {name} plans in scenes only; give a scene with a table, or choose fast_graspd")
     return known.planner(_options(name, options))
 
 
@@ -82,6 +86,16 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
 
         there_are = ", ".join(known.options.model_fields) or "none"
         raise InputError(f"option of {name}: {validation_line(error)}; its options: {there_are}") from None
+
+
+def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Options as a user of this machine gives them, with digests in the place of files, which this process keeps.
+
+    Raises:
+        InputError: unknown method, or a file that cannot be used.
+    """
+    files, given = method(name).files, dict(options or {})
+    return given | {key: files[key](Path(str(value))) for key, value in given.items() if key in files}
 
 
 def parsed_options(pairs: list[str]) -> dict[str, str]:

@@ -28,6 +28,8 @@ Names = Annotated[tuple[Name, ...], AfterValidator(_once)]
 class Matrix(JobOptions):
     """Hands x objects, and what is wanted of each cell: `grasps` is a number for each cell."""
 
+    SUBMITTED = True
+
     hands: Names = Field(min_length=1, max_length=1000, description="names of hands")
     objects: Names = Field((), max_length=MAX_CELLS, description="names of objects")
     sets: Names = Field((), max_length=100, description="names of sets of objects; these follow `objects`")

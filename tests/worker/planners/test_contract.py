@@ -16,8 +16,10 @@ from worker.planners import PLANNERS, method, synthesize
 from worker.planners.port import Wanted
 from worker.run import Run
 
-#: All methods but fast_graspd, with the options that make them quick.
-PEERS: dict[str, dict[str, object]] = {name: dict(method(name).quick) for name in PLANNERS if name != "fast_graspd"}
+#: All methods around free objects but fast_graspd, with the options that make them quick.
+PEERS: dict[str, dict[str, object]] = {
+    name: dict(method(name).quick) for name in PLANNERS if name != "fast_graspd" and method(name).free
+}
 PEERS["graspd2022"]["grid"] = 24
 EACH = pytest.mark.parametrize("name", sorted(PEERS))
 

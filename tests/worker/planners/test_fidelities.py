@@ -27,7 +27,7 @@ SHORT: dict[str, Any] = {
     "starts": 1, "finalists": 1, "coarse_points": 64, "fine_points": 64, "object_points": 64, "coarse_iterations": 3,
     "fine_iterations": 2, "polish_iterations": 1,
 }  # fmt: skip
-METHODS = sorted(PLANNERS)
+METHODS = sorted(name for name in PLANNERS if method(name).free)
 PAIR = ("draft", "fine")
 
 

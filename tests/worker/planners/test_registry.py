@@ -22,7 +22,8 @@ from worker.planners.registry import parsed_options
 def test_every_method_of_graspds_own_says_what_it_is_and_where_it_is_published(name: str) -> None:
     found = method(name)
     assert found.summary and found.source
-    assert callable(planner(name))
+    options = {name: "0" * 32 for name, field in found.options.model_fields.items() if field.is_required()}
+    assert callable(planner(name, options, in_scenes=found.in_scenes))
 
 
 def test_options_of_a_method_are_read_from_text() -> None:
@@ -97,7 +98,7 @@ def test_the_page_names_every_method_with_all_its_options_and_defaults(name: str
     page = (Path(__file__).parents[3] / "docs" / "planners.md").read_text()
     row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` | "))
     for option, field in method(name).options.model_fields.items():
-        assert f"`{option}` ({field.default:g}" in row
+        assert f"`{option}` ({'required' if field.is_required() else format(field.default, 'g')}" in row
 
 
 @pytest.mark.parametrize("name", FREE_ONLY_METHODS)

@@ -17,6 +17,7 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.scene_starts import free_ways
 from worker.planners.fast_graspd.schedule import in_scene, with_trial
 from worker.planners.fast_graspd.starts import start_generator
+from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.port import Asked
 from worker.planners.threads import Steps
 from worker.simulation.surroundings import Placed, placed_together
@@ -28,12 +29,15 @@ Rows = NDArray[np.intp]
 class Batches:
     """The grasps of several batches, one batch after the other; a row is a grasp."""
 
-    def __init__(self, asked: Sequence[Asked], obj: ObjectModel) -> None:
-        """All batches have one fidelity, and all or none of them are in scenes with the same fixed surroundings."""
-        self.asked = asked
+    def __init__(self, asked: Sequence[Asked], obj: ObjectModel, warm: WarmStart | None = None) -> None:
+        """All batches have one fidelity, and all or none of them are in scenes with the same fixed surroundings.
+        `warm`, in scenes: where their hands set out; None: where `scene_starts` finds."""
+        self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
         in_scenes = wanted[0].placed is not None
         self.fidelity: Fidelity = _adapted(wanted[0].fidelity, in_scenes=in_scenes, tried=self.has_trial)
+        if warm is not None:
+            self.fidelity = warm.adapted(self.fidelity)
         counts = [one.count for one in wanted]
         self.owner = np.repeat(np.arange(len(asked)), counts)
         """(n,) the batch of each row."""

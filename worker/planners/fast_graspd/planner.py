@@ -24,6 +24,7 @@ from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import FRICTION, SCENE_FRICTION, best_of_each, merits, ranked
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
+from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.planners.port import Asked, Wanted
 from worker.planners.threads import cut, run_parts
@@ -83,18 +84,22 @@ class Part:
         return Part(rows, _joined_states([self.state, other.state]), loss, merit, curve, joined(both) if both else None)
 
 
-def plan(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet:
-    """See `worker.planners.Planner`."""
-    (found,) = plan_joined(hand, obj, [Asked(wanted, run)])
+def plan(
+    hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run, *, warm: WarmStart | None = None
+) -> GraspSet:  # fmt: skip
+    """See `worker.planners.Planner`; `warm` as `Batches` has it."""
+    (found,) = plan_joined(hand, obj, [Asked(wanted, run)], warm=warm)
     if isinstance(found, Exception):
         raise found
     return found
 
 
-def plan_joined(hand: HandModel, obj: ObjectModel, asked: Sequence[Asked]) -> list[GraspSet | Exception]:
-    """See `worker.planners.Joined`."""
+def plan_joined(
+    hand: HandModel, obj: ObjectModel, asked: Sequence[Asked], *, warm: WarmStart | None = None
+) -> list[GraspSet | Exception]:  # fmt: skip
+    """See `worker.planners.Joined`; `warm` as `Batches` has it."""
     began = time.perf_counter()
-    batches = Batches(asked, obj)
+    batches = Batches(asked, obj, warm)
     run = asked[0].run.apart()
     try:
         parts = optimise(pair_of(hand, obj, asked[0].wanted.fidelity, run.device), batches, run, postures=True)
@@ -212,9 +217,8 @@ def _set_out(launch: _Launch, rows: Rows, attempt: int = 0) -> _Begun:
     if placed is None:
         state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
     else:
-        state, depth = scene_starts.clear_scene_starts(
-            coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways
-        )
+        starts_of = batches.warm or scene_starts.clear_scene_starts
+        state, depth = starts_of(coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways)
     touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
     return _Begun(rows, state, depth, touch)
 

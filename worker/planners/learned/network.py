@@ -36,6 +36,7 @@ from service.store.network_file import (
     Floats32,
     ProposalNetwork,
     from_bytes,
+    read_file,
     to_bytes,
     weight_shapes,
 )
@@ -92,11 +93,7 @@ def load(path: Path) -> ProposalNetwork:
     Raises:
         InputError: no such file, or no network; see `service.store.network_file.from_bytes`.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"the network {path} cannot be read: {error.strerror}") from None
-    return from_bytes(data, str(path))
+    return from_bytes(read_file(path), str(path))
 
 
 def save(network: ProposalNetwork, path: Path) -> None:
@@ -135,7 +132,7 @@ def propose(
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
     noise = rng.standard_normal((count, network.numbers)).astype(np.float32)
-    return decode(network, flow(network, noise, np.repeat(condition, count, axis=0)), anchor)
+    return decode(flow(network, noise, np.repeat(condition, count, axis=0)), anchor)
 
 
 def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> tuple[Floats32, Floats]:
@@ -209,7 +206,7 @@ def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
     )  # fmt: skip
 
 
-def decode(network: ProposalNetwork, rows: ArrayLike, anchor: ArrayLike) -> Proposals:
+def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
     """Grasps of rows (n, D); the anchor is one (3,) or each row's own (n, 3). Rotations by Gram-Schmidt."""
     x = np.asarray(rows, float)
     joints, opened, pressed = np.split(x[:, POSE:], 3, axis=1)

@@ -63,7 +63,7 @@ def float64_rows(network: net.ProposalNetwork, noise: Floats, label: float) -> F
 def test_proposals_are_those_of_the_definition_in_double_precision(label: float) -> None:
     network = random_network(["a", "b", "c"])
     noise = np.random.default_rng(7).standard_normal((3, network.numbers))
-    expected = net.decode(network, float64_rows(network, noise, label), cloud()[0].mean(axis=0))
+    expected = net.decode(float64_rows(network, noise, label), cloud()[0].mean(axis=0))
     found = proposed(network, 3, label=label)
     # Single precision: 16 steps of sums over 512 numbers of order 1, each rounded at 6e-8.
     for name in ("hand_pose", "approach", "joints", "pregrasp", "squeeze"):
@@ -128,13 +128,13 @@ def test_a_grasp_survives_its_row_and_a_bad_row_gives_a_rotation_all_the_same() 
     network = random_network(["a", "b", "c"])
     found = proposed(network, 5)
     np.testing.assert_allclose(np.linalg.norm(found.hand_pose[:, 3:], axis=1), 1, atol=1e-12)
-    back = net.decode(network, net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3])
+    back = net.decode(net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3])
     for name in ("hand_pose", "approach", "joints", "pregrasp", "squeeze"):
         np.testing.assert_allclose(getattr(back, name), getattr(found, name), atol=1e-12)
     flat = np.zeros((3, network.numbers))
     flat[1, 3:9] = [0, 2, 0, 0, -1, 0]  # columns on one line
     flat[2, 3:9] = [3, 0, 0, 1, 2, 0]
-    made = net.decode(network, flat, np.zeros(3))
+    made = net.decode(flat, np.zeros(3))
     np.testing.assert_allclose(np.linalg.norm(made.hand_pose[:, 3:], axis=1), 1, atol=1e-12)
     np.testing.assert_allclose(made.hand_pose[2, 3:], [1, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(made.approach, [[0, 0, -1]] * 3, atol=1e-12)

@@ -1,0 +1,54 @@
+"""Networks of this process by the digest of their file: an option of a method names one without naming a file."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Final
+
+from cachetools import LRUCache
+
+from service.model.digests import digest_bytes
+from service.model.errors import InputError
+from service.store.network_file import ProposalNetwork, from_bytes, read_file, to_bytes
+
+_known: Final[LRUCache[str, ProposalNetwork]] = LRUCache(16)
+_lock: Final = threading.Lock()
+
+
+def keep_file(path: Path) -> str:
+    """Read a network's file and keep it; its digest.
+
+    Raises:
+        InputError: no network.
+    """
+    return _kept(read_file(path), str(path))
+
+
+def keep(network: ProposalNetwork) -> str:
+    """Keep a network that is in memory; the digest of its file.
+
+    Raises:
+        InputError: it could not be written.
+    """
+    return _kept(to_bytes(network), "the network")
+
+
+def kept(digest: str) -> ProposalNetwork:
+    """The network of a digest.
+
+    Raises:
+        InputError: none is kept under it.
+    """
+    with _lock:
+        found = _known.get(digest)
+    if found is None:
+        raise InputError(f"network {digest[:12]} is not known here; give its file: --option network=FILE.npz")
+    return found
+
+
+def _kept(data: bytes, what: str) -> str:
+    network, digest = from_bytes(data, what), digest_bytes(data)
+    with _lock:
+        _known[digest] = network
+    return digest
