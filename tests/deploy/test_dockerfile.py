@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import graspd.cli
 from tests.conftest import REPOSITORY
@@ -157,19 +161,35 @@ def test_compose_builds_targets_that_exist_and_runs_commands_that_exist(name: st
     assert service["command"][0] in COMMANDS
 
 
-def test_the_pins_are_within_the_ranges_of_the_project() -> None:
+@pytest.fixture(scope="module")
+def pin() -> Iterator[ModuleType]:
+    """docker/pin.py, which writes the pins."""
     sys.path.insert(0, str(REPOSITORY / "docker"))
     try:
-        import pin
+        yield importlib.import_module("pin")
     finally:
         sys.path.pop(0)
-    pins = dict(line.split("==") for line in CONSTRAINTS.read_text().splitlines() if line and not line.startswith("#"))
+
+
+def pins() -> dict[str, str]:
+    return dict(line.split("==") for line in CONSTRAINTS.read_text().splitlines() if line and not line.startswith("#"))
+
+
+def test_the_pins_are_within_the_ranges_of_the_project(pin: ModuleType) -> None:
+    pinned = pins()
     wrong = [
-        f"{requirement} but {pins[requirement.name]}"
+        f"{requirement} but {pinned[requirement.name]}"
         for requirement in map(Requirement, map(str, pin.requirements(*pin.EXTRAS)))
-        if requirement.name in pins and not requirement.specifier.contains(pins[requirement.name])
+        if requirement.name in pinned and not requirement.specifier.contains(pinned[requirement.name])
     ]
     assert not wrong, "run `make pins`"
+
+
+@pytest.mark.parametrize("extra", ["api", "worker", "postgres", "otel", "gpu"])
+def test_what_the_images_install_is_pinned(pin: ModuleType, extra: str) -> None:
+    assert extra in pin.EXTRAS
+    wanted = {canonicalize_name(str(requirement.name)) for requirement in pin.requirements(extra)}
+    assert not wanted - pins().keys(), "run `make pins`"
 
 
 def test_hadolint_finds_nothing() -> None:
