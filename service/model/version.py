@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-PACKAGE_VERSION: Final = "0.1.0"
+PACKAGE_VERSION: Final = "0.2.0"
 
 #: Newest schema of task messages, and the oldest that a worker of this version still reads. A message carries the range
 #: that can read it, so workers of two versions may run side by side (`service/model/ability.py`).
