@@ -86,7 +86,7 @@ STUDIES: Final = (
     Study(
         "scenes-chart", "planned in a scene, or filtered", ("results/scenes-chart/*",),
         (f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
-         f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --peer-batch 8 --threads 1 "
+         f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --peer-batch 24 --threads 1 "
          "--work WORK/scenes-chart --out OUT/results/scenes-chart",),
         ("graspd chart --scene table --quick --hands barrett --objects block --work WORK/scenes-chart "
          "--out OUT/results/scenes-chart",),

@@ -14,6 +14,7 @@ import typer
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.domain import FIDELITIES, OFFERED
 from service.model.errors import InputError
+from service.model.robust import MODELS
 from worker.engines.devices import Device
 from worker.run import Run
 
@@ -74,10 +75,10 @@ def chart(
     if scene != "free" and (sweep or publish):
         raise InputError("--sweep and --publish are of free objects' charts; leave out --scene")
     on = Run(Device(device).resolve(), threads)
-    batches = [_number(part) for part in _parts(batch)]
+    batches, models_around = [_number(part) for part in _parts(batch)], MODELS
     if quick:
         hands, objects, fidelities = (_first(text) for text in (hands, objects, fidelities))
-        batches, peer_batch, repeats = [4], 2, 1
+        batches, peer_batch, repeats, models_around = [4], 2, 1, 2
     chosen = settings_of(
         _parts(methods), known_fidelities(_parts(fidelities)), batches=batches, peer_batch=peer_batch,
         options=option or [], quick=quick, run=on,
@@ -93,7 +94,7 @@ def chart(
         if out is not None:
             write(so_far | said, out)
 
-    result = run(models, things, chosen, repeats=repeats, say=_say, keep=keep) | said
+    result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep) | said
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on,

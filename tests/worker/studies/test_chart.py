@@ -26,6 +26,7 @@ from worker.studies.chart.variants import asking_each
 
 RUN_KEYS = {
     "method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon", "pd_mm",
+    "end_to_end_per_second", "letter", "hard", "robust",
 }  # fmt: skip
 
 
@@ -58,12 +59,25 @@ def test_valid_grasps_per_second_are_those_that_held_over_the_seconds(made: tupl
         assert run["gsr_low"] <= run["gsr"] <= run["gsr_high"]
 
 
+def test_end_to_end_counts_what_is_valid_over_all_that_a_job_does(made: tuple[dict[str, Any], Path]) -> None:
+    for run in made[0]["runs"]:
+        assert run["kept"] <= run["valid"]
+        assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
+        assert run["end_to_end_per_second"] == pytest.approx(run["kept"] / sum(run["end_seconds"]), rel=1e-4)
+        for key in ("letter", "hard", "end_to_end_per_second", *(["robust"] if run["valid"] else [])):
+            assert run[f"{key}_low"] <= run[key] <= run[f"{key}_high"], key
+        assert (run["robust"] is None) == (run["valid"] == 0)
+    assert set(made[0]["by_hand"]) == {"barrett"} and made[0]["models"] == 2
+    assert made[0]["by_hand"]["barrett"] == made[0]["summary"]
+
+
 def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
     found, folder = made
     assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
     rows = list(csv.DictReader((folder / "chart.csv").read_text().splitlines()))
     assert [float(row["gsr"]) for row in rows] == [run["gsr"] for run in found["runs"]]
     assert "The best ten by epsilon" in (folder / "chart.md").read_text()
+    assert (folder / "chart.hands.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "chart.png").read_bytes().startswith(b"\x89PNG")
     assert "<svg" in (folder / "chart.svg").read_text()
 
@@ -119,8 +133,10 @@ def test_the_first_valid_grasp_takes_as_many_calls_as_a_coin_of_that_bias() -> N
 def run_of(method: str, valid: int, seconds: float, pd: float) -> dict[str, Any]:
     row: dict[str, Any] = {"method": method, "fidelity": "standard", "batch": 10, "grasps": 10, "valid": valid}
     row |= {"seconds": [seconds], "seconds_to_first_valid": seconds if valid else None, "gsr": valid / 10}
+    row |= {"letter": valid / 10, "hard": valid / 20, "robust": 0.5 if valid else None}
     row |= {"epsilon": 0.1, "pd_mm": pd, "valid_per_second": valid / seconds}
-    for key in ("gsr", "epsilon", "pd_mm", "valid_per_second"):
+    row |= {"kept": valid, "end_seconds": [2 * seconds], "end_to_end_per_second": valid / seconds / 2}
+    for key in ("gsr", "letter", "hard", "robust", "epsilon", "pd_mm", "valid_per_second", "end_to_end_per_second"):
         row |= {f"{key}_low": row[key], f"{key}_high": row[key]}
     return row
 
@@ -128,22 +144,24 @@ def run_of(method: str, valid: int, seconds: float, pd: float) -> dict[str, Any]
 def test_sums_divide_all_valid_grasps_by_all_seconds() -> None:
     (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
-    assert row["gsr"] == pytest.approx(0.5)
+    assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
+    assert row["gsr"] == row["letter"] == pytest.approx(0.5)
     assert row["pd_mm"] == pytest.approx(0.2)
 
 
 def test_a_method_that_makes_nothing_valid_is_on_no_front() -> None:
     able, unable = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
-    assert able["front"] == ["gsr", "epsilon", "pd_mm"]
-    assert unable["front"] == []
+    assert able["front"] == ["letter", "hard", "robust", "gsr", "epsilon", "pd_mm"]
+    assert unable["front"] == [] and unable["robust"] is None
     assert unable["seconds_to_first_valid"] is None
 
 
 def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
-    """10 valid/s against 0 of 10 at 100 grasps/s: at most 3 of 10 hold, so at least a third of a time more."""
+    """5 valid/s against 0 of 10 at 50 grasps/s: at most 3 of 10 hold, so at least a third of a time more."""
     rows = summed([run_of("fast_graspd", 10, 1.0, 0.5), run_of("graspit", 0, 0.1, 0.0)])
     assert "> × 0.333 (0 of 10 valid)" in markdown(
-        {"summary": rows, "runs": [], "created": "", "device": "", "threads": 2, "versions": {"graspd": "", "warp": ""},
+        {"summary": rows, "runs": [], "by_hand": {}, "models": 8,
+         "created": "", "device": "", "threads": 2, "versions": {"graspd": "", "warp": ""},
          "referee": {"level": ""}, "friction": 1.0, "threshold_m": 0.005}
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ class Thing:
 
 
 def chart(
-    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], *, repeats: int,
+    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], *, repeats: int, models: int,
     say: Say = lambda line: None, keep: Callable[[dict[str, Any]], None] = lambda result: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run everything.
@@ -43,11 +43,13 @@ def chart(
         things: the objects.
         settings: what to compare.
         repeats: timed calls of each setting on each pair.
+        models: around the nominal one, in which each grasp that holds is judged.
         say: told of each cell as it ends.
         keep: given the result so far after each pair.
 
     Returns:
-        `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `device`, `created`.
+        `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `by_hand` over each
+        hand's objects, `device`, `created`.
     """
     runs: list[dict[str, Any]] = []
     for thing in things:
@@ -62,24 +64,31 @@ def chart(
                     cell.repeat()
                     cell.time_first(cell.setting.run.cores)
             for cell in cells:
+                cell.scrutinise(models)
                 runs.append(_row(cell, hand, thing))
                 say(_line(runs[-1]))
-            keep(_result(runs, settings))
-    return _result(runs, settings)
+            keep(_result(runs, settings, models))
+    return _result(runs, settings, models)
 
 
-def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting]) -> dict[str, Any]:
+def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models: int) -> dict[str, Any]:
     return {
         "created": timestamp(),
         "device": device_name(settings[0].run.device),
         "versions": {"graspd": PACKAGE_VERSION, "warp": wp.config.version},
         "threads": settings[0].run.cores,
         "referee": {"protocol": "dexgraspbench", "level": "certificate"},
+        "models": models,
         "friction": FRICTION,
         "threshold_m": THRESHOLD_M,
         "runs": list(runs),
         "summary": summed(runs),
+        "by_hand": {hand: summed(own) for hand, own in _of_hands(runs).items()},
     }
+
+
+def _of_hands(runs: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    return {hand: [run for run in runs if run["hand"] == hand] for hand in dict.fromkeys(run["hand"] for run in runs)}
 
 
 def _row(cell: Trial, hand: HandModel, thing: Thing) -> dict[str, Any]:
@@ -98,6 +107,6 @@ def _row(cell: Trial, hand: HandModel, thing: Thing) -> dict[str, Any]:
 def _line(run: dict[str, Any]) -> str:
     return (
         f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
-        f"{run['valid_per_second']:8.3f} valid/s  GSR {run['gsr']:.2f}  eps {run['epsilon']:.3f}  "
-        f"PD {run['pd_mm']:.2f} mm"
+        f"{run['end_to_end_per_second']:8.3f} valid/s  letter {run['letter']:.2f}  hard {run['hard']:.2f}  "
+        f"eps {run['epsilon']:.3f}  PD {run['pd_mm']:.2f} mm"
     )

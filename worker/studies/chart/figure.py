@@ -1,4 +1,4 @@
-"""The chart's pictures: accuracy over speed with bars and Pareto front; accuracy over speed for each knob."""
+"""The chart's pictures: accuracy over speed with bars and Pareto front, over all and for each hand; knobs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from worker.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
 
-#: Title, key, whether more is better.
+#: Title and key of the accuracies over speed.
 PANELS: Final = (
-    ("Success in MuJoCo", "gsr", True),
-    ("ε (median)", "epsilon", True),
-    ("Penetration, mm (median; less is better)", "pd_mm", False),
+    ("Success by the letter", "letter"),
+    ("Success at half the friction", "hard"),
+    ("Robust share of those that hold", "robust"),
+    ("ε (median)", "epsilon"),
+    ("Penetration, mm (median; less is better)", "pd_mm"),
 )
+SPEED: Final = "end_to_end_per_second"
+#: Shares.
+OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_hard"})
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
 INK: Final = "#1f2937"
@@ -27,23 +32,54 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
     """Accuracies over valid grasps per second, and success over the seconds to the first valid grasp."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 8.2), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    panels = figure.subplots(2, 3)
     styles = _styles(rows)
-    for axes, (title, key, more) in zip(panels.flat[:3], PANELS, strict=True):
-        _panel(axes, rows, styles, x="valid_per_second", y=key)
-        _front(axes, rows, key, more)
-        axes.set_xlabel("valid grasps per second")
-        axes.set_title(title, loc="left", fontsize=11)
-    last = panels.flat[3]
-    _panel(last, [r for r in rows if r["seconds_to_first_valid"]], styles, x="seconds_to_first_valid", y="gsr")
-    last.set_xlabel("seconds to the first valid grasp (less is better)")
-    last.set_title("Success in MuJoCo", loc="left", fontsize=11)
-    for axes in (panels.flat[0], last):
-        axes.set_ylim(-0.07, 1.04)
+    for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
+        _over_speed(axes, rows, styles, key, title, "valid grasps per second, end to end", SPEED)
+    last = panels.flat[5]
+    _panel(last, [r for r in rows if r["seconds_to_first_valid"]], styles, x="seconds_to_first_valid", y="letter")
+    last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
+    last.set_title("Success by the letter", loc="left", fontsize=11)
+    last.set_ylim(-0.07, 1.04)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    for file in files:
+        figure.savefig(file, dpi=150)
+
+
+def draw_hands(
+    by_hand: Mapping[str, Sequence[Row]], files: Sequence[Path], *, key: str, speed: str, words: tuple[str, str]
+) -> None:
+    """A panel for each hand: one accuracy over speed, both in words."""
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(by_hand))
+    lines = -(-len(by_hand) // columns)
+    figure = Figure(figsize=(5.4 * max(columns, 2), 4.6 * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False)
+    styles = _styles([row for rows in by_hand.values() for row in rows])
+    for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
+        _over_speed(axes, rows, styles, key, hand, words[1], speed)
+    for axes in panels.flat[len(by_hand) :]:
+        axes.set_visible(False)
+    figure.supylabel(words[0], fontsize=10)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     for file in files:
         figure.savefig(file, dpi=150)
+
+
+def _over_speed(
+    axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], key: str, title: str, words: str, speed: str,
+    label: Callable[[Row, Sequence[Row]], str] | None = None,
+) -> None:  # fmt: skip
+    """One accuracy over a speed, with the front."""
+    known = [row for row in rows if row[key] is not None]
+    _panel(axes, known, styles, x=speed, y=key, label=label)
+    _front(axes, known, key, speed)
+    axes.set_xlabel(words)
+    axes.set_title(title, loc="left", fontsize=11)
+    if key in OF_ONE:
+        axes.set_ylim(-0.07, 1.07)
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path]) -> None:
@@ -56,11 +92,8 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path]) -> None:
     for axes, (title, key) in zip(
         panels, (("Lifted", "lift"), ("Lifted at half the friction", "lift_hard")), strict=True
     ):
-        _panel(axes, rows, styles, x="valid_per_second", y=key, label=_one_of_several)
-        _front(axes, rows, key, True)
-        axes.set_xlabel("lifted grasps per CPU second")
-        axes.set_title(title, loc="left", fontsize=11)
-        axes.set_ylim(-0.07, 1.04)
+        words = "lifted grasps per CPU second"
+        _over_speed(axes, rows, styles, key, title, words, "valid_per_second", label=_one_of_several)
     panels[0].set_ylabel("share of all tries")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     for file in files:
@@ -82,7 +115,7 @@ def _panel(
     for row in rows:
         colour, marker = styles[row["method"]]
         # None valid: at the most there can be, hollow, with an arrow to where it may lie.
-        none = x == "valid_per_second" and not row[x]
+        none = not row[x]
         at = most_valid(row) if none else row[x]
         bars: dict[str, Any] = {
             f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
@@ -143,12 +176,10 @@ def _one_of_several(row: Row, rows: Sequence[Row]) -> str:
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
-def _front(axes: Any, rows: Sequence[Row], key: str, more: bool) -> None:
-    front = sorted(
-        (r for r in rows if key in r["front"] and r["valid_per_second"]), key=lambda r: r["valid_per_second"]
-    )
+def _front(axes: Any, rows: Sequence[Row], key: str, speed: str) -> None:
+    front = sorted((r for r in rows if key in r["front"] and r[speed]), key=lambda r: r[speed])
     axes.step(
-        [r["valid_per_second"] for r in front], [r[key] for r in front], where="pre", color=INK, linewidth=1,
+        [r[speed] for r in front], [r[key] for r in front], where="pre", color=INK, linewidth=1,
         linestyle="--", alpha=0.6, zorder=1, label="Pareto front",
     )  # fmt: skip
 

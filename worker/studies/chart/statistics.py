@@ -16,15 +16,18 @@ Floats = NDArray[np.float64]
 #: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
-#: Accuracies: whether more is better.
-METRICS: Final = {"gsr": True, "epsilon": True, "pd_mm": False}
+#: Accuracies: whether more is better. Of `SCRUTINISED` runs of sweeps have none.
+METRICS: Final = {"letter": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
+SCRUTINISED: Final = ("letter", "hard", "robust")
+#: What is drawn against accuracies.
+SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
 #: Of these the median of a cell's grasps counts; of `gsr` the mean.
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
 def figures(cell: Trial) -> dict[str, Any]:
     """The keys of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
-    held = np.concatenate(cell.success).astype(float)
+    held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds, batch = np.array(cell.seconds), cell.setting.batch
     draws = _draws(cell)
     row: dict[str, Any] = {
@@ -33,7 +36,10 @@ def figures(cell: Trial) -> dict[str, Any]:
         "grasps": len(held),
         "valid": int(held.sum()),
         "grasps_per_second": len(held) / seconds.sum(),
-        "seconds_to_first_valid": first_valid(float(held.mean()), cell.first_calls, cell.first_grasps),
+        "end_seconds": [round(s, 6) for s in cell.end_seconds],
+        "kept": int(kept.sum()),
+        "end_to_end_per_second": kept.sum() / sum(cell.end_seconds),
+        "seconds_to_first_valid": first_valid(float(kept.mean()), cell.first_calls, cell.first_grasps),
         "valid_per_second": held.sum() / seconds.sum(),
         "gsr": held.mean(),
         "batch": batch,
@@ -43,15 +49,39 @@ def figures(cell: Trial) -> dict[str, Any]:
     for key, values in draws.items():
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
     widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
+    widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
+    row |= _scrutinised(cell) if cell.letter else {}
     return {key: plain(value) for key, value in row.items()}
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
     """Bars of success, and of speed where it depends on it, from the counts; speed keeps the wider of both its bars."""
+    row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
+    widen_speed(row, "valid_per_second", valid, grasps, per_second)
+
+
+def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
+    """Bars of a speed, at least as wide as those of the share of grasps that count."""
     low, high = wilson(valid, grasps)
-    row["gsr_low"], row["gsr_high"] = low, high
-    row["valid_per_second_low"] = min(row["valid_per_second_low"], low * per_second)
-    row["valid_per_second_high"] = max(row["valid_per_second_high"], high * per_second)
+    row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
+    row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
+
+
+def _scrutinised(cell: Trial) -> dict[str, Any]:
+    """Success by the letter and at half the friction, and the mean share of other models that held ones hold in."""
+    row: dict[str, Any] = {}
+    for key, verdicts in (("letter", cell.letter), ("hard", cell.hard)):
+        held = np.concatenate(verdicts) == 1
+        row[key] = float(held.mean())
+        row[f"{key}_low"], row[f"{key}_high"] = wilson(int(held.sum()), len(held))
+    shares = np.concatenate(cell.shares)
+    known = shares[np.isfinite(shares)]
+    if not len(known):
+        return row | dict.fromkeys(("robust", "robust_low", "robust_high"))
+    rng = np.random.default_rng(0)
+    means = known[rng.integers(len(known), size=(DRAWS, len(known)))].mean(axis=1)
+    low, high = np.percentile(means, BAR)
+    return row | {"robust": float(known.mean()), "robust_low": low, "robust_high": high}
 
 
 def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
@@ -68,13 +98,15 @@ def _draws(cell: Trial) -> dict[str, Floats]:
     """Bootstrap: repeats with replacement, then grasps within each."""
     rng = np.random.default_rng(0)
     repeats = len(cell.seconds)
-    out: dict[str, list[float]] = {key: [] for key in ("valid_per_second", "gsr", "epsilon", "pd_mm")}
+    out: dict[str, list[float]] = {key: [] for key in (*SPEEDS, "gsr", "epsilon", "pd_mm")}
     for _ in range(DRAWS):
         chosen = rng.integers(repeats, size=repeats)
         rows = [rng.integers(len(cell.success[r]), size=len(cell.success[r])) for r in chosen]
         held = np.concatenate([cell.success[r][i] for r, i in zip(chosen, rows, strict=True)])
         out["gsr"].append(float(held.mean()))
         out["valid_per_second"].append(float(held.sum() / sum(cell.seconds[r] for r in chosen)))
+        kept = sum(float(cell.kept[r][i].sum()) for r, i in zip(chosen, rows, strict=True))
+        out["end_to_end_per_second"].append(kept / sum(cell.end_seconds[r] for r in chosen))
         for key in ("epsilon", "pd_mm"):
             values = [cell.columns[r][key][i] for r, i in zip(chosen, rows, strict=True)]
             out[key].append(float(np.median(np.concatenate(values))))
@@ -85,6 +117,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """One row per method, fidelity and batch, over all hands and objects.
 
     Speed is all valid grasps over all seconds; accuracies are means over the pairs, whose bars shrink accordingly.
+    `front` names the accuracies in which nobody faster, end to end, is better.
     """
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in runs:
@@ -99,18 +132,23 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         # Of pairs without a valid grasp nobody knows how long they take: a mean without them would flatter.
         row["seconds_to_first_valid"] = None if None in firsts else float(np.mean(firsts))
         for key in METRICS:
-            values = np.array([r[key] for r in own], float)
-            row[key] = float(values.mean())
-            row[f"{key}_low"], row[f"{key}_high"] = _bar(own, key)
+            # Of a pair on which nothing holds nobody knows in which other models it would.
+            known = [r for r in own if r[key] is not None]
+            row[key] = float(np.mean([r[key] for r in known])) if known else None
+            row[f"{key}_low"], row[f"{key}_high"] = _bar(known, key) if known else (None, None)
         row["valid_per_second"] = valid / seconds
-        low, high = (_ratio_bar(own, end) for end in ("low", "high"))
-        row["valid_per_second_low"], row["valid_per_second_high"] = low, high
+        kept, end = sum(r["kept"] for r in own), sum(sum(r["end_seconds"]) for r in own)
+        row["end_to_end_per_second"] = kept / end
+        for key, times in zip(SPEEDS, ("seconds", "end_seconds"), strict=True):
+            row[f"{key}_low"], row[f"{key}_high"] = (_ratio_bar(own, key, times, side) for side in ("low", "high"))
         widen(row, valid, row["grasps"], row["grasps_per_second"])
+        widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
+        row["raw_end_to_end_per_second"] = row["grasps"] / end
         rows.append({key: plain(value) for key, value in row.items()})
     for key, more in METRICS.items():
         # Who makes no valid grasp is on no front: a hand that touches nothing does not penetrate either.
-        able = [row for row in rows if row["valid_per_second"]]
-        front = pareto([(row["valid_per_second"], row[key] if more else -row[key]) for row in able])
+        able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
+        front = pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able])
         for row in rows:
             row.setdefault("front", [])
         for index in front:
@@ -126,18 +164,20 @@ def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
     return mean - float(down), mean + float(up)
 
 
-def _ratio_bar(runs: Sequence[dict[str, Any]], end: str) -> float:
+def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str) -> float:
     """Bar of valid grasps over seconds, each cell's weighed by its seconds."""
-    weight = np.array([sum(r["seconds"]) for r in runs])
-    value = np.array([r["valid_per_second"] for r in runs])
-    off = np.array([r[f"valid_per_second_{end}"] for r in runs]) - value
+    weight = np.array([sum(r[seconds]) for r in runs])
+    value = np.array([r[key] for r in runs])
+    off = np.array([r[f"{key}_{side}"] for r in runs]) - value
     spread = float(np.sqrt(np.sum((weight * off) ** 2)) / weight.sum())
-    return float((weight * value).sum() / weight.sum()) + (spread if end == "high" else -spread)
+    return float((weight * value).sum() / weight.sum()) + (spread if side == "high" else -spread)
 
 
 def most_valid(row: Mapping[str, Any]) -> float:
-    """Valid grasps per second that a method has at most, with 95 %, of which none of n held: a share of 3 / n."""
-    return float(row["grasps_per_second"]) * min(1.0, 3.0 / row["grasps"])
+    """Valid grasps per second, end to end, that a method has at most, with 95 %, of which none of n is: a share of
+    3 / n. In scenes, of those that are lifted."""
+    raw = row.get("raw_end_to_end_per_second", row["grasps_per_second"])
+    return float(raw) * min(1.0, 3.0 / row["grasps"])
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:

@@ -17,9 +17,11 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners import Trial as Tried
 from worker.planners import Wanted, synthesize
+from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.judge import judge
+from worker.quality.referee.robust import robust
 from worker.quality.table import measure
 from worker.run import ALONE, Run
 from worker.scenes.trial import trial_on
@@ -32,6 +34,8 @@ FRICTION: Final = 1.0
 #: A seed no setting was chosen with; repeats take the next ones.
 SEED: Final = 4711
 WARM_SEED: Final = 1
+#: Of the models around the nominal one: no job's, nor that of `graspd evaluate`.
+MODELS_SEED: Final = 2**31 + 1
 #: Grasps per object in the paper's table 2: the best by epsilon.
 BEST: Final = 10
 #: Columns kept of every grasp.
@@ -93,12 +97,22 @@ class Trial:
     seconds: list[float] = field(default_factory=list)
     processor_seconds: list[float] = field(default_factory=list)
     """Of all threads: what a call costs whatever else the machine does; without meaning for a GPU."""
+    end_seconds: list[float] = field(default_factory=list)
+    """End to end: planned, judged, and measured where they hold."""
+    made: list[GraspSet] = field(default_factory=list)
     success: list[NDArray[np.int8]] = field(default_factory=list)
+    """Verdicts of the certificate."""
+    kept: list[NDArray[np.int8]] = field(default_factory=list)
+    """1 valid: a grasp holds and is sound."""
     columns: list[dict[str, Floats]] = field(default_factory=list)
-    postures: list[Posture] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
-    """Seconds of calls of `first_grasps` grasps."""
+    """Seconds of calls of `first_grasps` grasps, end to end."""
     first_grasps: int = 1
+    letter: list[NDArray[np.int8]] = field(default_factory=list)
+    """Verdicts of the letter of the protocol; with `hard` and `shares` there only after `scrutinise`."""
+    hard: list[NDArray[np.int8]] = field(default_factory=list)
+    shares: list[Floats] = field(default_factory=list)
+    """Of other models in which a grasp holds; nan where it does not in the nominal one."""
 
     @cached_property
     def tried(self) -> Tried | None:
@@ -114,18 +128,47 @@ class Trial:
 
     def repeat(self) -> None:
         """One timed call, then quality and verdict of its grasps."""
-        batch, run = self.setting.batch, self.setting.run
+        batch = self.setting.batch
         began, used = time.perf_counter(), time.process_time()
         found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), trial=self.tried)
         self.seconds.append(time.perf_counter() - began)
         self.processor_seconds.append(time.process_time() - used)
+        success, sound, table = self._finished(found)
+        self.end_seconds.append(time.perf_counter() - began)
+        lost = self._measured(found.take(np.flatnonzero(success != 1)))
+        self.made.append(found)
+        self.success.append(success)
+        self.kept.append(sound)
+        columns = {}
+        for key in COLUMNS:
+            columns[key] = np.empty(len(found))
+            columns[key][success == 1], columns[key][success != 1] = table[key], lost[key]
+        self.columns.append(columns)
+
+    def _finished(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
+        """What a job does with planned grasps: verdicts, which are valid, and the columns of those that hold."""
+        success = judge(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
+        held = np.flatnonzero(success == 1)
+        table = self._measured(found.take(held))
+        kept = np.zeros(len(found), np.int8)
+        kept[held] = table.pop("sound")
+        return success, kept, table
+
+    def _measured(self, found: GraspSet) -> dict[str, Floats]:
         table = measure(
-            self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=run
+            self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=self.setting.run
         )  # fmt: skip
-        verdicts = judge(self.hand, self.true, found, pieces=self.pieces, run=run)
-        self.success.append(verdicts.success)
-        self.columns.append({key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()})
-        self.postures.append(found.grasp)
+        columns = {key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
+        return columns | {"sound": np.asarray(passes(table), float)}
+
+    def scrutinise(self, models: int) -> None:
+        """Judge what was made by the letter, at half the friction, and in so many models around the nominal one."""
+        common: dict[str, Any] = {"pieces": self.pieces, "run": self.setting.run}
+        for found, success in zip(self.made, self.success, strict=True):
+            self.letter.append(judge(self.hand, self.true, found, level="letter", **common).success)
+            self.hard.append(judge(self.hand, self.true, found, hard=True, **common).success)
+            shares = robust(self.hand, self.true, found, held=success, models=models, seed=MODELS_SEED, **common).share
+            self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
         """Time a call of few grasps, as somebody would make who waits for the first valid one.
@@ -133,12 +176,12 @@ class Trial:
         Where a grasp takes longer than a second the time follows from the batch: threads work on one grasp each.
         """
         self.first_grasps = grasps
-        each = self.seconds[-1] / self.setting.batch
+        each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:
             self.first_calls.append(each * grasps)
             return
         began = time.perf_counter()
-        self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), trial=self.tried)
+        self._finished(self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), trial=self.tried))
         self.first_calls.append(time.perf_counter() - began)
 
     def values(self, key: str) -> Floats:
@@ -149,7 +192,7 @@ class Trial:
         """Means over the `BEST` grasps by epsilon, with their simulated displacement: a row of the paper's table 2."""
         order = np.argsort(-self.values("epsilon"), kind="stable")[:BEST]
         pose, joints = (
-            np.concatenate([getattr(p, name) for p in self.postures])[order]
+            np.concatenate([getattr(found.grasp, name) for found in self.made])[order]
             for name in ("hand_pose", "joint_positions")
         )
         slip = simulated_displacement_cm(
