@@ -16,6 +16,8 @@ IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Beside DATA, SOURCES and BEFORE: what a study may need.
 SERVICE, BROWSER, GPU, TORCH, FIRST_JUDGE = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
+#: A file that training made: its study is run by hand, with the file in the place of NETWORK.
+NETWORK = "a trained network"
 
 _ALLEGRO = "DATA/hands/allegro/allegro_hand_right.urdf"
 _BARRETT = "DATA/hands/barrett_bh280/bh280.urdf"
@@ -255,6 +257,11 @@ STUDIES: Final = (
     ),
     Study(
         "predictor-page", "the same with its conditions", ("results/predictor.md",), (), stages=ALL,
+    ),
+    Study(
+        "learned", "seeds from a network against the planner's own", ("results/learned.*",),
+        ("python -m benchmarks.learned --network NETWORK --data DATA --out OUT/results",),
+        stages=IN_SCENES, seeds=(404,), needs=(NETWORK,),
     ),
     Study(
         "modelling", "what graspd leaves out: its cost and its effect", ("results/modelling.json",),

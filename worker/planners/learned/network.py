@@ -65,7 +65,6 @@ LENGTH_M: Final = 0.1
 _ROWS: Final = 32
 _MULTIPLICATIONS: Final = 2**18
 _TINY: Final = 1e-6
-_FLOW: Final = ("flow.in", *(f"flow.{block}.{part}" for block in range(BLOCKS) for part in "ab"), "flow.out")
 
 
 @dataclass(frozen=True)
@@ -163,14 +162,13 @@ def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label
         label: see `propose`.
     """
     found = np.empty((len(clouds), CONDITION), np.float32)
-    layers = [_Layer.of(network, f"encoder.{i}") for i in range(len(ENCODER) - 1)]
-    out = _Layer.of(network, "encoder.out")
+    layers = _layers(network)
     with np.errstate(all="ignore"):  # what runs away is told by `flow`
         for row, cloud in zip(found, clouds, strict=True):
             h = np.asarray(cloud, np.float32)
-            for layer in layers:
-                h = np.maximum(layer(h), 0)
-            row[:-2] = np.maximum(out(h.max(axis=0, keepdims=True)), 0)
+            for i in range(len(ENCODER) - 1):
+                h = np.maximum(layers[f"encoder.{i}"](h), 0)
+            row[:-2] = np.maximum(layers["encoder.out"](h.max(axis=0, keepdims=True)), 0)
     found[:, -2] = np.asarray(height, float) / LENGTH_M
     found[:, -1] = label
     return found
@@ -182,7 +180,7 @@ def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floa
     Raises:
         InputError: numbers that are not finite come out.
     """
-    layers = {name: _Layer.of(network, name) for name in _FLOW}
+    layers = _layers(network)
     x, c = np.asarray(noise, np.float32), np.asarray(condition, np.float32)
     with np.errstate(all="ignore"):  # looked at below
         for step in range(network.steps):
@@ -248,6 +246,15 @@ class _Layer:
         product = rows.reshape(blocks, 1, _ROWS, into) @ self.weight
         whole = product.transpose(0, 2, 1, 3).reshape(blocks * _ROWS, -1)
         return np.asarray(whole[:n, : len(self.bias)] + self.bias, np.float32)
+
+
+def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
+    """The layers by their names, cut once for a network."""
+    if "layers" not in vars(network):
+        names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
+        vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}
+    found: Mapping[str, _Layer] = vars(network)["layers"]
+    return found
 
 
 def _velocity(layers: Mapping[str, _Layer], x: Floats32, t: float, condition: Floats32) -> Floats32:

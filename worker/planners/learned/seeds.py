@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -107,34 +108,32 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: Placed
 ) -> tuple[HandState, Floats]:
-    """Of the hands of each start (n) the first that is clear, at the nearest step back, and its depth (n,) [m]; inf
-    where there is none. What a hand lacks of its room from obstacles it is raised first."""
+    """Of the hands of each start (n) the one that is clear at the fewest steps back, and its depth (n,) [m]; inf where
+    there is none. What a hand lacks of its room from obstacles it is raised first."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
-    near = np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M
-    up = np.array([s.up for s in placed.scenes])[scene]
     draws = len(drawn.pivot) // count
-    best, depth = drawn[np.arange(count) * draws], np.full(count, np.inf)
+    near = (np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M).reshape(count, draws)
+    up = np.array([s.up for s in placed.scenes])[scene]
+    raised = np.zeros_like(drawn.pivot)
     for draw in range(draws):
-        left = np.flatnonzero((depth > CLEAR) & near[np.arange(count) * draws + draw])
+        rows = np.arange(count) * draws + draw
+        probe.data.set_scenes(scene)
+        probe.depths(drawn[rows])
+        raised[rows] = probe.data.depths.obstacles.numpy()[:count, None].astype(float) * up
+    best, depth = drawn[np.arange(count) * draws], np.full(count, np.inf)
+    for back, draw in product(RETREATS, range(draws)):
+        left = np.flatnonzero((depth > CLEAR) & near[:, draw])
         if not len(left):
             continue
         rows = left * draws + draw
+        states = drawn[rows]
+        states.pivot[:] += raised[rows] + back * away[rows]
         probe.data.set_scenes(scene[left])
-        probe.depths(drawn[rows])
-        raised = probe.data.depths.obstacles.numpy()[: len(left), None].astype(float) * up[left]
-        for back in RETREATS:
-            states = drawn[rows]
-            states.pivot[:] += raised + back * away[rows]
-            probe.data.set_scenes(scene[left])
-            found = probe.depths(states)
-            clear = np.flatnonzero(found <= CLEAR)
-            taken = left[clear]
-            depth[taken] = found[clear]
-            best.pivot[taken], best.rotation[taken], best.q[taken] = (
-                part[clear] for part in (states.pivot, states.rotation, states.q)
-            )
-            keep = np.flatnonzero(found > CLEAR)
-            left, rows, raised = left[keep], rows[keep], raised[keep]
-            if not len(left):
-                break
+        found = probe.depths(states)
+        clear = np.flatnonzero(found <= CLEAR)
+        taken = left[clear]
+        depth[taken] = found[clear]
+        best.pivot[taken], best.rotation[taken], best.q[taken] = (
+            part[clear] for part in (states.pivot, states.rotation, states.q)
+        )
     return best, depth
