@@ -160,6 +160,7 @@ def stand_ins(folder: Path) -> None:
         files = (REPOSITORY / "service" / "builtin" / "objects" / name).rglob("*")
         mesh = trimesh.load(next(file for file in files if file.suffix in {".stl", ".obj", ".ply"}), force="mesh")
         mesh.export(folder / f"{name}.stl")
+    (folder / "my_mug.stl").write_bytes((folder / "mug.stl").read_bytes())
     mesh.export(folder / "koala.obj")
     mesh.copy().apply_scale(1000).export(folder / "banana.stl")
     box = trimesh.creation.box((0.06, 0.06, 0.06))

@@ -180,4 +180,6 @@ class Assets:
             known = self._parts.index.assets.get(kind, name, reach=replace(reach(), everything=False))
             # A refused upload holds no name: the same file with the mend must get in.
             if known.digest != digest and known.verdict != "refuse":
-                raise ConflictError(f"there is another {kind.value} named {name!r}; choose a name of its own")
+                raise ConflictError(
+                    f"there is another {kind.value} named {name!r}; rename the file, or add it with --name"
+                )
