@@ -87,7 +87,7 @@ def chart(
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
 
     if scene != "free":
-        _in_scenes(models, things, chosen, scene, work=work, said=said, out=out, json=json)
+        _in_scenes(models, things, chosen, scene, models=models_around, work=work, said=said, out=out, json=json)
         return
 
     def keep(so_far: dict[str, Any]) -> None:
@@ -111,7 +111,7 @@ def chart(
 
 
 def _in_scenes(
-    hands: Sequence[Any], things: Sequence[Any], settings: Sequence[Any], scene: str, *, work: Path | None,
+    hands: Sequence[Any], things: Sequence[Any], settings: Sequence[Any], scene: str, *, models: int, work: Path | None,
     said: dict[str, str], out: Path | None, json: bool,
 ) -> None:  # fmt: skip
     from service.model.scene_spec import parse_scene
@@ -128,7 +128,7 @@ def _in_scenes(
         if out is not None:
             write(so_far | said, out)
 
-    result = scene_chart(hands, things, settings, spec, work=work, say=_say, keep=keep) | said
+    result = scene_chart(hands, things, settings, spec, models=models, work=work, say=_say, keep=keep) | said
     if json:
         emit(result)
     else:

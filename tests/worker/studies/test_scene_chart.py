@@ -39,6 +39,10 @@ def test_lifted_per_second_are_those_lifted_over_the_seconds(made: tuple[dict[st
         assert 0 <= run["lift_hard_count"] <= run["lift_count"] <= run["clear_count"] <= run["grasps"]
         assert run["valid_per_second"] == pytest.approx(run["lift_count"] / run["seconds"], rel=1e-4)
         assert run["lift_low"] <= run["lift"] <= run["lift_high"]
+        assert run["end_seconds"] > run["seconds"] and run["lift_letter_count"] <= run["clear_count"]
+        assert run["end_to_end_per_second"] == pytest.approx(run["lift_count"] / run["end_seconds"], rel=1e-4)
+        assert (run["robust"] is None) == (run["seconds_to_first"] is None) == (run["lift_count"] == 0)
+        assert run["robust"] is None or 0 <= run["robust_low"] <= run["robust"] <= run["robust_high"] <= 1
 
 
 def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
@@ -46,6 +50,7 @@ def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> N
     assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
     with (folder / "chart.csv").open() as stream:
         assert [row["method"] for row in csv.DictReader(stream)] == [run["method"] for run in found["runs"]]
+    assert (folder / "chart.hands.png").is_file()
     assert (folder / "chart.png").stat().st_size > 10_000 and (folder / "chart.svg").is_file()
     assert f"| {IN_SCENE} | fast_graspd | draft |" in (folder / "chart.md").read_text()
 
@@ -59,7 +64,7 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(
     kept[0].unlink()
     planned = []
 
-    def tried(setting: Any, way: str, hand: Any, place: Any) -> dict[str, Any]:
+    def tried(setting: Any, way: str, hand: Any, place: Any, models: int) -> dict[str, Any]:
         planned.append((setting.method, way))
         return {**runs[setting.method, way]}
 
@@ -78,9 +83,11 @@ def test_a_free_chart_s_options_are_refused_with_a_scene(tmp_path: Path) -> None
 
 
 def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:
-    counts = {"grasps": grasps, "seconds": seconds, "clear_count": lifted, "lift_count": lifted, "lift_hard_count": 0}
+    counts = {"grasps": grasps, "seconds": seconds, "end_seconds": 2 * seconds, "clear_count": lifted,
+              "lift_count": lifted, "lift_letter_count": lifted, "lift_hard_count": 0,
+              "robust_sum": 0.5 * lifted, "robust_squares": 0.5 * lifted}  # fmt: skip
     said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
-    return {**said, **figures([counts]), "scenes": 1}
+    return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
 
 def test_a_gain_is_the_median_of_the_pairs_in_which_filtering_found_any() -> None:
@@ -89,6 +96,10 @@ def test_a_gain_is_the_median_of_the_pairs_in_which_filtering_found_any() -> Non
     inside, outside = summed(runs)
     assert inside["gain"] == pytest.approx((4 / 1 + 4 / 2) / 2)
     assert (inside["pairs_with_one"], outside["pairs_with_one"]) == (3, 2)
+    # Half of the lifted are so in all models and half in none.
+    half = 1.96 * 0.5 / 24**0.5
+    assert (inside["robust"], inside["robust_low"]) == (0.5, pytest.approx(0.5 - half, abs=1e-5))
+    assert outside["seconds_to_first"] is None and inside["seconds_to_first"] == 2.0
     assert inside["lift"] == 0.8 and outside["valid_per_second"] == pytest.approx(1.0)
 
 
@@ -97,6 +108,7 @@ def test_a_pair_that_is_refused_counts_as_tries_without_a_lift() -> None:
     (row,) = summed([refused, run_of(IN_SCENE, "b", 5, 1.0)])
     assert row["lift"] == 0.25 and row["grasps_per_second"] == pytest.approx(10.0)
     assert row["valid_per_second"] == pytest.approx(5.0)
-    chart = {"runs": [refused], "summary": [row], "device": "d", "created": "c", "versions": {"graspd": "0"}}
+    chart = {"runs": [refused], "summary": [row], "device": "d", "created": "c", "versions": {"graspd": "0"},
+             "models": 2, "by_hand": {}}  # fmt: skip
     said = markdown(chart | {"scene": {"kind": "table", "faces": "all"}})
     assert "## Refused" in said and "nothing can reach it" in said

@@ -18,9 +18,13 @@ PANELS: Final = (
     ("ε (median)", "epsilon"),
     ("Penetration, mm (median; less is better)", "pd_mm"),
 )
+IN_SCENES: Final = (
+    ("Lifted, share of all tries", "lift"), ("Lifted by the letter", "lift_letter"),
+    ("Lifted at half the friction", "lift_hard"), ("Robust share of those lifted", "robust"),
+)  # fmt: skip
 SPEED: Final = "end_to_end_per_second"
 #: Shares.
-OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_hard"})
+OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_letter", "lift_hard"})
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
 INK: Final = "#1f2937"
@@ -83,19 +87,23 @@ def _over_speed(
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path]) -> None:
-    """Share of tries that are lifted over lifted grasps per second, at full and at half friction."""
+    """Shares of tries over lifted grasps per CPU second, and what is lifted over the seconds to the first."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
+    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    panels = figure.subplots(2, 3)
     styles = _styles(rows)
-    for axes, (title, key) in zip(
-        panels, (("Lifted", "lift"), ("Lifted at half the friction", "lift_hard")), strict=True
-    ):
-        words = "lifted grasps per CPU second"
-        _over_speed(axes, rows, styles, key, title, words, "valid_per_second", label=_one_of_several)
-    panels[0].set_ylabel("share of all tries")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    words = "lifted grasps per CPU second, end to end"
+    for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
+        _over_speed(axes, rows, styles, key, title, words, SPEED, label=_one_of_several)
+    timed = [row for row in rows if row["seconds_to_first"]]
+    last = panels.flat[4]
+    _panel(last, timed, styles, x="seconds_to_first", y="lift", label=_one_of_several)
+    last.set_xlabel("CPU seconds to the first that is lifted (less is better)")
+    last.set_title("Lifted; of those that lift in every pair", loc="left", fontsize=11)
+    last.set_ylim(-0.07, 1.07)
+    panels.flat[5].set_visible(False)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     for file in files:
         figure.savefig(file, dpi=150)
 

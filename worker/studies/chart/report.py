@@ -100,7 +100,7 @@ def summary_table(rows: Sequence[Row]) -> str:
     ]
     for row in sorted(rows, key=lambda r: -r[SPEED]):
         cells = [row["method"], row["fidelity"], row["batch"], _with_bar(row, SPEED, ".3g")]
-        cells += [_first(row["seconds_to_first_valid"]), f"{row['valid_per_second']:.3g}"]
+        cells += [first(row["seconds_to_first_valid"]), f"{row['valid_per_second']:.3g}"]
         for key, form in ACCURACIES:
             text = _with_bar(row, key, form)
             cells.append(f"**{text}**" if key in row["front"] else text)
@@ -120,7 +120,8 @@ def share(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
-def _first(value: float | None) -> str:
+def first(value: float | None) -> str:
+    """Seconds to the first, or a dash where there was none."""
     return "–" if value is None else f"{value:.2g}"
 
 

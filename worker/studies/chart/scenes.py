@@ -1,9 +1,10 @@
 """Grasps planned in a scene against grasps planned around a free object, put into the same scene and filtered.
 
 A setting of a method that plans in scenes is run both ways, others only the second. Grasp i is tried in scene i of the
-object's stable faces in turn, whichever way it was planned, and judged alike: clear on its way, lifted, lifted at half
-the friction. Speed is lifted grasps over seconds of all cores together, planner and postures without way and referee:
-it does not follow what else the machine does.
+object's stable faces in turn, whichever way it was planned, and judged alike: clear on its way, lifted, lifted by the
+letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds of all cores
+together, which do not follow what else the machine does: of planner and postures alone, and end to end, with way,
+referee and the metrics of what is lifted.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.model.clock import timestamp
 from service.model.digests import digest_json
@@ -30,14 +32,16 @@ from worker.planners import Trial, Wanted, method, synthesize
 from worker.quality.intervals import wilson
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.lifting import judge_lifts
+from worker.quality.referee.robust import robust
+from worker.quality.table import measure
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.trial import lift_trial
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 from worker.studies.bench import device_name
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
-from worker.studies.chart.statistics import pareto, plain
-from worker.studies.chart.trials import SEED, WARM_SEED, Setting
+from worker.studies.chart.statistics import first_valid, pareto, plain
+from worker.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
@@ -45,7 +49,18 @@ Say = Callable[[str], None]
 IN_SCENE: Final = "in the scene"
 FILTERED: Final = "free, filtered"
 #: Shares of all tries, by their column.
-SHARES: Final = ("clear", "lift", "lift_hard")
+SHARES: Final = ("clear", "lift", "lift_letter", "lift_hard")
+#: Accuracies that have a front.
+ACCURACIES: Final = ("lift", "lift_letter", "lift_hard", "robust")
+SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
+#: Raise when a row has other columns: what is kept then begins anew.
+FORM: Final = 2
+#: Raw grasps per second, by the speed that counts those lifted.
+RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "raw_end_to_end_per_second"}
+#: A grasp that takes longer is not made once more to time the first one [s].
+_SHORT_S: Final = 1.0
+_NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "robust_squares": 0.0,
+                   "first_seconds": 0.0}  # fmt: skip
 
 
 @dataclass
@@ -71,7 +86,7 @@ class Place:
 
 
 def scene_chart(
-    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], spec: SceneSpec, *,
+    hands: Sequence[HandModel], things: Sequence[Thing], settings: Sequence[Setting], spec: SceneSpec, *, models: int,
     work: Path | None = None, say: Say = lambda line: None, keep: Callable[[Row], None] = lambda result: None,
 ) -> Row:  # fmt: skip
     """Run everything.
@@ -81,22 +96,23 @@ def scene_chart(
         things: the objects.
         settings: what to compare; a setting's `batch` is the number of its grasps on each pair.
         spec: the scene.
+        models: around the nominal one, in which each grasp that is lifted is lifted again.
         work: folder that keeps what each setting found on each pair; a run that was stopped goes on there.
         say: told of each cell as it ends.
         keep: given the result so far after each pair.
 
     Returns:
-        `runs[]` of one setting on one pair each, `summary[]` over the pairs, `device`, `created`.
+        `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`, `created`.
     """
     runs: list[Row] = []
     for thing in things:
         place = Place(thing, spec)
         for hand in hands:
             for setting, way in _ways(settings):
-                runs.append(_kept(setting, way, hand, place, work))
+                runs.append(_kept(setting, way, hand, place, models, work))
                 say(_line(runs[-1]))
-            keep(_result(runs, settings, spec))
-    return _result(runs, settings, spec)
+            keep(_result(runs, settings, spec, models))
+    return _result(runs, settings, spec, models)
 
 
 def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
@@ -108,45 +124,58 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
     return found
 
 
-def _kept(setting: Setting, way: str, hand: HandModel, place: Place, work: Path | None) -> Row:
+def _kept(setting: Setting, way: str, hand: HandModel, place: Place, models: int, work: Path | None) -> Row:
     """What the setting finds on the pair, from its file where it was found before."""
     said = {
         "way": way, "method": setting.method, "fidelity": setting.fidelity, "hand": hand.name,
         "object": place.thing.name, "batch": setting.batch, "options": dict(setting.options),
     }  # fmt: skip
     if work is None:
-        return said | _tried(setting, way, hand, place)
+        return said | _tried(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
-    terms = [said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
+    terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
     # What is found follows from the code of planners too: another revision begins anew.
     file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize']])}.json"
     if not file.is_file():
         work.mkdir(parents=True, exist_ok=True)
         partial = file.with_suffix(".tmp")
-        partial.write_text(json.dumps(said | _tried(setting, way, hand, place), indent=1, allow_nan=False) + "\n")
+        partial.write_text(
+            json.dumps(said | _tried(setting, way, hand, place, models), indent=1, allow_nan=False) + "\n"
+        )
         partial.replace(file)
     found: Row = json.loads(file.read_text())
     return found
 
 
-def _tried(setting: Setting, way: str, hand: HandModel, place: Place) -> Row:
+def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: int) -> Row:
     """Counts, shares and speed of one setting on one pair."""
     obj = place.thing.load(setting.knobs.face_error_m)
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
-    used, note = 0.0, ""
-    counts = dict.fromkeys(SHARES, 0)
+    row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
+    note, few = "", min(setting.run.cores, setting.batch)
     try:
         trial = lift_trial(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
         _planned(setting, hand, obj, _first(placed), trial, warm=True)
         began = time.process_time()
         grasps = _planned(setting, hand, obj, placed, trial)
-        used = time.process_time() - began
-        counts = _judged(hand, place, grasps, placed)
+        row["seconds"] = time.process_time() - began
+        judged = Judged(hand, place, grasps, placed)
+        row["end_seconds"] = time.process_time() - began
+        each = row["end_seconds"] / setting.batch
+        row["first_seconds"] = each * few
+        if each < _SHORT_S:
+            began = time.process_time()
+            start = placed.take(slice(0, few))
+            Judged(hand, place, _planned(setting, hand, obj, start, trial), start)
+            row["first_seconds"] = time.process_time() - began
+        row |= judged.counts(models)
     except InputError as error:
         # A scene that leaves no way in, or a pair that the method refuses.
         note = str(error)
-    row: Row = {"grasps": setting.batch, "seconds": used, **{f"{name}_count": n for name, n in counts.items()}}
-    return {**row, **figures([row]), "scenes": len(place.scenes.object_pose), "note": note}
+    row["first_grasps"] = few
+    told = figures([row])
+    told["seconds_to_first"] = first_valid(told["lift"], [row["first_seconds"]], few)
+    return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
 
 def _first(placed: Placed) -> Placed:
@@ -164,42 +193,76 @@ def _planned(
     return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
 
 
-def _judged(hand: HandModel, place: Place, grasps: GraspSet, placed: Placed) -> dict[str, int]:
-    """How many are clear on their way, lifted besides, and lifted at half the friction besides."""
-    way = plan_way(hand, place.true, grasps, placed)
-    grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
-    rows, counts = np.flatnonzero(way.clear), {"clear": int(way.clear.sum())}
-    for name, hard in (("lift", False), ("lift_hard", True)):
-        if len(rows):
-            verdicts = judge_lifts(
-                hand, place.true, grasps.take(rows), placed.take(rows), hard=hard, pieces=place.pieces
-            )  # fmt: skip
-            rows = rows[verdicts.success == 1]
-        counts[name] = len(rows)
-    return counts
+class Judged:
+    """Grasps with their way and the verdict of the lift, and measured where that is one."""
+
+    def __init__(self, hand: HandModel, place: Place, grasps: GraspSet, placed: Placed) -> None:
+        way = plan_way(hand, place.true, grasps, placed)
+        self.grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
+        self.hand, self.place, self.placed = hand, place, placed
+        self.clear = np.flatnonzero(way.clear)
+        self.lifted = self._lifting(self.clear)
+        measure(hand, place.true, self.grasps.take(self.lifted), friction=FRICTION)
+
+    def _lifting(self, rows: NDArray[np.intp], **options: Any) -> NDArray[np.intp]:
+        if not len(rows):
+            return rows
+        success = judge_lifts(
+            self.hand, self.place.true, self.grasps.take(rows), self.placed.take(rows), pieces=self.place.pieces,
+            **options,
+        ).success  # fmt: skip
+        return rows[success == 1]
+
+    def counts(self, models: int) -> Row:
+        """How many are clear on their way, lifted besides, by the letter, at half the friction besides; and of those
+        lifted the shares of models in which they are: how many there are, their sum and that of their squares."""
+        lifted = self.lifted
+        shares = robust(
+            self.hand, self.place.true, self.grasps.take(lifted), placed=self.placed.take(lifted), models=models,
+            seed=MODELS_SEED, pieces=self.place.pieces,
+        ).share  # fmt: skip
+        return {
+            "clear_count": len(self.clear), "lift_count": len(lifted),
+            "lift_letter_count": len(self._lifting(self.clear, level="letter")),
+            "lift_hard_count": len(self._lifting(lifted, hard=True)),
+            "robust_sum": float(shares.sum()), "robust_squares": float((shares**2).sum()),
+        }  # fmt: skip
 
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     """Shares of all tries with their 95 % (Wilson), and lifted grasps per second, over some cells.
 
-    Where several cells are summed, each grasp counts alike. A cell that was refused took no time that is known.
+    `robust` is the mean share of models over the grasps that are lifted, with the normal bar of a mean. Where several
+    cells are summed, each grasp counts alike. A cell that was refused took no time that is known.
     """
-    grasps, seconds = sum(row["grasps"] for row in rows), sum(row["seconds"] for row in rows)
-    found: Row = {"grasps": grasps, "seconds": seconds}
-    planned = sum(row["grasps"] for row in rows if row["seconds"])
+    grasps = sum(row["grasps"] for row in rows)
+    found: Row = {"grasps": grasps}
     for name in SHARES:
         count = sum(row[f"{name}_count"] for row in rows)
         low, high = wilson(count, grasps)
         found |= {f"{name}_count": count, name: count / grasps, f"{name}_low": low, f"{name}_high": high}
-    found["grasps_per_second"] = planned / seconds if seconds else 0.0
-    for end in ("", "_low", "_high"):
-        found[f"valid_per_second{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
+    planned = sum(row["grasps"] for row in rows if row["seconds"])
+    for speed, key in SPEEDS:
+        found[key] = seconds = sum(row[key] for row in rows)
+        found[RAW[speed]] = planned / seconds if seconds else 0.0
+        for end in ("", "_low", "_high"):
+            found[f"{speed}{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
+    total, squares = (sum(row[f"robust_{name}"] for row in rows) for name in ("sum", "squares"))
+    found |= {"robust_sum": total, "robust_squares": squares, **_mean_of(found["lift_count"], total, squares)}
     return {key: plain(value) for key, value in found.items()}
+
+
+def _mean_of(count: int, total: float, squares: float) -> Row:
+    if not count:
+        return dict.fromkeys(("robust", "robust_low", "robust_high"))
+    mean = total / count
+    half = 1.96 * float(np.sqrt(max(0.0, squares / count - mean**2) / count))
+    return {"robust": mean, "robust_low": max(0.0, mean - half), "robust_high": min(1.0, mean + half)}
 
 
 def summed(runs: Sequence[Row]) -> list[Row]:
     """A row for each way, method and fidelity over all pairs; `gain` over the same fidelity filtered, the median of the
-    pairs in which that found any; `front` names the shares in which nobody faster is better."""
+    pairs in which that found any; `front` names the accuracies in which nobody faster, end to end, is better."""
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)
@@ -207,14 +270,17 @@ def summed(runs: Sequence[Row]) -> list[Row]:
     for (way, name, fidelity, batch), own in groups.items():
         row: Row = {"way": way, "method": name, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
         row |= figures(own)
+        firsts = [run["seconds_to_first"] for run in own]
+        # Of pairs without a lift nobody knows how long they take.
+        row["seconds_to_first"] = None if None in firsts else plain(float(np.mean(firsts)))
         row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
         row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None
         rows.append(row)
-    able = [row for row in rows if row["valid_per_second"]]
     for row in rows:
         row["front"] = []
-    for key in ("lift", "lift_hard"):
-        for index in pareto([(row["valid_per_second"], row[key]) for row in able]):
+    for key in ACCURACIES:
+        able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
+        for index in pareto([(row["end_to_end_per_second"], row[key]) for row in able]):
             able[index]["front"].append(key)
     return rows
 
@@ -225,7 +291,8 @@ def _gain(own: Sequence[Row], filtered: Sequence[Row]) -> float | None:
     return plain(float(np.median(ratios))) if ratios else None
 
 
-def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec) -> Row:
+def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, models: int) -> Row:
+    hands = dict.fromkeys(run["hand"] for run in runs)
     return {
         "created": timestamp(),
         "device": device_name(settings[0].run.device),
@@ -233,13 +300,15 @@ def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec) -
         "scene": spec.model_dump(mode="json"),
         "referee": {"protocol": "lift", "level": "lift"},
         "runs": list(runs),
+        "models": models,
         "summary": summed(runs),
+        "by_hand": {hand: summed([run for run in runs if run["hand"] == hand]) for hand in hands},
     }
 
 
 def _line(run: Row) -> str:
     return (
         f"{run['way']:14s} {run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
-        f"{run['valid_per_second']:8.3f} lifted/s  clear {run['clear']:.2f}  lift {run['lift']:.2f}  "
+        f"{run['end_to_end_per_second']:8.3f} lifted/s  clear {run['clear']:.2f}  lift {run['lift']:.2f}  "
         f"half friction {run['lift_hard']:.2f} {run['note']}"
     )
