@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from typing import Final
+
 from scipy.stats import binomtest
+
+#: Quantile of the normal distribution that leaves 2.5 % above.
+_Z: Final = 1.959963984540054
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
@@ -13,3 +19,14 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
     """
     bounds = binomtest(part, whole).proportion_ci(method="wilson")
     return float(bounds.low), float(bounds.high)
+
+
+def wilson_of_mean(total: float, count: int) -> tuple[float, float]:
+    """95 % interval of the mean of `count` values from 0 to 1 that sum up to `total`.
+
+    Wilson's for a share: no values from 0 to 1 spread more than zeros and ones do, so it is wide enough.
+    """
+    mean, grown = total / count, 1 + _Z**2 / count
+    middle = (mean + _Z**2 / (2 * count)) / grown
+    half = _Z / grown * math.sqrt(max(0.0, mean * (1 - mean)) / count + _Z**2 / (4 * count**2))
+    return max(0.0, middle - half), min(1.0, middle + half)

@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from worker.commands.chart import app
+from worker.quality.intervals import wilson
 from worker.studies.chart.scene_report import markdown
 from worker.studies.chart.scenes import FILTERED, IN_SCENE, figures, summed
 
@@ -85,7 +86,7 @@ def test_a_free_chart_s_options_are_refused_with_a_scene(tmp_path: Path) -> None
 def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:
     counts = {"grasps": grasps, "seconds": seconds, "end_seconds": 2 * seconds, "clear_count": lifted,
               "lift_count": lifted, "lift_letter_count": lifted, "lift_hard_count": 0,
-              "robust_sum": 0.5 * lifted, "robust_squares": 0.5 * lifted}  # fmt: skip
+              "robust_sum": 0.5 * lifted}  # fmt: skip
     said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
     return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
@@ -96,9 +97,7 @@ def test_a_gain_is_the_median_of_the_pairs_in_which_filtering_found_any() -> Non
     inside, outside = summed(runs)
     assert inside["gain"] == pytest.approx((4 / 1 + 4 / 2) / 2)
     assert (inside["pairs_with_one"], outside["pairs_with_one"]) == (3, 2)
-    # Half of the lifted are so in all models and half in none.
-    half = 1.96 * 0.5 / 24**0.5
-    assert (inside["robust"], inside["robust_low"]) == (0.5, pytest.approx(0.5 - half, abs=1e-5))
+    assert inside["robust"] == 0.5 and (inside["robust_low"], inside["robust_high"]) == pytest.approx(wilson(12, 24))
     assert outside["seconds_to_first"] is None and inside["seconds_to_first"] == 2.0
     assert inside["lift"] == 0.8 and outside["valid_per_second"] == pytest.approx(1.0)
 

@@ -85,7 +85,7 @@ def _head(chart: Row) -> str:
         f"{chart['models']} models around the nominal one in which a grasp that holds does, on average\n"
         f"- ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
         "medians of a pair's grasps, then means over the pairs\n"
-        "- bars and ±: 95 % (Wilson for success, else bootstrap); hollow: none is valid, the most that there can be; "
+        "- bars and ±: 95 % (Wilson for shares, else bootstrap); hollow: none is valid, the most that there can be; "
         "bold: nobody faster is better\n\n"
         "![Speed against accuracy](chart.png)"
     )

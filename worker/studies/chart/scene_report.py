@@ -79,7 +79,7 @@ def _head(chart: Row) -> str:
         "average\n"
         "- speed: lifted grasps over CPU seconds, all cores together, end to end: planner, postures, way, lift, and "
         "the metrics of what is lifted; *planner's*: over those of planner and postures\n"
-        "- bars: 95 % (Wilson for shares of tries); hollow: none was lifted, the most that there can be"
+        "- bars: 95 % (Wilson); hollow: none was lifted, the most that there can be"
     )
 
 

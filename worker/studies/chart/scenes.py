@@ -29,7 +29,7 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners import Trial, Wanted, method, synthesize
-from worker.quality.intervals import wilson
+from worker.quality.intervals import wilson, wilson_of_mean
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.lifting import judge_lifts
 from worker.quality.referee.robust import robust
@@ -59,8 +59,7 @@ FORM: Final = 2
 RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "raw_end_to_end_per_second"}
 #: A grasp that takes longer is not made once more to time the first one [s].
 _SHORT_S: Final = 1.0
-_NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "robust_squares": 0.0,
-                   "first_seconds": 0.0}  # fmt: skip
+_NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "first_seconds": 0.0}
 
 
 @dataclass
@@ -215,7 +214,7 @@ class Judged:
 
     def counts(self, models: int) -> Row:
         """How many are clear on their way, lifted besides, by the letter, at half the friction besides; and of those
-        lifted the shares of models in which they are: how many there are, their sum and that of their squares."""
+        lifted the sum of the shares of models in which they are."""
         lifted = self.lifted
         shares = robust(
             self.hand, self.place.true, self.grasps.take(lifted), placed=self.placed.take(lifted), models=models,
@@ -225,15 +224,15 @@ class Judged:
             "clear_count": len(self.clear), "lift_count": len(lifted),
             "lift_letter_count": len(self._lifting(self.clear, level="letter")),
             "lift_hard_count": len(self._lifting(lifted, hard=True)),
-            "robust_sum": float(shares.sum()), "robust_squares": float((shares**2).sum()),
+            "robust_sum": float(shares.sum()),
         }  # fmt: skip
 
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     """Shares of all tries with their 95 % (Wilson), and lifted grasps per second, over some cells.
 
-    `robust` is the mean share of models over the grasps that are lifted, with the normal bar of a mean. Where several
-    cells are summed, each grasp counts alike. A cell that was refused took no time that is known.
+    `robust` is the mean share of models over the grasps that are lifted. Where several cells are summed, each grasp
+    counts alike. A cell that was refused took no time that is known.
     """
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}
@@ -247,17 +246,11 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
         found[RAW[speed]] = planned / seconds if seconds else 0.0
         for end in ("", "_low", "_high"):
             found[f"{speed}{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
-    total, squares = (sum(row[f"robust_{name}"] for row in rows) for name in ("sum", "squares"))
-    found |= {"robust_sum": total, "robust_squares": squares, **_mean_of(found["lift_count"], total, squares)}
+    total, lifted = sum(row["robust_sum"] for row in rows), found["lift_count"]
+    low, high = wilson_of_mean(total, lifted) if lifted else (None, None)
+    mean = total / lifted if lifted else None
+    found |= {"robust_sum": total, "robust": mean, "robust_low": low, "robust_high": high}
     return {key: plain(value) for key, value in found.items()}
-
-
-def _mean_of(count: int, total: float, squares: float) -> Row:
-    if not count:
-        return dict.fromkeys(("robust", "robust_low", "robust_high"))
-    mean = total / count
-    half = 1.96 * float(np.sqrt(max(0.0, squares / count - mean**2) / count))
-    return {"robust": mean, "robust_low": max(0.0, mean - half), "robust_high": min(1.0, mean + half)}
 
 
 def summed(runs: Sequence[Row]) -> list[Row]:

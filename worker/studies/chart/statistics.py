@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.quality.intervals import wilson
+from worker.quality.intervals import wilson, wilson_of_mean
 from worker.studies.chart.trials import Trial
 
 Floats = NDArray[np.float64]
@@ -78,9 +78,7 @@ def _scrutinised(cell: Trial) -> dict[str, Any]:
     known = shares[np.isfinite(shares)]
     if not len(known):
         return row | dict.fromkeys(("robust", "robust_low", "robust_high"))
-    rng = np.random.default_rng(0)
-    means = known[rng.integers(len(known), size=(DRAWS, len(known)))].mean(axis=1)
-    low, high = np.percentile(means, BAR)
+    low, high = wilson_of_mean(float(known.sum()), len(known))
     return row | {"robust": float(known.mean()), "robust_low": low, "robust_high": high}
 
 
