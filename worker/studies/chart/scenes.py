@@ -247,9 +247,9 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
         for end in ("", "_low", "_high"):
             found[f"{speed}{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
     total, lifted = sum(row["robust_sum"] for row in rows), found["lift_count"]
-    low, high = wilson_of_mean(total, lifted) if lifted else (None, None)
+    bar = wilson_of_mean(total, lifted) if lifted else (None, None)
     mean = total / lifted if lifted else None
-    found |= {"robust_sum": total, "robust": mean, "robust_low": low, "robust_high": high}
+    found |= {"robust_sum": total, "robust": mean, "robust_low": bar[0], "robust_high": bar[1]}
     return {key: plain(value) for key, value in found.items()}
 
 
