@@ -16,9 +16,8 @@ Floats = NDArray[np.float64]
 #: Bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
-#: Accuracies: whether more is better. Of `SCRUTINISED` runs of sweeps have none.
+#: Accuracies: whether more is better. The first three are not of sweeps.
 METRICS: Final = {"letter": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
-SCRUTINISED: Final = ("letter", "hard", "robust")
 #: What is drawn against accuracies.
 SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
 #: Of these the median of a cell's grasps counts; of `gsr` the mean.
