@@ -32,6 +32,13 @@ _SEVEN = (
 _LITTLE = "--hands barrett --objects 077_rubiks_cube --grasps 4"
 
 
+_TRAIN = (
+    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free --peer WORK/peer "
+    "--meshes DATA/objects --held-out 006_mustard_bottle,025_mug,035_power_drill,061_foam_brick "
+    "-o OUT/results/predictor.json"
+)
+
+
 def _mesh(name: str) -> str:
     return f"DATA/objects/{name}/clean.stl"
 
@@ -240,20 +247,18 @@ STUDIES: Final = (
         ("python -m benchmarks.matrix DATA --data-dir WORK/matrix --out OUT/results/matrix.md",),
     ),
     Study(
-        "predictor", "networks that learned from grasps",
-        ("results/predictor.json", "results/predictor.png", "results/predictor-tables.md"),
-        ("graspd datasets create train-graspd --hands barrett --objects DATA/objects -n 96 --scenes 4 --views 6 "
-         "--width 200 --height 150 --yes --wait",
-         "graspd datasets create train-graspit --hands barrett --objects "
+        "predictor", "networks that learned from grasps on tables",
+        ("results/predictor.json", "results/predictor-barrett.png", "results/predictor-allegro.png"),
+        ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
+         "graspd datasets export tables -o WORK/tables",
+         "graspd datasets create tables-raw --hands barrett --objects "
          "003_cracker_box,005_tomato_soup_can,011_banana,024_bowl,037_scissors,048_hammer,056_tennis_ball,"
-         "077_rubiks_cube,koala,spot --method graspit --want raw -n 64 --scenes 4 --views 6 --width 200 --height 150 "
-         "--yes --wait",
-         "graspd datasets export train-graspd -o WORK/train-graspd",
-         "graspd datasets export train-graspit -o WORK/train-graspit",
-         "python -m examples.train_grasp_predictor --source fast_graspd=WORK/train-graspd "
-         "--source graspit=WORK/train-graspit --held-out 006_mustard_bottle,025_mug,035_power_drill,061_foam_brick "
-         "--meshes DATA/objects --grasps 64 --sheet OUT/results/predictor.png -o OUT/results/predictor.json"),
-        stages=ALL, needs=(SERVICE, TORCH), prints="results/predictor-tables.md",
+         "077_rubiks_cube,koala,spot --scene table --faces all --views 2 --want raw -n 64 --yes --wait",
+         "graspd datasets export tables-raw -o WORK/raw",
+         "sh examples/train_grasp_predictor/data.sh DATA/objects WORK",
+         f"{_TRAIN} --hand barrett --raw WORK/raw --ablations --sheet OUT/results/predictor-barrett.png",
+         f"{_TRAIN} --hand allegro --sheet OUT/results/predictor-allegro.png"),
+        stages=ALL, seeds=(0, 1, 2), needs=(SERVICE, TORCH),
     ),
     Study(
         "predictor-page", "the same with its conditions", ("results/predictor.md",), (), stages=ALL,
@@ -295,6 +300,19 @@ STUDIES: Final = (
          "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0 --assets docs/results/pilot/assets.json"),
         ("graspd datasets create pilot --hands barrett --objects block -n 4 --fidelity draft --yes --wait",
          "graspd datasets snapshot pilot", "graspd datasets card pilot -o OUT/results/pilot --licence CC-BY-4.0"),
+        ALL, seeds=(0,), needs=(SERVICE,),
+    ),
+    Study(
+        "tables", "the card of ten thousand grasps on tables",
+        ("results/tables/README.md", "results/tables/card.json", "results/tables/checksums.sha256",
+         "results/tables/*.png", "results/tables/*.jpg"),
+        ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
+         "graspd datasets snapshot tables",
+         "graspd datasets card tables -o OUT/results/tables --licence CC-BY-4.0 "
+         "--assets docs/results/pilot/assets.json"),
+        ("graspd datasets create --spec examples/tables/tables.toml --hands barrett --objects block -n 4 "
+         "--fidelity draft --yes --wait",
+         "graspd datasets snapshot tables", "graspd datasets card tables -o OUT/results/tables --licence CC-BY-4.0"),
         ALL, seeds=(0,), needs=(SERVICE,),
     ),
     Study(

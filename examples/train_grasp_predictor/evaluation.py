@@ -1,81 +1,77 @@
-"""What grasps of an object that a network has not seen are worth, by the metrics and referee of datasets."""
+"""What proposals are worth: lifts of objects, and of faces, that nobody was trained on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from examples.train_grasp_predictor.samples import Example
-from service.readers import Grasps, Shards
-from service.store.shards import read_shard
-from worker.grasps import GraspSet
+from examples.train_grasp_predictor.execution import Lifted, Ready, carried_out, chosen, made_ready, taken
+from examples.train_grasp_predictor.samples import Sight
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.learned.network import Proposals
 from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.quality.referee.displacement import simulated_displacement_cm
-from worker.quality.referee.judge import judge
-from worker.quality.table import measure
+from worker.quality.referee.lift import LiftOutcome
 
-#: Contact threshold of areas and wrench spaces [m]; how many grasps of an object count for them, best epsilon first.
-CONTACT_M: Final = 0.005
-BEST: Final = 10
-#: Quality columns with a value for each threshold, and with one.
-_SWEPT: Final = ("epsilon", "contact_area_cm2", "wrench_volume")
-_SINGLE: Final = ("intersection_volume_cm3", "simulated_displacement_cm")
+Row = dict[str, Any]
+#: From a picture, a number and a generator to so many proposals, the best first.
+Proposer = Callable[[Sight, int, np.random.Generator], Proposals]
 
-
-@dataclass(frozen=True)
-class Score:
-    """Means over the grasps of one object; success and the ten best by epsilon as in the paper's tables."""
-
-    grasps: int
-    contact_area_cm2: float
-    intersection_volume_cm3: float
-    epsilon: float
-    wrench_volume: float
-    simulated_displacement_cm: float
-    gsr: float
+#: Proposals for a picture, of which those that are clear go first, and how many of them are carried out.
+PROPOSED: Final = 8
+TAKEN: Final = 2
+#: What a picture shows that was held back.
+OBJECT, FACE = "unseen object", "unseen face"
 
 
 @dataclass(frozen=True)
-class Held:
-    """A held-back object: its pictures, and its convex pieces for the referee."""
+class Exam:
+    """Pictures of one object that nobody was trained on."""
 
-    name: str
+    object: str
+    kind: str
+    """`OBJECT` or `FACE`."""
     model: ObjectModel
     pieces: ConvexPieces
-    pictures: Sequence[Example]
+    seen: Sequence[Sight]
 
     @classmethod
-    def of(cls, name: str, model: ObjectModel, pictures: Sequence[Example]) -> Held:
-        return cls(name, model, decompose(model), pictures)
+    def of(cls, name: str, kind: str, model: ObjectModel, seen: Sequence[Sight], count: int) -> Exam:
+        """So many of the pictures, spread over the scenes."""
+        order = np.random.default_rng(zlib.crc32(name.encode())).permutation(len(seen))
+        return cls(name, kind, model, decompose(model), [seen[i] for i in order[:count]])
 
 
-def score(hand: HandModel, held: Held, grasps: GraspSet, *, friction: float = 1.0) -> Score:
-    """Metrics at 5 mm as means of the ten best by epsilon; success over all."""
-    obj, pieces = held.model, held.pieces
-    columns = dict(measure(hand, obj, grasps, friction=friction))
-    columns["quality/success"] = judge(hand, obj, grasps, level="certificate", pieces=pieces).success
-    columns["quality/simulated_displacement_cm"] = simulated_displacement_cm(hand, obj, grasps.grasp, pieces=pieces)
-    return _summary(columns)
+def proposals_for(hand: HandModel, exam: Exam, proposer: Proposer, *, seed: int) -> tuple[list[Ready], float]:
+    """What is carried out for each picture, and the share of all proposals that would have met the table."""
+    ready, table = [], []
+    for number, sight in enumerate(exam.seen):
+        rng = np.random.default_rng([seed, number, zlib.crc32(exam.object.encode())])
+        one = made_ready(hand, proposer(sight, PROPOSED, rng), sight)
+        table.append(one.table.mean())
+        ready.append(taken(one, chosen(one, TAKEN)))
+    return ready, float(np.mean(table))
 
 
-def in_data(shards: Shards, name: str) -> Score:
-    """What a source shows of an object, by the figures that stand in its shards."""
-    paths = [f"quality/{field}" for field in (*_SWEPT, *_SINGLE, "success")]
-    arrays = Grasps(shards.only(objects=[name]), paths, valid=False).arrays()
-    first = shards.only(objects=[name]).of("base")[0]
-    return _summary(arrays | {"quality/thresholds_m": read_shard(shards.path(first))["quality/thresholds_m"]})
-
-
-def _summary(columns: Mapping[str, Any]) -> Score:
-    at = int(np.argmin(np.abs(np.asarray(columns["quality/thresholds_m"]) - CONTACT_M)))
-    found = {name: np.asarray(columns[f"quality/{name}"], float)[:, at] for name in _SWEPT}
-    found |= {name: np.asarray(columns[f"quality/{name}"], float) for name in _SINGLE}
-    best = np.argsort(-found["epsilon"])[:BEST]
-    success = np.asarray(columns["quality/success"], float)
-    means = {name: float(np.nanmean(values[best])) for name, values in found.items()}
-    return Score(grasps=len(success), gsr=float(success.mean()), **means)
+def examined(
+    hand: HandModel, exams: Sequence[Exam], proposer: Proposer, *, seed: int, epsilon: bool
+) -> Iterator[tuple[Exam, Row, list[Ready], Lifted]]:
+    """One row for each object: shares of the proposals that were carried out."""
+    for exam in exams:
+        ready, table = proposals_for(hand, exam, proposer, seed=seed)
+        lifted = carried_out(hand, exam.model, exam.pieces, ready, list(exam.seen), epsilon=epsilon)
+        best = np.arange(0, len(lifted.lift), TAKEN)
+        outcomes = np.bincount(lifted.outcome, minlength=len(LiftOutcome))
+        row: Row = {
+            "object": exam.object, "kind": exam.kind, "pictures": len(exam.seen), "tried": len(lifted.lift),
+            "lift": float(lifted.lift.mean()), "best": float(lifted.lift[best].mean()),
+            "hard": float(lifted.hard.mean()), "table": table,
+            "outcomes": {LiftOutcome(k).name.lower(): int(n) for k, n in enumerate(outcomes) if n},
+        }  # fmt: skip
+        if epsilon:
+            row["epsilon"] = float(np.nanmean(lifted.epsilon))
+        yield exam, row, ready, lifted

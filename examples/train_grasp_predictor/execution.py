@@ -1,110 +1,177 @@
-"""From what the network answers to grasps: as proposed, carried out, and a control without a network.
+"""From proposals to lifts: what a robot does that knows its hand, the table and what its camera saw, and nothing else.
 
-A proposal says where the hand goes and how it is shaped. It is carried out as a robot with touch would: the fingers
-open, the hand backs off as far as it must to touch nothing, advances until it nearly touches, and the fingers close
-until contact. All sources of data are treated alike. The control needs no network: hands that look at the object from
-anywhere advance and close in the same way, which is the method `autograsp`.
+A proposal is carried out open loop: from a standoff along its way in, fingers opened wider than it says, then to its
+grasp and its squeeze, then up. Only what the table forbids is mended before: a hand that would stand in it is raised.
+The mesh of the object is the simulator's alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from examples.train_grasp_predictor.network import Predictor
-from examples.train_grasp_predictor.samples import Example
-from service.model.transforms import compose, invert, quat_from_matrix, quat_rotate
-from worker.grasps import GraspSet
+from examples.train_grasp_predictor.samples import Floats, Sight
+from service.model.transforms import apply, compose, invert
+from worker.grasps import GraspSet, Posture
+from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
-from worker.planners.autograsp import kernels
-from worker.planners.autograsp.closing import Closer
-from worker.planners.fast_graspd.pairs import Pair
-from worker.planners.peers import free_starts, grasp_set, ground_of
-from worker.simulation.state import HandState
+from worker.planners.learned.network import Proposals
+from worker.quality.referee.decomposition import ConvexPieces
+from worker.quality.referee.lift import LiftOutcome
+from worker.quality.referee.lifting import judge_lifts
+from worker.quality.table import measure
+from worker.simulation.obstacles import MARGIN_M, obstacle_room
+from worker.simulation.surroundings import RISE_M, STANDOFF_M, UP, Obstacle, Placed, Surroundings
 
-Floats = NDArray[np.float64]
-
-#: Proposals of a picture that are carried out: those of the highest scores.
-TAKEN: Final = 4
-#: Shares of the way from the proposed joints to the pre-shape that the fingers open; the first that is enough counts.
-OPENINGS: Final = (0.5, 1.0)
-#: Distances the hand backs off, of which the first that is clear is taken [m].
-BACK_M: Final = tuple(0.005 * k for k in range(41))
-CLEAR_M: Final = 0.001
-STANDOFF_M: Final = 0.005
-
-
-def proposals(network: Predictor, pictures: Sequence[Example]) -> tuple[Floats, Floats]:
-    """Hand poses (N, 7) in the object's frame and joints (N, J) of the best proposals for each picture."""
-    with torch.no_grad():
-        grasps, logits = network(torch.stack([picture.image for picture in pictures]))
-    best = logits.argsort(dim=1, descending=True)[:, :TAKEN]
-    poses, joints = [], []
-    for picture, rows, chosen in zip(pictures, grasps.numpy().astype(float), best.numpy(), strict=True):
-        for row in rows[chosen]:
-            poses.append(in_object_frame(row, picture))
-            joints.append(row[9:])
-    return np.array(poses), np.array(joints)
+#: Fingers open by this share of their range beyond the proposed pregrasp.
+OPENED: Final = 0.15
+#: Most by which a hand is raised out of the table [m].
+MOST_RAISED_M: Final = 0.05
+#: Postures of the way in.
+WAYPOINTS: Final = 6
+#: Points of the hand that are looked at, and the least distance on the way from what the camera saw [m].
+_POINTS: Final = 400
+SEEN_M: Final = 0.002
+#: Of epsilon: contacts within this [m].
+CONTACT_M: Final = 0.005
 
 
-def in_object_frame(row: Floats, picture: Example) -> Floats:
-    """(7,) hand pose of an answer (9 + J,) of the network: the inverse of `samples.targets_of`."""
-    hand = np.concatenate([row[:3] + picture.anchor, quat_from_matrix(orthogonal(row[3:9]))])
-    return compose(invert(picture.object_pose), hand)
+@dataclass(frozen=True)
+class Ready:
+    """Proposals as they are carried out, and what the robot knows of them before."""
+
+    hands: Proposals
+    opened: Floats
+    """(N, J) joints of the hand that comes."""
+    table: NDArray[np.bool_]
+    """(N,) whether the proposal as it was would have met the table."""
+    clear: NDArray[np.bool_]
+    """(N,) whether the way is clear of the table, and of the points that the camera saw."""
 
 
-def orthogonal(columns: Floats) -> Floats:
-    """(3, 3) rotation from its first two columns (6,), the first one kept."""
-    x = columns[:3] / max(float(np.linalg.norm(columns[:3])), 1e-9)
-    y = columns[3:] - (columns[3:] @ x) * x
-    y = y / max(float(np.linalg.norm(y)), 1e-9)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
+    """Proposals for one picture, opened and raised out of the table."""
+    opened = wider(hand, proposed.pregrasp)
+    lacks = np.maximum(0.0, MARGIN_M - _room(hand, proposed, opened))
+    pose = proposed.hand_pose.copy()
+    pose[:, 2] += np.minimum(lacks, MOST_RAISED_M)
+    hands = replace(proposed, hand_pose=pose)
+    clear = (_room(hand, hands, opened) >= 0.5 * MARGIN_M) & (_gap(hand, hands, opened, sight) >= SEEN_M)
+    return Ready(hands, opened, lacks > MARGIN_M, clear)
 
 
-def as_proposed(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> GraspSet:
-    """Proposals untouched: hand poses (N, 7) in the object's frame, joints (N, J)."""
-    return grasp_set(ground_of(hand, obj, "cpu", kernels), _state(hand, obj, poses, joints), 0.0, {})
+def taken(ready: Ready, which: NDArray[np.intp]) -> Ready:
+    """Some of the proposals."""
+    hands = Proposals(*(np.asarray(part)[which] for part in vars(ready.hands).values()))
+    return Ready(hands, ready.opened[which], ready.table[which], ready.clear[which])
 
 
-def carried_out(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> GraspSet:
-    """Proposals after opening, backing off until clear, advancing and closing."""
-    pair = ground_of(hand, obj, "cpu", kernels)
-    return _advanced(pair, _clear(pair, _state(hand, obj, poses, joints)))
+def wider(hand: HandModel, joints: Floats, share: float = OPENED) -> Floats:
+    """(N, J) joints, closing ones opened by a share of their range."""
+    q = hand.reduce(joints)
+    return np.asarray(hand.expand(np.clip(q - share * hand.closing * hand.span, hand.lower, hand.upper)))
 
 
-def _state(hand: HandModel, obj: ObjectModel, poses: Floats, joints: Floats) -> HandState:
-    q = np.clip(hand.reduce(joints), hand.lower, hand.upper)
-    rotation = poses[:, 3:]
-    pivot = poses[:, :3] - obj.centre_of_mass + quat_rotate(rotation, hand.palm.centre)
-    return HandState(pivot, rotation, q)
+def tighter(hand: HandModel, joints: Floats, by: float) -> Floats:
+    """(N, J) joints, closing ones closed by so much [rad or m]."""
+    q = hand.reduce(joints)
+    return np.asarray(hand.expand(np.clip(q + by * hand.closing, hand.lower, hand.upper)))
 
 
-def anywhere(hand: HandModel, obj: ObjectModel, count: int, seed: int) -> GraspSet:
-    """The control: hands that look at a random place of the object, carried out in the same way."""
-    pair = ground_of(hand, obj, "cpu", kernels)
-    return _advanced(pair, free_starts(pair, seed=seed, batch=0, indices=range(count)))
+def chosen(ready: Ready, count: int) -> NDArray[np.intp]:
+    """(count,) which proposals are carried out: the first that are clear, then others."""
+    return np.argsort(~ready.clear, kind="stable")[:count]
 
 
-def _clear(pair: Pair, state: HandState) -> HandState:
-    """Each hand opened and backed off by the least that makes it clear of the object, else as far as may be."""
-    closer, hand = Closer(pair, len(state.pivot)), pair.hand.model
-    back, closes = -quat_rotate(state.rotation, hand.palm.approach), hand.closing != 0
-    opening = np.where(closes, hand.preshape - state.q, 0.0)
-    free, settled = state, np.zeros(len(state.pivot), bool)
-    for distance, share in ((distance, share) for distance in BACK_M for share in OPENINGS):
-        moved = HandState(state.pivot + distance * back, state.rotation, state.q + share * opening)
-        now = settled | (closer.distances(moved).min(axis=1) > CLEAR_M)
-        keep = settled[:, None]
-        pivot, q = np.where(keep, free.pivot, moved.pivot), np.where(keep, free.q, moved.q)
-        free, settled = HandState(pivot, state.rotation, q), now
-    return free
+def way_in(hands: Proposals) -> Floats:
+    """(N, W, 7) from the standoff to the grasp's place."""
+    poses = np.repeat(hands.hand_pose[:, None], WAYPOINTS, axis=1)
+    poses[..., :3] -= np.linspace(STANDOFF_M, 0.0, WAYPOINTS)[:, None] * hands.approach[:, None]
+    return poses
 
 
-def _advanced(pair: Pair, state: HandState) -> GraspSet:
-    closer = Closer(pair, len(state.pivot))
-    return grasp_set(pair, closer.close(closer.approach(state, STANDOFF_M)).state, 0.0, {})
+def table(tips_m: float | None = 0.0) -> Surroundings:
+    """What the robot knows to stand around: a table whose top is z = 0, which fingertips may touch."""
+    top = Obstacle.half_space([0.0, 0.0, 1.0], 0.0)
+    return Surroundings((Obstacle(top.planes, top.corners, tips_m=tips_m),), UP)
+
+
+def _room(hand: HandModel, hands: Proposals, opened: Floats) -> Floats:
+    """(N,) least distance from the table at the grasp, the squeeze and on the way [m]; fingertips may touch."""
+    path = way_in(hands)
+    n, steps = path.shape[:2]
+    at_grasp = [Posture(hands.hand_pose, joints) for joints in (hands.joints, hands.squeeze, opened)]
+    coming = Posture(path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
+    rooms = [obstacle_room(hand, posture, [table()]) for posture in at_grasp]
+    rooms.append(obstacle_room(hand, coming, [table()]).reshape(n, steps).min(axis=1))
+    return np.asarray(np.min(rooms, axis=0))
+
+
+def _gap(hand: HandModel, hands: Proposals, opened: Floats, sight: Sight) -> Floats:
+    """(N,) least distance of the coming hand's surface from the points that were seen [m]."""
+    path = way_in(hands)
+    n, steps = path.shape[:2]
+    points = hand_points(hand, path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
+    distance, _ = cKDTree(sight.points).query(points.reshape(-1, 3))
+    return np.asarray(distance).reshape(n, -1).min(axis=1)
+
+
+def hand_points(hand: HandModel, pose: Floats, joints: Floats) -> Floats:
+    """(N, H, 3) points on the hand's surface."""
+    surface = sample_surface(hand, _POINTS)
+    return np.asarray(apply(body_poses(hand, pose, joints)[:, surface.body], surface.position))
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """What became of N proposals."""
+
+    lift: NDArray[np.bool_]
+    hard: NDArray[np.bool_]
+    """At half the friction besides."""
+    outcome: NDArray[np.uint8]
+    """`LiftOutcome`."""
+    epsilon: Floats
+    """(N,) of the hand as it was proposed."""
+
+
+def carried_out(
+    hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, ready: list[Ready], seen: list[Sight], *, epsilon: bool
+) -> Lifted:
+    """Lift tests of all proposals of some pictures of one object."""
+    index = np.repeat(np.arange(len(seen)), [len(one.hands) for one in ready])
+    lying = np.array([sight.object_pose for sight in seen])
+    back = invert(lying[index])
+    pose, path, grasp, squeeze, opened = (
+        np.concatenate([part(one) for one in ready])
+        for part in (
+            lambda one: one.hands.hand_pose, lambda one: way_in(one.hands), lambda one: one.hands.joints,
+            lambda one: one.hands.squeeze, lambda one: one.opened,
+        )
+    )  # fmt: skip
+    own = compose(back, pose)
+    raised = pose.copy()
+    raised[:, :3] += RISE_M * UP
+    grasps = GraspSet(
+        Posture(own, grasp), Posture(own, opened), Posture(own, squeeze), np.full(len(own), np.nan),
+        approach=compose(back[:, None], path), coming=opened, lift=Posture(compose(back, raised), squeeze), scene=index,
+    )  # fmt: skip
+    placed = Placed(table().obstacles, lying, index)
+    lifts = judge_lifts(hand, obj, grasps, placed, pieces=pieces)
+    lift, hard = lifts.outcome == LiftOutcome.LIFTED, np.zeros(len(own), bool)
+    rows = np.flatnonzero(lift)
+    if len(rows):
+        again = judge_lifts(hand, obj, grasps.take(rows), placed.take(rows), hard=True, pieces=pieces)
+        hard[rows] = again.success == 1
+    found = np.full(len(own), np.nan)
+    if epsilon:
+        columns = measure(hand, obj, grasps, friction=1.0)
+        at = int(np.argmin(np.abs(np.asarray(columns["quality/thresholds_m"]) - CONTACT_M)))
+        found = np.asarray(columns["quality/epsilon"], float)[:, at]
+    return Lifted(lift, hard, lifts.outcome, found)

@@ -1,54 +1,45 @@
-"""A small convolutional network that proposes several grasps with scores, and the loss that lets them differ.
+"""The proposal network in PyTorch: what `worker.planners.learned.network` reads and runs without it.
 
-An object has many grasps; a network with one answer would give their mean, which is none. With several answers only
-the nearest to each shown grasp learns from it (Rupprecht et al., Learning in an Uncertain World, ICCV 2017), and the
-scores learn how often each of them is the nearest.
+Points of an object seen by one camera become one feature; a flow carries noise to grasps that go with it, so a cloud
+gets as many different proposals as one likes (conditional flow matching, Lipman et al. 2023).
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import Final
-
 import torch
 from torch import nn
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import relu, silu
 
-#: Differences that count as one: position [m], rotation columns, joints [rad].
-SCALES: Final = (0.03, 0.3, 0.3)
-#: Share of the loss that goes to all proposals, so that none is left behind.
-RELAXED: Final = 0.05
+#: Unit of lengths in the network's input [m].
+UNIT_M = 0.1
+_FREQUENCIES = 4
 
 
-class Predictor(nn.Module):
-    """(B, 5, 64, 64) -> grasps (B, P, 9 + J) and logits of their scores (B, P)."""
+class Proposer(nn.Module):
+    """A velocity for each of G half-made grasps of each of B clouds."""
 
-    def __init__(self, joints: int, proposals: int = 16, width: int = 32) -> None:
+    def __init__(self, size: int) -> None:
         super().__init__()
-        self.proposals, self.size = proposals, 9 + joints
-        sizes = [5, width, 2 * width, 4 * width, 4 * width]
-        blocks: list[nn.Module] = []
-        for before, after in pairwise(sizes):
-            blocks += [nn.Conv2d(before, after, 3, stride=2, padding=1), nn.GroupNorm(8, after), nn.ReLU()]
-        self.encoder = nn.Sequential(*blocks, nn.Flatten(), nn.Linear(4 * width * 16, 256), nn.ReLU())
-        self.head = nn.Linear(256, proposals * (self.size + 1))
+        self.encoder = nn.ModuleDict(
+            {"0": nn.Linear(7, 64), "1": nn.Linear(64, 128), "2": nn.Linear(128, 256), "out": nn.Linear(256, 256)}
+        )
+        given = size + 2 * _FREQUENCIES + 256 + 2
+        blocks = {str(k): nn.ModuleDict({"a": nn.Linear(512, 512), "b": nn.Linear(512, 512)}) for k in range(2)}
+        self.flow = nn.ModuleDict({"in": nn.Linear(given, 512), **blocks, "out": nn.Linear(512, size)})
 
-    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        out = self.head(self.encoder(image)).view(len(image), self.proposals, self.size + 1)
-        return torch.cat([0.1 * out[..., :3], out[..., 3:-1]], dim=-1), out[..., -1]
+    def seen(self, points: torch.Tensor, height: torch.Tensor) -> torch.Tensor:
+        """(B, 257) of points (B, P, 7) and of how high above the table their mean is (B,) [m]."""
+        each = points
+        for name in ("0", "1", "2"):
+            each = relu(self.encoder[name](each))
+        feature = relu(self.encoder["out"](each.max(dim=1).values))
+        return torch.cat([feature, height[:, None] / UNIT_M], dim=1)
 
-
-def distances(proposed: torch.Tensor, shown: torch.Tensor) -> torch.Tensor:
-    """(B, P, G) squared distance of proposals (B, P, 9 + J) from shown grasps (B, G, 9 + J), in units of `SCALES`."""
-    difference = proposed[:, :, None] - shown[:, None]
-    parts = difference[..., :3], difference[..., 3:9], difference[..., 9:]
-    return torch.stack([(part / scale).square().mean(-1) for part, scale in zip(parts, SCALES, strict=True)]).sum(0)
-
-
-def loss(proposed: torch.Tensor, logits: torch.Tensor, shown: torch.Tensor) -> torch.Tensor:
-    """Mean over the shown grasps of the nearest proposal's distance, and of the surprise that it is that one."""
-    apart = distances(proposed, shown)
-    nearest, which = apart.min(dim=1)
-    each = (1 - RELAXED) * nearest.mean() + RELAXED * apart.mean()
-    spread = logits[:, None].expand(-1, which.shape[1], -1)
-    return each + 0.1 * cross_entropy(spread.reshape(-1, logits.shape[1]), which.reshape(-1))
+    def velocity(self, x: torch.Tensor, time: torch.Tensor, seen: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
+        """(N, D) from x (N, D), time (N,), what is seen (N, 257) and label (N,)."""
+        turns = 2 * torch.pi * time[:, None] * 2.0 ** torch.arange(_FREQUENCIES)
+        h = silu(self.flow["in"](torch.cat([x, turns.sin(), turns.cos(), seen, label[:, None]], dim=1)))
+        for name in ("0", "1"):
+            block = self.flow[name]
+            h = h + block["b"](silu(block["a"](h)))
+        return self.flow["out"](h)

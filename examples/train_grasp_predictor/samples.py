@@ -1,118 +1,145 @@
-"""From a picture with its grasps to what the network sees and what it should say.
+"""What cameras saw of objects on a table, and the grasps of each scene as rows of numbers that a network learns.
 
-The network sees a square crop around the object: colour, depth relative to the object's, and its mask. It answers in
-a frame that follows from the crop alone: the camera's axes, the origin at the anchor, which is the middle of the crop
-at the median depth of the object.
+A row has the 12 + 3 J numbers of `worker.planners.learned.network`, in the frame of the table, z up, counted from its
+origin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn.functional import interpolate
 
-from service.model.transforms import quat_rotate, quat_to_matrix
+from service.model.transforms import compose, quat_rotate
 from service.readers import Pictures, Shards
-from service.store.shards import read_shard
+from service.store.shards import Shard, read_shard
+from worker.grasps import GraspSet
+from worker.planners.learned.network import Proposals, encode
 
-#: Side of the crop [px], and how much larger than the object's box it is.
-SIZE: Final = 64
-MARGIN: Final = 1.3
-#: Depth that becomes 1 in the network's input [m], and the most of it that is told.
-DEPTH_UNIT_M: Final = 0.1
-FAR: Final = 3.0
-#: Least cosine between the palm's direction and the camera's: nobody can tell from a picture how a back is shaped.
-SEEN: Final = 0.5
-#: Label of the grasped object in segmentations.
-_OBJECT: Final = 2
+Floats = NDArray[np.float64]
+
+#: Points of a cloud that are kept; fewer are shown to a network at a time.
+POINTS: Final = 1024
+#: A picture that shows less of its object is left out [pixels].
+LEAST_SEEN: Final = 60
 
 
 @dataclass(frozen=True)
-class Example:
-    """One picture."""
+class Scene:
+    """One object as it lies on one face; `shard` is the base shard of the grasps that were planned there."""
 
-    image: torch.Tensor
-    """(5, SIZE, SIZE): colour in [0, 1], depth, mask."""
-    grasps: torch.Tensor
-    """(K, 3 + 6 + J): hand position from the anchor [m], first two columns of its rotation, joints [rad]."""
-    anchor: np.ndarray
-    """(3,) in the camera's frame [m]."""
     object: str
-    object_pose: np.ndarray
-    """(7,) object in the camera's frame."""
+    shard: str
+    number: int
 
 
-def first_grasps(shards: Shards, count: int) -> Shards:
-    """The first batches that hold `count` grasps of each hand and object, with their scenes and views; 0: all."""
-    if not count:
-        return shards
-    held: dict[tuple[str, str], int] = {}
-    kept: set[tuple[str, str, int]] = set()
-    for file in sorted(shards.of("base"), key=lambda file: file.batch):
-        pair = file.hand, file.object
-        if held.get(pair, 0) < count:
-            kept.add((*pair, file.batch))
-            held[pair] = held.get(pair, 0) + len(read_shard(shards.path(file), kind="base")["quality/valid"])
-    chosen = (file for file in shards if (file.hand, file.object, file.batch) in kept)
-    return Shards(tuple(chosen), shards.store, shards.cache)
+@dataclass(frozen=True)
+class Sight:
+    """One picture of a scene as points of its object, in the frame of the table."""
+
+    scene: Scene
+    points: Floats
+    """(P, 3) [m]"""
+    normals: Floats
+    """(P, 3) unit, toward the camera."""
+    object_pose: Floats
+    """(7,) where the object lies: for labels and for the simulator, never shown to who proposes."""
+
+    @property
+    def anchor(self) -> Floats:
+        """(3,) mean of the points."""
+        return np.asarray(self.points.mean(axis=0))
 
 
-def examples(shards: Shards, approach: NDArray[np.float64]) -> Iterator[Example]:
-    """All pictures that show enough of their object and have grasps from the side that the camera sees.
-
-    Clearance of the table is no matter here: too few grasps have it, and the object is judged without a table.
+def sights(shards: Shards, *, noise: str) -> list[Sight]:
+    """All pictures that show enough of their object.
 
     Args:
-        shards: base, scene and views shards.
-        approach: (3,) unit direction in which the palm looks, in the frame of the hand's root link.
+        shards: base and views shards of grasps that were planned in scenes.
+        noise: of the depth camera; see docs/clouds.md.
     """
-    for sample in Pictures(shards, clear=False, valid=False, with_grasps_only=True):
-        crop, pose = crop_of(sample), np.asarray(sample["grasp/hand_pose"])
-        towards = quat_rotate(pose[:, 3:], approach)[:, 2]
-        seen = np.flatnonzero(towards > SEEN)
-        if crop is not None and len(seen):
-            image, anchor = crop
-            targets = targets_of(pose[seen], np.asarray(sample["grasp/joint_positions"])[seen], anchor)
-            yield Example(image, targets, anchor, sample["object"], np.asarray(sample["object/pose"]))
+    clouds = Pictures(shards, valid=False).clouds(POINTS, noise=noise, frame="table")
+    found = []
+    for place, sample in zip(clouds.pictures.places, clouds, strict=True):
+        if sample["cloud/seen"] >= LEAST_SEEN:
+            scene = Scene(sample["object"], place.scene_shard, place.scene)
+            points, normals = (sample[f"cloud/{what}"].astype(float) for what in ("points", "normals"))
+            found.append(Sight(scene, points, normals, np.asarray(sample["object/pose"])))
+    return found
 
 
-def crop_of(sample: dict[str, Any]) -> tuple[torch.Tensor, np.ndarray] | None:
-    """The network's input and the anchor (3,) [m]; None where less than 30 pixels of the object are seen."""
-    mask = sample["image/segmentation"] == _OBJECT
-    if mask.sum() < 30:
-        return None
-    x0, y0, x1, y1 = np.asarray(sample["box/bounding_box_2d_tight"], float)
-    depth = np.asarray(sample["image/depth"], float)
-    middle = float(np.median(depth[mask]))
-    centre, half = np.array([x0 + x1, y0 + y1]) / 2, MARGIN * max(x1 - x0, y1 - y0) / 2
-    near = np.where(np.isfinite(depth), (depth - middle) / DEPTH_UNIT_M, FAR).clip(-FAR, FAR)
-    planes = np.concatenate([np.moveaxis(sample["image/rgb"] / 255.0, -1, 0), near[None], mask[None]])
-    k = np.asarray(sample["camera/intrinsics"], float)
-    anchor = np.array([*((centre - k[:2, 2]) / np.diag(k)[:2] * middle), middle])
-    return _resampled(planes, centre, half), anchor
+@dataclass(frozen=True)
+class Taught:
+    """Grasps of one object in its scenes."""
+
+    scenes: Sequence[Scene]
+    """(K,)"""
+    rows: Floats
+    """(K, 12 + 3 J)"""
+    label: Floats
+    """(K,) 1: to be proposed; 0: an example of what fails."""
+    hard: NDArray[np.bool_]
+    """(K,) whether it lifts at half the friction too."""
+    weight: Floats
+    """(K,) how often a grasp is shown, beside the others of its scene."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def take(self, which: NDArray[np.intp]) -> Taught:
+        scenes = [self.scenes[i] for i in which]
+        return Taught(scenes, self.rows[which], self.label[which], self.hard[which], self.weight[which])
 
 
-def targets_of(pose: Any, joints: Any, anchor: Any) -> torch.Tensor:
-    """(K, 3 + 6 + J) from hand poses (K, 7) in the camera's frame and joints (K, J)."""
-    rotation = quat_to_matrix(np.asarray(pose)[:, 3:])
-    columns = np.concatenate([rotation[:, :, 0], rotation[:, :, 1]], axis=1)
-    rows = np.concatenate([np.asarray(pose)[:, :3] - anchor, columns, joints], axis=1)
-    return torch.from_numpy(rows.astype(np.float32))
+def taught(shards: Shards, obj: str, *, valid: bool = True) -> Taught:
+    """The grasps of an object that were planned in its scenes, in the order of their batches."""
+    scenes: list[Scene] = []
+    rows, label, hard = [], [], []
+    for file in sorted(shards.only(objects=[obj]).of("base"), key=lambda file: file.batch):
+        shard = read_shard(shards.path(file), kind="base")
+        # What is not clear on its way has no verdict: it is no example of anything.
+        kept = np.flatnonzero(
+            np.asarray(shard["quality/valid"]) == 1 if valid else np.asarray(shard["quality/success"], int) >= 0
+        )
+        number = np.asarray(shard["grasp/scene_index"], np.intp)[kept]
+        scenes += [Scene(obj, file.id, int(one)) for one in number]
+        rows.append(rows_of(GraspSet.from_columns(shard.arrays).take(kept), poses_of(shard)[number]))
+        label.append(np.asarray(shard["quality/valid"], float)[kept])
+        hard.append(np.asarray(shard["quality/lift_hard"])[kept] == 1)
+    return Taught(scenes, np.concatenate(rows), np.concatenate(label), np.concatenate(hard), np.ones(len(scenes)))
 
 
-def _resampled(planes: Any, centre: Any, half: float) -> torch.Tensor:
-    """The square around `centre` [px] with half side `half`, at SIZE x SIZE; outside the picture it is empty."""
-    side = max(2, round(2 * half))
-    x, y = (round(float(value)) - side // 2 for value in centre)
-    height, width = planes.shape[1:]
-    out = np.zeros((len(planes), side, side), np.float32)
-    out[3] = FAR  # nothing is there
-    a, b = max(0, y), min(height, y + side)
-    c, d = max(0, x), min(width, x + side)
-    out[:, a - y : b - y, c - x : d - x] = planes[:, a:b, c:d]
-    return interpolate(torch.from_numpy(out)[None], size=(SIZE, SIZE), mode="area")[0]
+def poses_of(shard: Shard) -> Floats:
+    """(S, 7) where the object lies in each scene of a base shard."""
+    return np.asarray(shard["scene/object_pose"], float)
+
+
+def rows_of(grasps: GraspSet, object_pose: Floats) -> Floats:
+    """(K, 12 + 3 J) from grasps in the object's frame, which lies at `object_pose` (K, 7)."""
+    assert grasps.approach is not None
+    way = grasps.approach[:, -1, :3] - grasps.approach[:, 0, :3]
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    proposals = Proposals(
+        compose(object_pose, np.asarray(grasps.grasp.hand_pose, float)),
+        quat_rotate(object_pose[:, 3:], way),
+        *(np.asarray(part.joint_positions, float) for part in (grasps.grasp, grasps.pregrasp, grasps.squeeze)),
+    )
+    return encode(proposals, np.zeros(3))
+
+
+def apart(faces: Floats) -> int:
+    """Of directions that look up (S, 3) in the object's frame, the one that is farthest from all others."""
+    cosine = faces @ faces.T - 2.0 * np.eye(len(faces))
+    return int(np.argmin(cosine.max(axis=1)))
+
+
+def each_scene(taught_here: Taught) -> Iterator[tuple[Scene, NDArray[np.intp]]]:
+    """Scenes with the rows of their grasps."""
+    rows: dict[Scene, list[int]] = {}
+    for row, scene in enumerate(taught_here.scenes):
+        rows.setdefault(scene, []).append(row)
+    for scene, which in rows.items():
+        yield scene, np.array(which, np.intp)

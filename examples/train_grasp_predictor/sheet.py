@@ -1,44 +1,55 @@
-"""A page to look at: what the network saw of each held-back object, and the grasps that came of its best proposals."""
+"""A page to look at: for each unseen object what each source proposes, as it is carried out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
-from examples.train_grasp_predictor.evaluation import Held
-from examples.train_grasp_predictor.execution import TAKEN
-from worker.grasps import GraspSet
+from examples.train_grasp_predictor.evaluation import TAKEN, Exam
+from examples.train_grasp_predictor.execution import Lifted, Ready
+from examples.train_grasp_predictor.samples import Floats
+from service.model.transforms import apply, quat_rotate
 from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
 from worker.rendering.pages.pictures import grasp_pictures
 from worker.rendering.pages.sheets import label_page
 
-SIDE: Final = 240
-#: Proposals of a source drawn for each object: the best of its first pictures.
-DRAWN: Final = 3
+SIDE: Final = 200
+#: Pictures of each object whose first proposal is drawn.
+DRAWN: Final = 2
+_LIFTED, _LOST = (40, 160, 60), (200, 60, 50)
+
+Found = tuple[Exam, list[Ready], Lifted]
 
 
-def page(hand: HandModel, tests: Sequence[Held], made: Mapping[str, Mapping[str, GraspSet]]) -> bytes:
-    """PNG with a row for each object.
-
-    Args:
-        hand: the hand.
-        tests: the held-back objects.
-        made: for each source and object the grasps of its pictures, `TAKEN` for each, best first.
-    """
+def page(hand: HandModel, found: Mapping[str, Mapping[str, Found]]) -> bytes:
+    """PNG with a row for each object and `DRAWN` pictures of each source; a green frame: it was lifted."""
     rows, names = [], []
-    for held in tests:
-        first = np.arange(DRAWN) * TAKEN
-        seen = (held.pictures[0].image[:3].numpy().transpose(1, 2, 0) * 255).astype(np.uint8)
-        cells = [Image.fromarray(seen).resize((SIDE, SIDE), Image.Resampling.LANCZOS)]
-        for grasps in (of_objects[held.name] for of_objects in made.values()):
-            shown = grasps.grasp.take(first)
-            drawn = grasp_pictures(hand, held.model, shown.hand_pose, shown.joint_positions, (SIDE, SIDE))
-            cells += [Image.fromarray(picture) for picture in drawn[:, 0]]
+    for obj, of_sources in found.items():
+        cells = []
+        for exam, ready, lifted in of_sources.values():
+            for number in range(DRAWN):
+                hands, there = ready[number].hands, _lying(exam.model, exam.seen[number].object_pose)
+                drawn = grasp_pictures(hand, there, hands.hand_pose[:1], hands.joints[:1], (SIDE, SIDE))[0, 0]
+                cells.append(_framed(drawn, lifted=bool(lifted.lift[number * TAKEN])))
         rows.append(cells)
-        names.append([held.name])
-    heads = ["seen", *(name if k == 0 else "" for name in made for k in range(DRAWN))]
-    subtitle = "the best proposal for each of three pictures, carried out"
-    return label_page(rows, heads, names, title="Objects the networks had not seen", subtitle=subtitle)
+        names.append([obj])
+    heads = [name if k == 0 else "" for name in next(iter(found.values())) for k in range(DRAWN)]
+    subtitle = "the first proposal for each of two pictures; green: lifted in simulation"
+    return label_page(rows, heads, names, title=f"Objects that {hand.name} had not seen", subtitle=subtitle)
+
+
+def _lying(obj: ObjectModel, pose: Floats) -> ObjectModel:
+    """The surface of an object as it lies on the table."""
+    vertices, normals = apply(pose, obj.vertices), quat_rotate(pose[3:], obj.corner_normals)
+    return replace(obj, vertices=vertices, corner_normals=normals)
+
+
+def _framed(picture: np.ndarray, *, lifted: bool) -> Image.Image:
+    image = Image.fromarray(picture)
+    ImageDraw.Draw(image).rectangle([0, 0, SIDE - 1, SIDE - 1], outline=_LIFTED if lifted else _LOST, width=4)
+    return image

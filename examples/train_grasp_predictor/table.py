@@ -1,50 +1,71 @@
-"""The scores as a table in the layout of the paper's Table 3: grasps in, grasps out."""
+"""The scores as tables: what each source is worth, by unseen objects and faces, and object by object."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import fmean, stdev
 from typing import Any, Final
 
+from examples.train_grasp_predictor.evaluation import FACE, OBJECT
+
 Row = dict[str, Any]
 
-_HEADINGS: Final = {
-    "contact_area_cm2": "CA cm²", "intersection_volume_cm3": "IV cm³", "epsilon": "ε", "wrench_volume": "Vol",
-    "simulated_displacement_cm": "SD cm", "gsr": "GSR",
+#: Column -> kind of exam, figure, digits.
+_COLUMNS: Final = {
+    "lift": (OBJECT, "lift"), "first proposal": (OBJECT, "best"), "half friction": (OBJECT, "hard"),
+    "into the table": (OBJECT, "table"), "ε": (OBJECT, "epsilon"), "lift, unseen faces": (FACE, "lift"),
+    "half friction, faces": (FACE, "hard"),
 }  # fmt: skip
-
-#: What a row tells of: a source's own grasps, a network's proposals, what comes of them.
-DATA, PROPOSED, CARRIED_OUT = "data", "proposed", "carried out"
-_TABLES: Final = {DATA: "data", PROPOSED: "trained on; as proposed", CARRIED_OUT: "trained on; carried out"}
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Three tables: the sources' own grasps; what networks trained on them propose for unseen objects; and what comes
-    of it when a hand carries it out.
-
-    Cells are means over the objects; with several seeds the mean over them and their standard deviation.
-    """
-    parts = [_table(rows, side, title) for side, title in _TABLES.items() if any(row["side"] == side for row in rows)]
-    return "\n\n".join("\n".join(lines) for lines in parts)
-
-
-def _table(rows: Sequence[Row], side: str, title: str) -> list[str]:
-    some = [row for row in rows if row["side"] == side]
-    lines = [
-        f"| {title} | objects | pictures | grasps | " + " | ".join(_HEADINGS.values()) + " |",
-        "| --- " + "| --: " * 9 + "|",
-    ]
-    for name in dict.fromkeys(row["source"] for row in some):
-        seeds: dict[int, list[Row]] = {}
-        for row in some:
-            if row["source"] == name:
-                seeds.setdefault(row.get("seed", 0), []).append(row)
-        first = next(iter(seeds.values()))
-        cells = [_cell([fmean(row[metric] for row in part) for part in seeds.values()]) for metric in _HEADINGS]
-        counts = [len(first), first[0].get("pictures", "–"), sum(row["grasps"] for row in first)]
-        lines.append(f"| {name} | " + " | ".join([*map(str, counts), *cells]) + " |")
-    return lines
+    """For each hand a table of sources and one of objects. Cells are means over the objects, each counting alike; then
+    the mean over seeds and the standard deviation between them."""
+    parts = []
+    for hand in dict.fromkeys(row["hand"] for row in rows):
+        mine = [row for row in rows if row["hand"] == hand]
+        parts += [f"**{hand}**", "\n".join(_sources(mine)), "\n".join(_objects(mine))]
+    return "\n\n".join(parts)
 
 
-def _cell(means: list[float]) -> str:
-    return f"{fmean(means):.3g} ± {stdev(means):.2g}" if len(means) > 1 else f"{means[0]:.3g}"
+def _sources(rows: Sequence[Row]) -> Iterator[str]:
+    yield "| trained on | grasps | pictures | " + " | ".join(_COLUMNS) + " |"
+    yield "| --- | --: | --: |" + " --: |" * len(_COLUMNS)
+    for source in dict.fromkeys(row["source"] for row in rows):
+        mine = [row for row in rows if row["source"] == source]
+        cells = [_cell([_mean(part, kind, name) for part in _by_seed(mine)]) for kind, name in _COLUMNS.values()]
+        counts = (mine[0].get("grasps") or "–", mine[0].get("views", "–"))
+        yield f"| {source} | {counts[0]} | {counts[1]} | " + " | ".join(cells) + " |"
+
+
+def _objects(rows: Sequence[Row]) -> Iterator[str]:
+    found = dict.fromkeys((row["kind"], row["object"]) for row in rows)
+    objects = sorted(found, key=lambda pair: pair[0] != OBJECT)
+    sources = list(dict.fromkeys(row["source"] for row in rows))
+    yield "| lift | " + " | ".join(sources) + " |"
+    yield "| --- |" + " --: |" * len(sources)
+    for kind, name in objects:
+        cells = []
+        for source in sources:
+            mine = [row["lift"] for row in rows if (row["source"], row["kind"], row["object"]) == (source, kind, name)]
+            cells.append(f"{fmean(mine):.2f}" if mine else "–")
+        yield f"| {name}{', unseen face' * (kind == FACE)} | " + " | ".join(cells) + " |"
+
+
+def _by_seed(rows: Sequence[Row]) -> list[list[Row]]:
+    seeds: dict[int, list[Row]] = {}
+    for row in rows:
+        seeds.setdefault(row["seed"], []).append(row)
+    return list(seeds.values())
+
+
+def _mean(rows: Sequence[Row], kind: str, name: str) -> float | None:
+    found = [row[name] for row in rows if row["kind"] == kind and name in row]
+    return fmean(found) if found else None
+
+
+def _cell(means: Sequence[float | None]) -> str:
+    known = [value for value in means if value is not None]
+    if not known:
+        return "–"
+    return f"{fmean(known):.2f} ± {stdev(known):.2f}" if len(known) > 1 else f"{known[0]:.2f}"

@@ -79,7 +79,11 @@ def write(folder: Path) -> Path:
     ):  # fmt: skip
         base[f"quality/{name}"] = one
     base["quality/contact_links"] = one
-    base |= {"scene/object_pose": POSES, "grasp/scene_index": SCENE_OF_GRASP}
+    base |= {"scene/object_pose": POSES, "grasp/scene_index": SCENE_OF_GRASP, "quality/lift_hard": VALID}
+    coming = np.repeat(base["pregrasp/hand_pose"][:, None], 3, axis=1)
+    coming[..., 2] += [0.1, 0.05, 0.0]
+    base |= {"grasp/approach": coming, "grasp/lift": base["squeeze/hand_pose"]}
+    base["grasp/approach_joint_positions"] = base["pregrasp/joint_positions"]
     shot = [(scene, look_from(eye)) for scene in range(len(POSES)) for eye in EYES]
     seen = [picture(POSES[scene], extrinsics) for scene, extrinsics in shot]
     views = {

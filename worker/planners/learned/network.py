@@ -113,6 +113,7 @@ def propose(
     count: int,
     rng: np.random.Generator,
     label: float = 1.0,
+    spread: float = 1.0,
 ) -> Proposals:
     """Grasps that the network proposes for one cloud. The first of them do not depend on `count`.
 
@@ -124,13 +125,14 @@ def propose(
         count: proposals.
         rng: where the noise is drawn.
         label: 1: grasps that hold; 0: such as failed.
+        spread: standard deviation of the noise. Less than that of training, 1, gives likelier grasps, and more alike.
 
     Raises:
         InputError: no cloud of finite numbers, or a network whose numbers run away.
     """
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
-    noise = rng.standard_normal((count, network.numbers)).astype(np.float32)
+    noise = (spread * rng.standard_normal((count, network.numbers))).astype(np.float32)
     return decode(flow(network, noise, np.repeat(condition, count, axis=0)), anchor)
 
 

@@ -1,0 +1,103 @@
+"""What networks are trained on: the same number of grasps of each object, in the same scenes and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from examples.train_grasp_predictor.filtered import filtered, valid_grasps
+from examples.train_grasp_predictor.samples import Floats, Scene, Taught, apart, each_scene, poses_of, taught
+from service.model.transforms import quat_conjugate, quat_rotate
+from service.readers import Shards
+from service.store.shards import read_shard
+from worker.hands.model import HandModel
+from worker.objects.model import ObjectModel
+from worker.simulation.surroundings import UP
+
+#: Sizes of the ablation beside the usual one.
+QUARTER, FOURFOLD = "scenes, a quarter", "scenes, four times"
+ALIKE, UNLIKE = "scenes, most alike", "scenes, most unlike"
+FAILED, HARD = "scenes, failures told", "scenes, by half the friction"
+SCENES: Final = "scenes in the loop"
+#: How often a grasp is shown that lifts at half the friction too, for each that does not.
+HARD_WEIGHT: Final = 4.0
+#: Radians that weigh like a metre where grasps are compared.
+_RADIAN_M: Final = 0.05
+
+
+class Held:
+    """Which scenes are trained on: those of an object's faces but one, the one that looks least like the others."""
+
+    def __init__(self, shards: Shards, objects: Sequence[str]) -> None:
+        self.face: dict[str, int] = {}
+        self.poses: dict[Scene, Floats] = {}
+        for obj in objects:
+            for file in shards.only(objects=[obj]).of("base"):
+                poses = poses_of(read_shard(shards.path(file), kind="base"))
+                self.poses |= {Scene(obj, file.id, number): pose for number, pose in enumerate(poses)}
+                if obj not in self.face and len(poses) > 1:
+                    up = quat_rotate(quat_conjugate(poses[:, 3:]), np.broadcast_to(UP, (len(poses), 3)))
+                    self.face[obj] = apart(up)
+
+    def back(self, scene: Scene) -> bool:
+        return self.face.get(scene.object) == scene.number
+
+    def trained(self, given: Taught) -> Taught:
+        return given.take(np.array([i for i, scene in enumerate(given.scenes) if not self.back(scene)], np.intp))
+
+
+def in_scenes(shards: Shards, obj: str, held: Held, count: int) -> Taught:
+    """The first grasps of an object that were planned in its scenes."""
+    return first(held.trained(taught(shards, obj)), count)
+
+
+def first(given: Taught, count: int) -> Taught:
+    """The first grasps; all, where there are fewer."""
+    return given.take(np.arange(min(count, len(given))))
+
+
+def put_into(
+    free: Shards, hand: HandModel, obj: ObjectModel, name: str, like: Taught, held: Held, *, seed: int
+) -> Taught:
+    """As many free grasps as `like` has, put into its scenes and filtered."""
+    scenes, counts = zip(*((scene, len(rows)) for scene, rows in each_scene(like)), strict=True)
+    poses = np.array([held.poses[scene] for scene in scenes])
+    return filtered(hand, obj, valid_grasps(free, name), scenes, poses, np.array(counts), seed=seed)
+
+
+def spread(given: Taught, held: Held, count: int, *, alike: bool) -> Taught:
+    """`count` grasps of an object that resemble one another, or do not: the nearest to the one in their middle, or each
+    the farthest from those before it."""
+    place = _of_object(given, held)
+    apart_by = np.linalg.norm(place[:, None] - place[None], axis=2)
+    if alike:
+        return given.take(np.argsort(apart_by[int(apart_by.sum(axis=1).argmin())], kind="stable")[:count])
+    chosen = [int(apart_by.sum(axis=1).argmin())]
+    nearest = apart_by[chosen[0]].copy()
+    while len(chosen) < min(count, len(place)):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, apart_by[chosen[-1]])
+    return given.take(np.array(chosen, np.intp))
+
+
+def _of_object(given: Taught, held: Held) -> Floats:
+    """(K, ...) hands' places in the object's frame: positions [m], columns of rotations and joints as lengths."""
+    pose = np.array([held.poses[scene] for scene in given.scenes])
+    back = quat_conjugate(pose[:, 3:])
+    position = quat_rotate(back, given.rows[:, :3] - pose[:, :3])
+    columns = [quat_rotate(back, given.rows[:, first : first + 3]) for first in (3, 6)]
+    joints = given.rows[:, 12 : 12 + (given.rows.shape[1] - 12) // 3]
+    return np.concatenate([position, *(_RADIAN_M * part for part in (*columns, joints))], axis=1)
+
+
+def with_failures(shards: Shards, obj: str, held: Held, count: int) -> Taught:
+    """The first grasps of an object that were planned in its scenes and judged, whatever the verdict."""
+    return first(held.trained(taught(shards, obj, valid=False)), count)
+
+
+def by_friction(given: Taught) -> Taught:
+    """The same grasps, those shown more often that lift at half the friction."""
+    return replace(given, weight=np.where(given.hard, HARD_WEIGHT, 1.0))
