@@ -24,21 +24,15 @@ from worker.simulation.surroundings import Placed
 _TOGETHER: Final = 32
 
 
-def valid_grasps(shards: Shards, obj: str) -> GraspSet:
-    """The valid grasps of an object, of all batches.
-
-    Raises:
-        ValueError: there is none.
-    """
+def valid_grasps(shards: Shards, obj: str) -> GraspSet | None:
+    """The valid grasps of an object, of all batches; None: there is none."""
     found = []
     for file in sorted(shards.only(objects=[obj]).of("base"), key=lambda file: file.batch):
         shard = read_shard(shards.path(file), kind="base")
         kept = np.flatnonzero(shard["quality/valid"] == 1)
         if len(kept):
             found.append(GraspSet.from_columns(shard.arrays).take(kept))
-    if not found:
-        raise ValueError(f"no valid grasp of {obj}")
-    return joined(found)
+    return joined(found) if found else None
 
 
 def filtered(
@@ -76,9 +70,15 @@ def filtered(
                     owner += [s] * len(grasps)
                     kept[s] += range(len(grasps))
                     missing -= len(grasps)
-    none = np.zeros((0, 12 + 3 * len(hand.joint_names)))
-    rows = rows_of(joined(parts), object_pose[owner]) if parts else none
+    if not parts:
+        return nothing(hand)
+    rows = rows_of(joined(parts), object_pose[owner])
     return Taught([scenes[s] for s in owner], rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.ones(len(rows)))
+
+
+def nothing(hand: HandModel) -> Taught:
+    """No grasp."""
+    return Taught([], np.zeros((0, 12 + 3 * len(hand.joint_names))), np.ones(0), np.zeros(0, bool), np.ones(0))
 
 
 def _stands(free: GraspSet, order: NDArray[np.intp], pose: Floats, hand: HandModel) -> NDArray[np.bool_]:

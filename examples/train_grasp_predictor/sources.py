@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from examples.train_grasp_predictor.filtered import filtered, valid_grasps
+from examples.train_grasp_predictor.filtered import filtered, nothing, valid_grasps
 from examples.train_grasp_predictor.samples import Floats, Scene, Taught, apart, each_scene, poses_of, taught
 from service.model.transforms import quat_conjugate, quat_rotate
 from service.readers import Shards
@@ -65,7 +65,8 @@ def put_into(
     """As many free grasps as `like` has, put into its scenes and filtered."""
     scenes, counts = zip(*((scene, len(rows)) for scene, rows in each_scene(like)), strict=True)
     poses = np.array([held.poses[scene] for scene in scenes])
-    return filtered(hand, obj, valid_grasps(free, name), scenes, poses, np.array(counts), seed=seed)
+    grasps = valid_grasps(free, name)
+    return filtered(hand, obj, grasps, scenes, poses, np.array(counts), seed=seed) if grasps else nothing(hand)
 
 
 def spread(given: Taught, held: Held, count: int, *, alike: bool) -> Taught:
