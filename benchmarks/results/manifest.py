@@ -17,7 +17,7 @@ REPOSITORY: Final = Path(__file__).resolve().parents[2]
 DOCS: Final = REPOSITORY / "docs"
 #: Under the folder of the docs; what says what is there is not itself a figure.
 MANIFEST, INDEX = "results/MANIFEST.json", "results/README.md"
-_REVISIONS: Final = re.compile(r"STAGE_REVISIONS[^=]*= (\{[^}]*\})")
+_REVISIONS: Final = re.compile(r"^STAGE_REVISIONS[^=]*= (\{[^}]*\})", re.MULTILINE)
 
 Manifest = dict[str, dict[str, Any]]
 
@@ -100,7 +100,7 @@ def entered(study: Study, docs: Path) -> dict[str, Any]:
 
 def stage_revisions_at(revision: str) -> dict[str, int] | None:
     """`STAGE_REVISIONS` as a commit has them; None where it has none or is not there."""
-    text = _git("grep", "-h", "-A4", "STAGE_REVISIONS.*= {", revision, "--", "*.py")
+    text = _git("grep", "-h", "-A4", "^STAGE_REVISIONS.*= {", revision, "--", "*.py")
     found = _REVISIONS.search(text)
     return json.loads(found[1].replace(",}", "}").replace("'", '"')) if found else None
 
