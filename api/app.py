@@ -23,10 +23,10 @@ from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
 from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
-from api.routes import datasets, grasps, hand_corrections, jobs, shards, system, usage, webhooks
+from api.routes import datasets, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
 from api.routes.assets import asset_router
 from api.routes.dependencies import provide
-from api.routes.long_requests import FORMS, UPLOADS, Turns
+from api.routes.long_requests import EXPORTS, FORMS, UPLOADS, Turns
 from service.index.rebuild import complete_if_new
 from service.model.domain import AssetKind
 from service.model.errors import InputError, UnavailableError
@@ -76,8 +76,9 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     provide(app, opened)
     app.state.metrics = Metrics()
     app.state.uploads, app.state.forms = Turns(UPLOADS), Turns(FORMS)
+    app.state.exports = Turns(EXPORTS)
     problems.install(app, problem_page)
-    plain = (jobs, grasps, shards, system, hand_corrections, usage, webhooks)
+    plain = (jobs, grasps, shards, system, hand_corrections, tags, usage, webhooks)
     routers = [*(routes.router for routes in plain), *map(asset_router, AssetKind)]
     pages.install(app, opened)
     for router in (*routers, *datasets.routers, *pages.routers):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.index.views import AttemptView, GraspView, ShardView, StageProgress, WorkerView
+from service.index.views import AttemptView, GraspView, ShardView, StageProgress, TagView, WorkerView
 from service.model.diversity import CELLS
-from service.model.domain import JobRequest, Stage, State
+from service.model.domain import Digest, JobRequest, Stage, State
+from service.model.labels import Name
 from service.model.metric_fields import OfferedName, filters, means, with_fields
 from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind
+from service.model.where import LONGEST
 
 
 class StageStatus(StageProgress):
@@ -99,6 +101,11 @@ class GraspQuery(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     job: str | None = Field(None, max_length=64)
+    dataset: str | None = Field(None, max_length=64, description="of its cells")
+    tag: str | None = Field(None, max_length=64, description="that somebody gave to them")
+    where: str | None = Field(
+        None, max_length=LONGEST, description="an expression, as in `epsilon > 0.3 and lift and robust >= 0.75`"
+    )
     hand: str | None = Field(None, max_length=64)
     object: str | None = Field(None, max_length=64)
     valid: bool | None = None
@@ -190,6 +197,49 @@ class GraspPageQuery(GraspQuery):
 
     limit: int = Field(50, ge=1, le=200, description="items on a page")
     cursor: str | None = Field(None, max_length=512, description="`next` of the page before")
+
+
+class GraspExportQuery(GraspQuery):
+    """Which grasps to take home, and how."""
+
+    format: Literal["csv", "json", "zip"] = Field("csv", description="zip: base shards of these grasps alone")
+
+
+class GraspName(BaseModel):
+    """A grasp by its place."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    shard_id: Digest
+    row: int = Field(ge=0, lt=2**31)
+
+
+class Selection(BaseModel):
+    """Grasps: those that are named, or all that pass a filter."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    grasps: list[GraspName] | None = Field(None, min_length=1, max_length=5000)
+    filter: GraspQuery | None = None
+
+    @model_validator(mode="after")
+    def _is_one_of_both(self) -> Self:
+        if (self.grasps is None) == (self.filter is None):
+            raise ValueError("name the grasps, or give a filter: one of both")
+        return self
+
+
+class TagRequest(Selection):
+    """Grasps that shall have a tag."""
+
+    name: Name
+
+
+class TagChange(BaseModel):
+    """What became of a tag."""
+
+    tag: TagView
+    changed: int = Field(description="grasps that have it and had not, or the other way round")
 
 
 class Part(BaseModel):

@@ -52,6 +52,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("keys", "api.client.commands", "Parts of the service", "Make, list and revoke API keys."),
     ("projects", "api.client.commands", "Parts of the service", "List projects of keys, and limit what each may use."),
     ("webhooks", "api.client.commands", "Jobs", "Addresses that are told when jobs and datasets end."),
+    ("tags", "api.client.commands", "Jobs", "Names for grasps of the service, to find them and take them home."),
     ("synth", "worker.commands.synth", "Without a server", "Grasps of a hand file on an object file."),
     ("evaluate", "worker.commands.evaluate", "Without a server", "Quality of grasps, judged by an independent engine."),
     ("scene", "worker.commands.scene", "Without a server", "The object at rest on a table; grasps that fit there."),

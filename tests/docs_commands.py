@@ -41,7 +41,7 @@ NOT_RUN: Final = (
     (r"cuda|--join|on_gpu|gpu-check", "needs a GPU, or its tools"),
     (r"^make ", "the verbs of the repository: what they do is tested by itself"),
     (r"graspd (up|api|keeper|worker|view)\b", "does not end"),
-    (r"graspd (keys|projects|webhooks)\b", "tests/api/access has services with keys"),
+    (r"graspd (keys|projects|webhooks|tags)\b", "tests/api has services that they ask"),
     (r"million|kitchen|pilot|train-|--grasps 1000|large_index|\bycb\b", "takes hours"),
 )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from api.access.auth import reach
@@ -11,7 +12,9 @@ from service.index.filters import GraspFilter, GraspSort, Metric
 from service.index.queries.statistics import Kinds
 from service.index.views import GraspView, JobView, Page
 from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
+from service.model.errors import LimitError
 from service.model.metrics import Indexed, indexed
+from service.model.tags import MOST_TAGGED, Grasp
 from service.pipeline.backends import Parts
 
 _KEPT_HISTOGRAMS: Final = 256
@@ -30,9 +33,38 @@ class Grasps:
     def page(self, query: GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
         """Grasps that pass every filter."""
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
+        return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
+
+    def members(self, query: GraspQuery) -> list[Grasp]:
+        """All grasps that pass every filter, by their places.
+
+        Raises:
+            LimitError: they are more than are chosen at once.
+        """
+        found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
+        if len(found) > MOST_TAGGED:
+            raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, which is the most at once; narrow it")
+        return found
+
+    def listed(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
+        """Grasps by their places, which the caller may see; those that are gone are left out."""
+        return self._index.grasps.listed(places)
+
+    def _filter(self, query: GraspQuery) -> GraspFilter:
+        """The index's filter behind a request's parameters, within the caller's reach.
+
+        Raises:
+            NotFoundError: there is no such tag, or dataset.
+        """
         seen = reach()
-        where = grasp_filter(query).model_copy(update={"project": None if seen.everything else seen.project})
-        return self._index.grasps.page(where, sort=sort, limit=limit, cursor=cursor)
+        if query.dataset is not None:
+            self._index.datasets.get(query.dataset, reach=seen)
+        named = {
+            "project": None if seen.everything else seen.project,
+            "dataset": query.dataset,
+            "tag": query.tag and self._index.tags.named(query.tag, reach=seen),
+        }
+        return _bounded(query).model_copy(update=named)
 
     def one(self, shard_id: str, row: int) -> GraspDetail:
         """One grasp with all that its shard says of it."""
@@ -90,8 +122,8 @@ def _told(kinds: Kinds) -> Diversity | None:
     )
 
 
-def grasp_filter(query: GraspQuery) -> GraspFilter:
-    """The index's filter behind a request's parameters."""
+def _bounded(query: GraspQuery) -> GraspFilter:
+    """What a request's parameters say of the grasps themselves."""
     bounds: dict[str, dict[Metric, float]] = {"min": {}, "max": {}}
     if query.type is not None:
         kind = float(GraspType[query.type.upper()])
@@ -105,6 +137,7 @@ def grasp_filter(query: GraspQuery) -> GraspFilter:
         job=query.job,
         hand=query.hand,
         object=query.object,
+        where=query.where,
         valid=query.valid,
         success=query.success,
         scene=query.scene,

@@ -19,7 +19,9 @@ from service.index.views import AssetView, GraspView, Page
 from service.model.domain import AssetKind, JobRequest, State
 from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError
 
-_TIMEOUT: Final = httpx.Timeout(30.0, connect=5.0)
+_PATIENCE_S: Final = 30.0
+_CONNECT_S: Final = 5.0
+_TIMEOUT: Final = httpx.Timeout(_PATIENCE_S, connect=_CONNECT_S)
 #: The server sends a sign of life every 15 s.
 _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
@@ -136,18 +138,27 @@ class Client:
             time.sleep(_POLL_S)
         return asset
 
-    def fetch(self, path: str) -> Iterator[bytes]:
-        """Chunks of a file of the API."""
-        with _Translated(self.url), self._http.stream("GET", path) as answer:
+    def fetch(
+        self, path: str, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
+    ) -> Iterator[bytes]:
+        """Chunks of a file of the API, none of which may take longer than `patience_s` [s]."""
+        timeout = httpx.Timeout(patience_s, connect=_CONNECT_S)
+        with _Translated(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
             _raise_for(answer)
             yield from answer.iter_bytes()
 
     def download(self, shard: Shard, path: Path) -> Path:
         """Fetch a shard's file; the name appears once it is whole."""
+        return self.save(shard.file, path)
+
+    def save(
+        self, address: str, path: Path, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
+    ) -> Path:
+        """Fetch a file of the API; the name appears once it is whole. `patience_s` as for `fetch`."""
         draft = path.with_name(f".{path.name}.part")
         try:
             with draft.open("wb") as file:
-                for chunk in self.fetch(shard.file):
+                for chunk in self.fetch(address, params=params, patience_s=patience_s):
                     file.write(chunk)
             draft.replace(path)
         finally:

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from api.client import key_commands, project_commands, webhook_commands
+from api.client import key_commands, project_commands, tag_commands, webhook_commands
 from api.client.add_commands import add_hand, add_object
 from api.client.client import Client
 from api.client.datasets import DatasetClient
@@ -281,6 +281,7 @@ app.add_typer(objects_app, name="objects")
 app.add_typer(key_commands.app, name="keys")
 app.add_typer(project_commands.app, name="projects")
 app.add_typer(webhook_commands.app, name="webhooks")
+app.add_typer(tag_commands.app, name="tags")
 
 
 def _uploaded(client: Client, kind: AssetKind, value: str) -> str:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse
 
 from api.catalog.assets import Assets
+from api.catalog.tags import Tags
 from api.dashboard import snippets
+from api.dashboard.choice_forms import did
 from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
 from api.models import GraspDetail, GraspQuery
-from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, may_read
+from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, TagsOf, may_read
 from api.routes.paging import next_address
+from service.index.views import GraspView, TagView
 from service.model.diversity import GraspType
 from service.model.domain import AssetKind
+from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS, Indexed, indexed
 from service.model.robust import MEANINGS
 
@@ -33,9 +39,10 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/grasps", dependencies=[Depends(may_read)])
-def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf) -> HTMLResponse:
+def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf) -> HTMLResponse:
     """Every grasp of the index: filters, order, pages. The address holds all of it."""
     given = {key: value for key, value in request.query_params.items() if value}
+    said = did(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
     view = view if view in PAGE_SIZES else "cards"
     problem, page, query = "", None, GraspQuery()
@@ -44,7 +51,10 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: As
         page = grasps.page(query, limit=PAGE_SIZES[view], cursor=cursor)
     except ValueError as error:
         problem = first_message(error)
+    except InputError as error:
+        problem = str(error)
     rows = page.items if page else []
+    known = tags.all()
     return render(
         request,
         "grasps.html",
@@ -53,6 +63,12 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: As
         filters={name: given.get(name, "") for name in GraspQuery.model_fields},
         filtered=bool(set(given) - {"sort", "order"}),
         problem=problem,
+        did=said,
+        **choice_of(tags, rows, known, given),
+        all_said="all that pass this filter" if set(given) - {"sort", "order"} else "all grasps there are",
+        here="/grasps",
+        shown_tag=next((tag for tag in known if tag.name == query.tag), None),
+        tag_choices=[(tag.name, tag.name) for tag in known],
         hands=_names(assets, AssetKind.HAND),
         objects=_names(assets, AssetKind.OBJECT),
         rows=rows,
@@ -74,14 +90,19 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, assets: As
 
 
 @router.get("/grasps/{shard_id}/{row}", dependencies=[Depends(may_read)])
-def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf) -> HTMLResponse:
-    """One grasp: 3D, verdict, quality, and where it is kept."""
+def grasp_page(
+    request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf, tags: TagsOf
+) -> HTMLResponse:
+    """One grasp: 3D, verdict, quality, tags, and where it is kept."""
     grasp, shard = grasps.one(shard_id, row), shards.one(shard_id)
     return render(
         request,
         "grasp.html",
         page="/grasps",
         grasp=grasp,
+        did=did(dict(request.query_params)),
+        tags=[tag.name for tag in tags.all()],
+        tagged=tags.of([(shard_id, row)]),
         stops=[point.name for point in grasp.way if point.name],
         shard=shard,
         job=shards.job_of(shard_id),
@@ -91,6 +112,17 @@ def grasp_page(request: Request, shard_id: str, row: int, grasps: GraspsOf, shar
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
         loader=snippets.grasp_loader(grasp, shard, str(request.base_url)),
     )
+
+
+def choice_of(
+    tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
+) -> dict[str, Any]:
+    """What a form that chooses grasps of a list shows: their tags, all tags, and the query of the list."""
+    return {
+        "tagged": tags.of([(grasp.shard_id, grasp.row) for grasp in rows]),
+        "tags": known,
+        "filter": urlencode(where),
+    }
 
 
 def _metrics(grasp: GraspDetail) -> list[tuple[str, float | None, str]]:

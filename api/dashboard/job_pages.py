@@ -8,12 +8,13 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
 from api.dashboard import snippets
+from api.dashboard.choice_forms import did
 from api.dashboard.figures import charts
-from api.dashboard.grasp_pages import COLUMNS
+from api.dashboard.grasp_pages import COLUMNS, choice_of
 from api.dashboard.pictures import Channel
 from api.dashboard.rendering import render
 from api.models import GraspQuery, JobDetail, LossCurve
-from api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, may_read
+from api.routes.dependencies import GraspsOf, JobsOf, ShardsOf, TagsOf, may_read
 
 _SHOWN_PICTURES: Final = 8
 _SHOWN_GRASPS: Final = 10
@@ -22,7 +23,7 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/jobs/{job_id}", dependencies=[Depends(may_read)])
-def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf) -> HTMLResponse:
+def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
     """All of one job."""
     job = jobs.one(job_id)
     pictures = _pictures(job)
@@ -44,6 +45,11 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf) -> H
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,
+        did=did(dict(request.query_params)),
+        **choice_of(tags, rows, tags.all(), where),
+        all_said=f"all {'valid ' if judged else ''}grasps of this job",
+        here=f"/jobs/{job_id}",
+        view="",
         models=dict.fromkeys((grasp.shard_id for grasp in rows), (job.hand_digest, job.object_digest)),
         columns=COLUMNS,
         sort="epsilon",

@@ -10,7 +10,17 @@ from fastapi.responses import HTMLResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from api.catalog import events
-from api.dashboard import dataset_pages, forms, grasp_pages, hand_pages, job_pages, service_pages, session, usage_pages
+from api.dashboard import (
+    choice_forms,
+    dataset_pages,
+    forms,
+    grasp_pages,
+    hand_pages,
+    job_pages,
+    service_pages,
+    session,
+    usage_pages,
+)
 from api.dashboard.expected import Expectations
 from api.dashboard.pictures import Pictures
 from api.dashboard.rendering import environment, render
@@ -23,7 +33,17 @@ router = APIRouter(include_in_schema=False)
 routers: Final = (
     *(
         part.router
-        for part in (service_pages, job_pages, grasp_pages, hand_pages, dataset_pages, usage_pages, forms, session)
+        for part in (
+            service_pages,
+            job_pages,
+            grasp_pages,
+            hand_pages,
+            dataset_pages,
+            usage_pages,
+            forms,
+            choice_forms,
+            session,
+        )
     ),
     router,
 )

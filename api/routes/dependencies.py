@@ -14,10 +14,12 @@ from api.access.quotas import Quotas
 from api.access.unfinished import unfinished
 from api.catalog.assets import Assets
 from api.catalog.datasets import Datasets
+from api.catalog.grasp_exports import GraspExports
 from api.catalog.grasps import Grasps
 from api.catalog.jobs import Jobs
 from api.catalog.overview import Overview
 from api.catalog.shards import Shards
+from api.catalog.tags import Tags
 from api.catalog.usage import Usage
 from api.catalog.webhooks import Webhooks
 from service.pipeline.backends import Parts
@@ -44,7 +46,8 @@ def provide(app: FastAPI, parts: Parts) -> None:
     state.jobs = Jobs(parts, quotas, Idempotency(redis), state.grasps, state.shards)
     state.datasets, state.assets = Datasets(parts, quotas), Assets(parts)
     state.overview, state.usage = Overview(parts, state.jobs), Usage(parts, state.keys)
-    state.webhooks = Webhooks(parts)
+    state.webhooks, state.tags = Webhooks(parts), Tags(parts, state.grasps)
+    state.grasp_exports = GraspExports(parts, state.grasps, state.tags)
 
 
 def may_read(request: Request) -> None:
@@ -76,6 +79,8 @@ GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
 StoreOf = Annotated[Store, Depends(_provided("store"))]
 UsageOf = Annotated[Usage, Depends(_provided("usage"))]
+TagsOf = Annotated[Tags, Depends(_provided("tags"))]
+ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
 Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="items on a page")]

@@ -16,6 +16,8 @@ T = TypeVar("T")
 UPLOADS: Final = 4
 #: Forms with an upload: they wait for its check too.
 FORMS: Final = 8
+#: Files of chosen grasps that are written at once.
+EXPORTS: Final = 2
 _WAITING: Final = 32
 _PATIENCE_S: Final = 20.0
 
@@ -49,7 +51,7 @@ class Turns:
             self._free.release()
 
     async def _take(self) -> None:
-        busy = UnavailableError("too many uploads at once; try again in a moment")
+        busy = UnavailableError("too many requests of this kind at once; try again in a moment")
         if self._free.locked() and self._waiting >= self._most_waiting:
             raise busy
         self._waiting += 1

@@ -19,6 +19,12 @@ class GraspFilter(Model):
     object: str | None = None
     job: str | None = None
     shard: str | None = None
+    dataset: str | None = None
+    """Of its cells."""
+    tag: str | None = None
+    """Id of a tag that they have."""
+    where: str | None = None
+    """An expression of `service.model.where`."""
     project: str | None = None
     """Of whose jobs; None: of everybody's."""
     valid: bool | None = None

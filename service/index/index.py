@@ -22,6 +22,7 @@ from service.index.queries.overview import Overview
 from service.index.queries.shards import Shards
 from service.index.queries.statistics import Statistics
 from service.index.queries.usage import Usage
+from service.index.tags import Tags
 
 
 class Index:
@@ -57,6 +58,7 @@ class Index:
         self.notes = Notes(database)
         self.damage = KnownDamage(database)
         self.outgoing = Outgoing(database)
+        self.tags = Tags(database)
 
     def close(self) -> None:
         """Give the connections back."""

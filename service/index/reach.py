@@ -8,6 +8,7 @@ from sqlalchemy import ColumnElement, Select, case, exists, or_, select
 
 from service.index.dataset_tables import datasets, object_sets
 from service.index.tables import assets, attempts, jobs, tasks
+from service.index.tag_tables import tags
 from service.model.projects import Reach
 
 Tests = tuple[ColumnElement[bool], ...]
@@ -25,6 +26,10 @@ def seen_datasets(reach: Reach) -> Tests:
 def seen_sets(reach: Reach) -> Tests:
     """Of sets of objects."""
     return () if reach.everything else (object_sets.c.project == reach.project,)
+
+
+def seen_tags(reach: Reach) -> Tests:
+    return () if reach.everything else (tags.c.project == reach.project,)
 
 
 def seen_assets(reach: Reach) -> Tests:

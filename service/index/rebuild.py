@@ -21,6 +21,7 @@ from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet
 from service.model.domain import State
 from service.model.errors import DamagedError, InputError, NotFoundError
 from service.model.records import AttemptRecord, JobEvent, JobRecord, Record
+from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.store.deletions import pending
 from service.store.library import load_asset, load_check, stored_assets
@@ -60,6 +61,7 @@ def rebuild(index: Index, store: Store, *, progress: Callable[[str, int], None] 
         made.shards()
         made.datasets()
         made.webhooks()
+        made.tags()
         index.notes.set_complete(made.left_out, within=connection)
     return {**made.counts, "left_out": len(made.left_out)}
 
@@ -148,6 +150,14 @@ class _Rebuild:
                 hook = parse_record(Webhook, data, key)
                 seen = self._seen.get(hook.id, self._last)
                 self._index.outgoing.add(hook, seen=seen, within=self._connection)
+
+    def tags(self) -> None:
+        """The last version of each tag: those before it are left of a change that broke off."""
+        found = sorted(self._read(names.TAGS, lambda key: key.endswith(".json")))
+        last = {key.rpartition("/")[0]: (key, data) for key, data in found}
+        for key, data in last.values():
+            with self._each(key):
+                self._index.tags.put(parse_record(Tag, data, key), within=self._connection)
 
     def _events(self, model: type[EventT], prefix: str) -> list[EventT]:
         found = []

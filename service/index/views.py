@@ -251,6 +251,18 @@ class WebhookView(View):
     seen: int = Field(0, description="ends up to this number have deliveries")
 
 
+class TagView(View):
+    """A name that somebody gave to grasps."""
+
+    id: str
+    name: str
+    created: str
+    changed: str
+    owner: str = Field("", description="id of the key that made it")
+    project: str = Field("", description="project that it belongs to; empty: the one without a name")
+    grasps: int = Field(0, description="grasps that have it and are there")
+
+
 class DeliveryView(View):
     """What became of telling an address of an end."""
 

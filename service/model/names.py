@@ -17,6 +17,7 @@ OBJECT_SETS: Final = "object_sets"
 DELETIONS: Final = "deletions"
 RELEASED: Final = "released"
 WEBHOOKS: Final = "webhooks"
+TAGS: Final = "tags"
 
 #: Folder under `shards/` and HDF5 kind of what each stage makes.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
@@ -135,6 +136,16 @@ def object_set(name: str, digest: str) -> str:
 def webhook(webhook: str) -> str:
     """An address that is told of ends; removed when its owner takes it away."""
     return f"{WEBHOOKS}/{webhook}.json"
+
+
+def tag_versions(tag: str) -> str:
+    """Prefix of what became of a tag with each change."""
+    return f"{TAGS}/{tag}"
+
+
+def tag_version(tag: str, number: int) -> str:
+    """One of `tag_versions`; numbers start at 1, the last one counts, and those before it go."""
+    return f"{tag_versions(tag)}/{number:06}.json"
 
 
 def deletion(what: str, name: str) -> str:

@@ -37,6 +37,7 @@ def test_commands_that_talk_http_need_no_web_framework_and_no_database() -> None
         "key_commands",
         "project_commands",
         "webhook_commands",
+        "tag_commands",
     )
     statement = "import " + ", ".join(f"api.client.{module}" for module in modules)
     assert modules_after(statement).isdisjoint({"fastapi", "starlette", "sqlalchemy", "redis"})

@@ -191,3 +191,30 @@ def test_an_error_is_a_page_of_its_own(page: Any) -> None:
     assert answer.status == 404
     assert "there is no job" in answer.text()
     assert "Back to the overview" in answer.text()
+
+
+def test_grasps_are_chosen_by_keyboard_tagged_found_by_their_tag_and_taken_home(page: Any, parts: Parts) -> None:
+    finish_all(parts, add_job(parts))
+    page.goto("/grasps?view=table")
+    assert page.is_disabled("button:has-text('Export')")
+    boxes = page.locator("input[name=grasp]")
+    for row in (0, 2):
+        boxes.nth(row).focus()
+        page.keyboard.press("Space")
+    assert page.inner_text("[data-chosen]") == "2 grasps chosen"
+    page.fill("form.choose input[name=tag]", "good")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("text=2 grasps given the tag good.")
+    page.select_option("#tag", "good")
+    page.wait_for_url("**tag=good**")
+    page.wait_for_selector("#found .tag-head")
+    assert boxes.count() == 2
+    page.check("input[name=all]")
+    page.select_option("[name=format]", "csv")
+    with page.expect_download() as download:
+        page.click("button:has-text('Export')")
+    assert Path(download.value.path()).read_text().count("\n") == 3
+    page.fill("#where", "epsilon > 1000")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("text=No grasp fits these filters")

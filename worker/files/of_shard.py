@@ -170,11 +170,6 @@ def id_of_columns(columns: Columns) -> str:
     return found.hexdigest()
 
 
-def carried(shard: Shard) -> dict[str, Attribute]:
-    """What a copy of a shard says at its root: all but what `write_shard` says itself."""
-    return {name: value for name, value in shard.attributes.items() if name != "schema"}
-
-
 def made_of(source: Shard) -> dict[str, Attribute]:
     """What a later shard says of the shard whose scenes or grasps it is made of."""
     return {f"{source.kind}_shard": str(source.attributes.get("shard_id") or id_of_columns(source.arrays))}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from service.model.errors import InputError
 from service.store.shards import json_attribute, read_shard, write_shard
-from worker.files.of_shard import carried
+from service.store.subsets import carried
 from worker.quality.referee.robust import Robustness
 
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.cli import load_settings
-from service.model.digests import digest_json
 from service.model.errors import InputError
 from service.readers import Shards, open_shards
-from service.store.shards import SCHEMAS, Shard, read_shard, write_shard
+from service.store.shards import Shard, read_shard
 from service.store.store import open_store
-from worker.files.of_shard import carried
+from service.store.subsets import part_of_shard, place_of
 
 #: From the base shards of one hand on one object to the mask (N,) of each.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
@@ -69,44 +68,18 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is there already; choose a folder that is not")
     looked_at = kept = 0
-    ready: list[tuple[Path, bytes]] = []
+    ready: list[tuple[PurePosixPath, bytes]] = []
     for together in base_shards(shards):
         for shard, mask in zip(together, choose(together), strict=True):
             looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
             if mask.any():
-                path = out / _place(shard)
-                ready.append((_free(path, {one for one, _ in ready}), _bytes(shard, mask)))
+                ready.append((place_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
     if not ready:
         raise InputError(f"none of {looked_at} grasps is chosen")
-    for path, data in ready:
+    files = [out / path for path, _ in ready]
+    for path, (_, data) in zip(files, ready, strict=True):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-    files = [path for path, _ in ready]
-    told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path.relative_to(out)) for path in files]}
+    told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
     (out / "subset.json").write_text(json.dumps(told, indent=1) + "\n")
     return Subset(looked_at, kept, files, len(shards) - len(shards.of("base")))
-
-
-def _place(shard: Shard) -> Path:
-    said = shard.attributes
-    names = [str(said.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]
-    return Path(*names) / f"base-{int(said.get('batch', 0)):05}.h5"  # type: ignore[arg-type]
-
-
-def _free(path: Path, taken: set[Path]) -> Path:
-    """The path, or one beside it: two jobs may have a batch of one number."""
-    found, number = path, 1
-    while found in taken:
-        found, number = path.with_stem(f"{path.stem}-{number}"), number + 1
-    return found
-
-
-def _bytes(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
-    schema = SCHEMAS["base"]
-    arrays = {
-        path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
-    }
-    attributes = carried(shard)
-    if "shard_id" in attributes:
-        attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
-    return write_shard("base", arrays, attributes)

@@ -15,12 +15,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, func, select, tuple_
+from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, exists, func, select, tuple_
 from sqlalchemy.sql.operators import in_op, is_
 
+from service.index.dataset_tables import dataset_cells
 from service.index.filters import GraspFilter, GraspSort
+from service.index.queries.grasp_where import truth
 from service.index.tables import grasps, jobs, shards, tasks
+from service.index.tag_tables import tagged
 from service.model.domain import Stage
+from service.model.where import Node, parsed
 
 #: So many rows are fetched by an index and sorted in less time than all of a million are read.
 SORTED_AT_ONCE: Final = 40_000
@@ -39,23 +43,75 @@ class Condition:
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
         """The test; of a group that is not listed in a form that no index serves (None: all are)."""
-        return self.on(self.column if groups is None or self.group in groups else _plain(self.column))
+        return self._of(self.column if groups is None or self.group in groups else _plain(self.column))
 
-    def on(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
-        """The same test of another column."""
+    def on(self, rows: Subquery) -> ColumnElement[bool]:
+        """The same test of grasps that were drawn from the table."""
+        return self._of(rows.c[str(self.column.key)])
+
+    def _of(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
         test: ColumnElement[bool] = self.operator(column, self.value)
         return test
 
 
-def conditions(where: GraspFilter | None) -> list[Condition]:
-    """A filter as conditions that all must hold."""
+@dataclass(frozen=True)
+class Tagged:
+    """Grasps that have a tag."""
+
+    tag: str
+    group: str = "tag"
+
+    def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
+        if groups is not None and self.group not in groups:
+            return self._of(grasps.c)
+        those = select(tagged.c.shard_id, tagged.c.row).where(tagged.c.tag == self.tag)
+        return tuple_(grasps.c.shard_id, grasps.c.row).in_(those)
+
+    def on(self, rows: Subquery) -> ColumnElement[bool]:
+        return self._of(rows.c)
+
+    def _of(self, columns: Any) -> ColumnElement[bool]:
+        same = (tagged.c.tag == self.tag, tagged.c.shard_id == columns.shard_id, tagged.c.row == columns.row)
+        return exists().where(*same)
+
+
+@dataclass(frozen=True)
+class Where:
+    """Grasps of which an expression is true; it is served by no index."""
+
+    node: Node
+    group: str = "flag"
+
+    def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
+        return truth(self.node, grasps.c)
+
+    def on(self, rows: Subquery) -> ColumnElement[bool]:
+        return truth(self.node, rows.c)
+
+
+Test = Condition | Tagged | Where
+
+
+def conditions(where: GraspFilter | None) -> list[Test]:
+    """A filter as conditions that all must hold.
+
+    Raises:
+        InputError: its expression is none, or asks for what the index does not hold.
+    """
     where = where or GraspFilter()
-    found = []
+    found: list[Test] = []
     if where.shard is not None:
         found.append(Condition("shard", grasps.c.shard_id, operator.eq, where.shard))
     if where.job is not None:
         of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
         found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
+    if where.dataset is not None:
+        made = _of_dataset(where.dataset).with_only_columns(tasks.c.shard_id)
+        found.append(Condition("dataset", grasps.c.shard_id, in_op, made))
+    if where.tag is not None:
+        found.append(Tagged(where.tag))
+    if where.where is not None:
+        found.append(Where(parsed(where.where)))
     if where.project is not None:
         found.append(
             Condition(
@@ -110,7 +166,7 @@ def search(
 
 def _with_metric(
     connection: Connection,
-    wanted: Sequence[Condition],
+    wanted: Sequence[Test],
     few: str | None,
     sort: GraspSort,
     size: int,
@@ -129,7 +185,7 @@ def _with_metric(
         return list(connection.execute(_slice(ordered, key, sort, size, start)).mappings())
     for number in LOOKED_AT:
         looked = _slice(ordered, key, sort, number, start).subquery()
-        query = select(looked).where(*(c.on(looked.c[str(c.column.key)]) for c in outside))
+        query = select(looked).where(*(c.on(looked) for c in outside))
         same_key = tuple(looked.c[str(column.key)] for column in key)
         rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
         if len(rows) >= size or _count(connection, looked) < number:
@@ -152,7 +208,7 @@ def _sorted(
     return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
 
 
-def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Condition]) -> str | None:
+def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Test]) -> str | None:
     """The group of conditions that leaves the fewest rows, if these can be sorted at once."""
     numbers: dict[str, int] = {}
     for group in dict.fromkeys(condition.group for condition in wanted):
@@ -164,7 +220,7 @@ def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Con
     return few if few is not None and numbers[few] <= SORTED_AT_ONCE else None
 
 
-def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Condition]) -> int:
+def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test]) -> int:
     """Rows that pass the conditions of a group; of a metric's no more are counted than matter."""
     query: Select[Any]
     if group == "job":
@@ -173,6 +229,10 @@ def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequ
         )
     elif group == "project":
         query = _of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
+    elif group == "dataset":
+        query = _of_dataset(where.dataset or "").with_only_columns(func.sum(tasks.c.count))
+    elif group == "tag":
+        query = select(func.count()).where(tagged.c.tag == where.tag)
     elif group == "pair":
         pair = {"hand": where.hand, "object": where.object}
         tests = [shards.c[name] == value for name, value in pair.items() if value is not None]
@@ -187,6 +247,12 @@ def _of_project(project: str) -> Select[Any]:
     """Tasks that make grasps for the jobs of a project."""
     joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
     return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
+
+
+def _of_dataset(dataset: str) -> Select[Any]:
+    """Tasks that make grasps for the cells of a dataset."""
+    joined = select(tasks.c.id).join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
+    return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
 
 
 def _count(connection: Connection, rows: Subquery) -> int:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
 from service.index.database import Database
+from service.index.dataset_tables import dataset_cells
 from service.index.filters import GraspFilter, Metric
 from service.index.queries.grasp_search import conditions, sql_conditions
 from service.index.tables import grasps, shards, tasks
@@ -126,7 +127,7 @@ class Statistics:
 def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> tuple[float, list[ColumnElement[bool]]]:
     """The share of shards that about `at_most` grasps come from, and the filter with the choice of these."""
     share = min(1.0, at_most / max(1, _size(connection, where)))
-    tests = [c.sql(["shard", "job"]) for c in conditions(where)]
+    tests = [c.sql(["shard", "job", "dataset"]) for c in conditions(where)]
     if share < 1.0:
         tests.append(grasps.c.shard_id < f"{round(share * 16**8):08x}")
     return share, tests
@@ -139,6 +140,9 @@ def _size(connection: Connection, where: GraspFilter) -> int:
         query = query.where(shards.c.id == where.shard)
     elif where.job is not None:
         query = select(func.sum(tasks.c.count)).where(tasks.c.job_id == where.job, tasks.c.position == 0)
+    elif where.dataset is not None:
+        cells = (dataset_cells.c.job_id == tasks.c.job_id, dataset_cells.c.dataset == where.dataset)
+        query = select(func.sum(tasks.c.count)).where(*cells, tasks.c.position == 0)
     else:
         pair = {"hand": where.hand, "object": where.object}
         query = query.where(*(shards.c[name] == value for name, value in pair.items() if value is not None))

@@ -92,6 +92,8 @@ class World:
             pass
         hook = self.post("/v1/webhooks", ann, json={"url": "https://red-secret.example/"}).json()
         snapshot = self.post("/v1/datasets/red-secret-data/snapshots", ann).json()["digest"]
+        tag = self.post("/v1/tags", ann, json={"name": "red-secret-tag", "grasps": [{"shard_id": shard, "row": 0}]})
+        assert tag.status_code == 200, tag.text
         add_worker(self.parts)
         self.said |= {
             "job_id": job, "failed": failed, "waiting": waiting, "shard_id": shard, "views": views,
@@ -104,7 +106,7 @@ class World:
     @property
     def secrets(self) -> list[str]:
         """What none but the project and an admin may read."""
-        named = [f"red-secret-{what}" for what in ("hand", "ball", "data", "set")]
+        named = [f"red-secret-{what}" for what in ("hand", "ball", "data", "set", "tag")]
         return [*named, "red-secret broke", *self.said.values()]
 
 
@@ -129,6 +131,7 @@ _NAMES = {
     "objects": ("red-secret-ball", "objects_digest"),
     "datasets": ("red-secret-data",),
     "object-sets": ("red-secret-set",),
+    "tags": ("red-secret-tag",),
 }
 
 
@@ -162,7 +165,7 @@ def _addresses(world: World, template: str) -> Iterator[str]:
 def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
     """What may be sent there: nothing; or documents and forms that name things of the project."""
     if method in ("GET", "HEAD", "DELETE"):
-        is_list = address.endswith(("/grasps", "/shards"))
+        is_list = address.endswith(("/grasps", "/shards", "/export"))
         return [{}, {"params": {"job": world.said["job_id"]}}] if is_list else [{}]
     options = {"grasps": "32", "fidelity": "draft"}
     cells = [world.said["job_id"], world.said["waiting"], "allegro|mug", "allegro|red-secret-ball"]
@@ -174,11 +177,16 @@ def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
         {"json": {"name": "mine", "hands": ["red-secret-hand"], "objects": ["red-secret-ball"]}},
         {"json": {"hands": ["allegro"], "objects": [], "sets": ["red-secret-set"], "name": "mine"}},
         {"json": {"name": "mine", "objects": ["red-secret-ball"]}},
+        {"json": {"name": "mine", "grasps": [{"shard_id": world.said["shard_id"], "row": 0}]}},
+        {"json": {"name": "mine", "filter": {"job": world.said["job_id"]}}},
+        {"json": {"grasps": [{"shard_id": world.said["shard_id"], "row": 0}]}},
     ]
     forms = [
         {"data": options | {"hand": "red-secret-hand", "object": "red-secret-ball"}},
         {"data": options | {"hand": "allegro", "object_held": world.said["objects_digest"], "held_units": "mm"}},
         {"data": options | {"name": "mine", "hands": "red-secret-hand", "objects": "red-secret-ball"}},
+        {"data": {"tag": "mine", "grasp": f"{world.said['shard_id']}:0", "format": "csv"}},
+        {"data": {"tag": "red-secret-tag", "all": "true", "filter": f"job={world.said['job_id']}", "format": "csv"}},
         *({"data": options | {"action": action, "cell": cells}} for action in ("submit", "retry", "cancel")),
     ]
     return documents if address.startswith("/v1/") else forms

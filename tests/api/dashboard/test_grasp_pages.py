@@ -137,3 +137,33 @@ def test_grasps_that_were_judged_in_no_other_model_say_nothing_of_it(http: TestC
     document = http.get(f"/v1/grasps/{manifest.shard_id}/0").json()
     assert (document["robust_share"], document["robust_weakest"]) == (None, None)
     assert "Models survived" not in http.get(f"/grasps/{manifest.shard_id}/0").text
+
+
+def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, parts: Parts) -> None:
+    record = add_job(parts)
+    shard = finish_all(parts, record)[0].shard_id
+
+    def does(action: str, **fields: object) -> str:
+        answer = http.post(f"/grasps/{action}", data={"tag": "good", **fields}, follow_redirects=False)
+        return answer.headers.get("location", f"{answer.status_code}")
+
+    filters = {"filter": f"job={record.id}&valid=false", "here": "/grasps", "view": "table"}
+    back = does("tag", grasp=[f"{shard}:1", f"{shard}:2"], **filters)
+    assert back == f"/grasps?job={record.id}&valid=false&view=table&did=tagged&done=2&named=good"
+    assert "2 grasps given the tag good." in http.get(back).text
+    assert does("untag", all="true", filter="tag=good", here=f"/jobs/{record.id}").startswith(f"/jobs/{record.id}?did=")
+    # What a form says of where it stands leads nowhere else; and a form that chooses nothing says so.
+    assert does("tag", grasp=f"{shard}:1", here="//example.org").startswith("/grasps?")
+    assert does("tag") == does("tag", all="true", filter="job=none") == does("export", grasp="../../x:1") == "422"
+    assert http.post("/grasps/tag", data=filters, headers={"Origin": "https://example.org"}).status_code == 403
+    assert http.post("/grasps/export", data={"grasp": f"{shard}:1", "format": "csv"}).text.count("\r\n") == 2
+    assert http.post("/tags/good/delete", follow_redirects=False).headers["location"] == "/grasps"
+    assert "<script>" not in http.get("/grasps?did=tagged&done=1&named=<script>").text
+
+
+def test_the_list_takes_the_language_of_the_command_line(http: TestClient, parts: Parts) -> None:
+    finish_all(parts, add_job(parts))
+    page = http.get("/grasps", params={"where": "epsilon > 0.2 and valid"})
+    assert page.status_code == 200 and 'value="epsilon &gt; 0.2 and valid"' in page.text
+    wrong = http.get("/grasps", params={"where": "epsilon >"})
+    assert wrong.status_code == 422 and "the expression ends where a value is expected" in wrong.text

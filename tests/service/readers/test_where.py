@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from service.model.errors import InputError
-from service.readers.where import LONGEST, parse
+from service.model.where import LONGEST
+from service.readers.where import parse
 
 COLUMNS: dict[str, Any] = {
     "quality/thresholds_m": np.array([0.002, 0.005]),

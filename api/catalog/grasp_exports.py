@@ -1,0 +1,125 @@
+"""Chosen grasps to take home: their rows as CSV or JSON, or the grasps themselves as base shards in a ZIP."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from tempfile import TemporaryFile
+from typing import IO, Any, Final, Literal
+
+import numpy as np
+
+from api.access.auth import reach
+from api.catalog.grasps import Grasps
+from api.catalog.tags import Tags
+from service.index.views import GraspView
+from service.model.errors import InputError, LimitError
+from service.model.tags import Grasp, by_shard
+from service.pipeline.backends import Parts
+from service.store.integrity import read_checked
+from service.store.shards import read_shard
+from service.store.subsets import part_of_shard, place_of
+
+Format = Literal["csv", "json", "zip"]
+MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}
+#: Shards that one ZIP takes grasps of: some ten seconds of work.
+MOST_SHARDS: Final = 2000
+_CHUNK: Final = 1 << 20
+_COLUMNS: Final = (*GraspView.model_fields, "tags")
+
+
+@dataclass(frozen=True)
+class Export:
+    """A file that is ready."""
+
+    media_type: str
+    filename: str
+    size: int
+    chunks: Iterator[bytes]
+
+
+class GraspExports:
+    """Writes chosen grasps into files, each on the disk of the service until it is sent."""
+
+    def __init__(self, parts: Parts, grasps: Grasps, tags: Tags) -> None:
+        self._parts = parts
+        self._grasps = grasps
+        self._tags = tags
+
+    def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> Export:
+        """The file of these grasps, which the caller may see.
+
+        Args:
+            said: how they were chosen; it stands in JSON and in the ZIP's `subset.json`.
+
+        Raises:
+            InputError: a ZIP of no grasp.
+            LimitError: a ZIP of grasps of more than `MOST_SHARDS` shards.
+            DamagedShard: a shard is not what its checksum says.
+        """
+        file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
+        try:
+            {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
+            size = file.tell()
+            file.seek(0)
+        except BaseException:
+            file.close()
+            raise
+        return Export(MEDIA_TYPES[format], f"grasps.{format}", size, _sent(file))
+
+    def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
+        tags = self._tags.of(places)
+        for grasp in self._grasps.listed(places):
+            yield grasp.model_dump(mode="json") | {"tags": tags.get((grasp.shard_id, grasp.row), [])}
+
+    def _csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        rows = csv.DictWriter(text, _COLUMNS)
+        rows.writeheader()
+        for row in self._rows(places):
+            rows.writerow(row | {"tags": " ".join(row["tags"])})
+        text.flush()
+        text.detach()
+
+    def _json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+        file.write(b'{"chosen": ' + json.dumps(said).encode() + b', "items": [')
+        for number, row in enumerate(self._rows(places)):
+            file.write((b",\n" if number else b"\n") + json.dumps(row).encode())
+        file.write(b"\n]}\n")
+
+    def _zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+        shards = by_shard(places)
+        if not shards:
+            raise InputError("no grasp is chosen, and a file of none says nothing; choose others")
+        if len(shards) > MOST_SHARDS:
+            raise LimitError(
+                f"these grasps lie in {len(shards)} shards and a ZIP takes them of at most {MOST_SHARDS}; choose "
+                "fewer, or write them with `graspd grasps where` where the store is at hand"
+            )
+        looked_at, names = 0, list[PurePosixPath]()
+        with zipfile.ZipFile(file, "w") as packed:
+            for shard_id, rows in shards.items():
+                known = self._parts.index.shards.get(shard_id, reach=reach())
+                shard = read_shard(
+                    read_checked(self._parts.store, known.key, known.sha256), kind="base", name=known.key
+                )
+                mask = np.zeros(known.count, bool)
+                mask[list(rows)] = True
+                looked_at += len(mask)
+                names.append(place_of(shard, names))
+                # Names come with a date of their own, so that the same grasps are the same file.
+                packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
+            told = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [str(name) for name in names]}
+            packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(told, indent=1) + "\n")
+
+
+def _sent(file: IO[bytes]) -> Iterator[bytes]:
+    with closing(file):
+        while chunk := file.read(_CHUNK):
+            yield chunk

@@ -1,0 +1,104 @@
+"""Tags: names that users give to grasps of their project."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+
+from api.access.auth import caller_id, may_change, must_own, reach
+from api.catalog.grasps import Grasps
+from api.models import Selection, TagChange
+from service.index.views import TagView
+from service.model.errors import InputError, LimitError, NotFoundError
+from service.model.projects import Reach
+from service.model.tags import MOST_TAGS, Grasp, Tag, tag_id
+from service.pipeline import tagging
+from service.pipeline.backends import Parts
+
+log = logging.getLogger(__name__)
+
+
+class Tags:
+    """Tags of the caller's project, and the grasps that have them."""
+
+    def __init__(self, parts: Parts, grasps: Grasps) -> None:
+        self._parts = parts
+        self._grasps = grasps
+
+    def all(self) -> list[TagView]:
+        """Tags within reach, by name."""
+        return self._parts.index.tags.all(reach=reach())
+
+    def one(self, name: str) -> TagView:
+        """A tag by its name or id."""
+        wanted = self._parts.index.tags.named(name, reach=reach())
+        return next(tag for tag in self.all() if tag.id == wanted)
+
+    def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
+        """Names of the tags of each of these grasps that has one."""
+        return self._parts.index.tags.of(grasps, reach=reach())
+
+    def chosen(self, selection: Selection) -> list[Grasp]:
+        """The grasps of a selection, each once, in order.
+
+        Raises:
+            NotFoundError: one that is named is not there, or not within reach.
+        """
+        if selection.filter is not None:
+            return self._grasps.members(selection.filter)
+        named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
+        there = self._parts.index.tags.there(named, reach=reach())
+        for shard, row in named:
+            if (shard, row) not in there:
+                raise NotFoundError(f"there is no grasp {row} in shard {shard!r}")
+        return named
+
+    def give(self, name: str, selection: Selection) -> TagChange:
+        """Give a tag of the caller's project to grasps; it is made if it is not there.
+
+        Raises:
+            InputError: no grasp is chosen.
+            NotYours: another key made it.
+            LimitError: there are `MOST_TAGS` of them, or too many grasps would have it.
+        """
+        if not (grasps := self.chosen(selection)):
+            raise InputError("no grasp passes this filter, so none gets the tag")
+        project = reach().project
+
+        def permit(tag: Tag | None) -> None:
+            _permit(tag)
+            if tag is None and self._mine(project) >= MOST_TAGS:
+                raise LimitError(f"there are {MOST_TAGS} tags, which is the most; delete one")
+
+        changed = tagging.give(self._parts, name, grasps, project=project, owner=caller_id(), permit=permit)
+        log.info("tag %s given to %d grasps", name, changed)
+        return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
+
+    def take_off(self, name: str, selection: Selection) -> TagChange:
+        """Take a tag off grasps.
+
+        Raises:
+            NotYours: another key made it.
+        """
+        tag = self._parts.index.tags.named(name, reach=reach())
+        changed = tagging.take_off(self._parts, tag, self.chosen(selection), permit=_permit)
+        return TagChange(tag=self.one(tag), changed=changed)
+
+    def remove(self, name: str) -> None:
+        """Take a tag away; its grasps stay.
+
+        Raises:
+            NotYours: another key made it.
+        """
+        tagging.remove(self._parts, self._parts.index.tags.named(name, reach=reach()), permit=_permit)
+        log.info("tag %s removed", name)
+
+    def _mine(self, project: str) -> int:
+        """Tags of the project; where it has no name, those of the caller's key."""
+        found = self._parts.index.tags.all(reach=Reach(project, everything=False))
+        return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
+
+
+def _permit(tag: Tag | None) -> None:
+    if tag is not None:
+        must_own(tag.owner, f"the tag {tag.name!r}", tag.project)

@@ -1,0 +1,50 @@
+// Choosing cells of a matrix, or grasps of a list: a press on a head takes its row or column, one box takes all, and the
+// bar says how many are chosen. `data-choose` of a form is the name of its boxes.
+(() => {
+  "use strict";
+  const boxes = (form) => [...form.querySelectorAll(`input[name="${form.dataset.choose}"]`)];
+  const forms = () => document.querySelectorAll("form[data-choose]");
+
+  function tell(form) {
+    const what = form.dataset.choose, count = boxes(form).filter((box) => box.checked).length;
+    const all = form.querySelector("input[name=all]"), every = form.querySelector("input[data-every]");
+    const said = all?.checked ? all.dataset.said : count ? `${count} ${what}${count === 1 ? "" : "s"} chosen` : `Choose ${what}s`;
+    form.querySelector("[data-chosen]").textContent = said;
+    for (const button of form.querySelectorAll("button[data-acts]")) button.disabled = count === 0 && !all?.checked;
+    if (every) {
+      every.checked = count > 0 && count === boxes(form).length;
+      every.indeterminate = count > 0 && !every.checked;
+    }
+  }
+
+  document.addEventListener("change", (event) => {
+    const form = event.target.closest("form[data-choose]");
+    if (!form) return;
+    if (event.target.matches("input[data-every]")) boxes(form).forEach((box) => { box.checked = event.target.checked; });
+    tell(form);
+  });
+  document.addEventListener("click", (event) => {
+    const head = event.target.closest("form[data-choose] :is(button[data-row], button[data-column])");
+    if (!head) return;
+    const form = head.closest("form");
+    const wanted = head.dataset.column === undefined
+      ? [...head.closest("tr").querySelectorAll(`input[name="${form.dataset.choose}"]`)]
+      : boxes(form).filter((box) => box.dataset.column === head.dataset.column);
+    const on = wanted.some((box) => !box.checked);
+    wanted.forEach((box) => { box.checked = on; });
+    tell(form);
+  });
+  // A refresh brings fresh boxes: what was chosen stays chosen.
+  let kept = new Set();
+  document.addEventListener("graspd:swapping", () => {
+    kept = new Set([...forms()].flatMap((form) => boxes(form).filter((box) => box.checked).map((box) => box.value)));
+  });
+  document.addEventListener("graspd:swapped", () => {
+    for (const form of forms()) {
+      boxes(form).forEach((box) => { box.checked = kept.has(box.value); });
+      tell(form);
+    }
+  });
+  document.addEventListener("htmx:after:swap", () => forms().forEach(tell));
+  forms().forEach(tell);
+})();

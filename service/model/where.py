@@ -1,0 +1,199 @@
+"""The language that chooses grasps by their numbers: `epsilon > 0.3 and lift and robust >= 0.75`.
+
+    expression   term { or term }
+    term         factor { and factor }
+    factor       not factor | ( expression ) | NAME | NAME op VALUE
+    op           < <= > >= = == !=
+
+A metric is called by its name in `service.model.metrics`, a swept one has its value at the threshold that the index
+tells. A metric is compared with a number, `hand`, `object` and `type` with a word; a flag stands alone. A grasp that
+lacks the number fails each comparison with it. The text becomes a tree here; nothing of it is evaluated.
+`service.readers.where` asks it of base shards, `service.index.queries.grasp_where` of the index.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from service.model.diversity import GraspType
+from service.model.errors import InputError
+from service.model.metrics import GRASP_METRICS
+
+#: Longest expression, and deepest nesting of one.
+LONGEST: Final = 1000
+_DEEPEST: Final = 40
+_METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric.code}
+_SHORT: Final = {"robust": "robust_share"}
+_WORDS: Final = ("hand", "object", "type")
+_TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
+#: What stands alone: true or not.
+FLAGS: Final = ("valid", "sound", "held", "lift", "lift_hard", "pushes")
+_COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
+_TOKEN: Final = re.compile(
+    r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\w.])|(?P<op><=|>=|==|!=|[<>=()])"
+    r"|'(?P<quoted>[^']*)'|(?P<word>[A-Za-z0-9_][\w.\-]*))"
+)
+
+
+@dataclass(frozen=True)
+class Flag:
+    """One of `FLAGS`."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class OfMetric:
+    """A metric that is not a code, compared with a number."""
+
+    name: str
+    op: str
+    """One of < <= > >= = !=."""
+    bound: float
+
+
+@dataclass(frozen=True)
+class OfWord:
+    """`hand` or `object`, = or != a word."""
+
+    name: str
+    op: str
+    word: str
+
+
+@dataclass(frozen=True)
+class OfType:
+    """The type of a grasp, = or != one; a grasp that tells none fails both."""
+
+    op: str
+    kind: GraspType
+
+
+@dataclass(frozen=True)
+class Not:
+    """What is not so."""
+
+    part: Node
+
+
+@dataclass(frozen=True)
+class Joined:
+    """All of its parts, or any of them."""
+
+    word: str
+    """and, or."""
+    parts: tuple[Node, ...]
+
+
+Node = Flag | OfMetric | OfWord | OfType | Not | Joined
+
+
+def parsed(text: str) -> Node:
+    """The tree of an expression.
+
+    Raises:
+        InputError: it is no such expression; says where, or what the names are.
+    """
+    if len(text) > LONGEST:
+        raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are read")
+    parser = _Parser(_tokens(text))
+    found = parser.expression(0)
+    if parser.at < len(parser.tokens):
+        raise InputError(f"{parser.tokens[parser.at].text!r} is left over; join conditions by `and` or `or`")
+    return found
+
+
+@dataclass(frozen=True)
+class _Token:
+    kind: str
+    """number, op, quoted or word."""
+    text: str
+
+
+def _tokens(text: str) -> list[_Token]:
+    found, at = [], 0
+    while at < len(text.rstrip()):
+        match = _TOKEN.match(text, at)
+        if match is None or match.lastgroup is None:
+            raise InputError(f"{text[at:].strip()[:20]!r} cannot be read; write it as: epsilon > 0.3 and valid")
+        found.append(_Token(match.lastgroup, match[match.lastgroup]))
+        at = match.end()
+    return found
+
+
+class _Parser:
+    """Recursive descent over the tokens; `at` is the next one."""
+
+    def __init__(self, tokens: list[_Token]) -> None:
+        self.tokens, self.at = tokens, 0
+
+    def expression(self, depth: int) -> Node:
+        return self._chain("or", lambda: self._chain("and", lambda: self._factor(depth)))
+
+    def _chain(self, word: str, part: Callable[[], Node]) -> Node:
+        parts = [part()]
+        while self._takes("word", word):
+            parts.append(part())
+        return parts[0] if len(parts) == 1 else Joined(word, tuple(parts))
+
+    def _factor(self, depth: int) -> Node:
+        if depth > _DEEPEST:
+            raise InputError(f"the expression is nested more than {_DEEPEST} deep")
+        if self._takes("word", "not"):
+            return Not(self._factor(depth + 1))
+        if self._takes("op", "("):
+            inner = self.expression(depth + 1)
+            if not self._takes("op", ")"):
+                raise InputError("a parenthesis is not closed")
+            return inner
+        return self._condition(self._next("a name"))
+
+    def _condition(self, token: _Token) -> Node:
+        name = _SHORT.get(token.text, token.text)
+        if token.kind != "word" or token.text in ("and", "or"):
+            raise InputError(f"{token.text!r} stands where a name is expected")
+        following = self.tokens[self.at] if self.at < len(self.tokens) else None
+        compared = following is not None and following.kind == "op" and following.text in _COMPARISONS
+        if name in FLAGS:
+            if compared:
+                raise InputError(f"{name} is true or not: write `{name}` or `not {name}`")
+            return Flag(name)
+        if name not in _METRICS and name not in _WORDS:
+            known = ", ".join([*_METRICS, *FLAGS, *_WORDS])
+            raise InputError(f"there is no {token.text!r}; the names are {known}")
+        if not compared or following is None:
+            raise InputError(f"{name} is to be compared, as in `{name} {'= power' if name == 'type' else '> 0'}`")
+        self.at += 1
+        op, value = _COMPARISONS[following.text], self._next("a value")
+        if name in _WORDS:
+            return _of_word(name, op, value)
+        if value.kind != "number":
+            raise InputError(f"{name} is compared with a number, not with {value.text!r}")
+        return OfMetric(name, op, float(value.text))
+
+    def _takes(self, kind: str, text: str) -> bool:
+        if self.at < len(self.tokens) and self.tokens[self.at] == _Token(kind, text):
+            self.at += 1
+            return True
+        return False
+
+    def _next(self, wanted: str) -> _Token:
+        if self.at >= len(self.tokens):
+            raise InputError(f"the expression ends where {wanted} is expected")
+        self.at += 1
+        return self.tokens[self.at - 1]
+
+
+def _of_word(name: str, op: str, value: _Token) -> Node:
+    if op not in ("=", "!="):
+        raise InputError(f"{name} is = or != a word, not {op} one")
+    if value.kind not in ("word", "quoted"):
+        raise InputError(f"{name} is compared with a word, not with {value.text!r}")
+    if name != "type":
+        return OfWord(name, op, value.text)
+    if value.text not in _TYPES:
+        raise InputError(f"there is no type {value.text!r}; choose one of {', '.join(_TYPES)}")
+    return OfType(op, GraspType[value.text.upper()])

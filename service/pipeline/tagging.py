@@ -1,0 +1,66 @@
+"""Giving tags to grasps and taking them off: the record, then the rows, in one turn of the index's writers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+
+from service.model.clock import timestamp
+from service.model.errors import LimitError, NotFoundError
+from service.model.tags import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
+from service.pipeline.backends import Parts
+from service.store.tags import drop_older, newest_version, put_version
+
+#: Asked with what is to be changed, None if it is to be made; raises where that is not allowed.
+Permit = Callable[[Tag | None], None]
+
+
+def give(parts: Parts, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
+    """Give a tag to grasps; it is made if it is not there. How many did not have it before.
+
+    Raises:
+        LimitError: more than `MOST_TAGGED` would have it.
+    """
+
+    def added(tag: Tag) -> Tag:
+        members = tag.members | set(grasps)
+        if len(members) > MOST_TAGGED:
+            raise LimitError(f"the tag {name!r} would name {len(members)} grasps; a tag names at most {MOST_TAGGED}")
+        return tag.model_copy(update={"grasps": by_shard(members)})
+
+    now = timestamp()
+    fresh = Tag(id=tag_id(name, project), name=name, number=1, created=now, changed=now, owner=owner, project=project)
+    before, after = _change(parts, fresh.id, added, permit, fresh=fresh)
+    return len(after.members) - len(before.members)
+
+
+def take_off(parts: Parts, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
+    """Take a tag, by its id, off grasps. How many had it."""
+    before, after = _change(
+        parts, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
+    )
+    return len(before.members) - len(after.members)
+
+
+def remove(parts: Parts, tag: str, *, permit: Permit) -> None:
+    """Take a tag away, by its id; the grasps stay."""
+    _change(parts, tag, lambda one: one.model_copy(update={"grasps": {}, "gone": True}), permit)
+
+
+def _change(
+    parts: Parts, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
+) -> tuple[Tag, Tag]:
+    """The tag before and after. Who writes has the index's turn, so that of two changes at once each sees the other."""
+    with parts.index.database.writing() as connection:
+        found = newest_version(parts.store, tag)
+        known = None if found is None or found.gone else found
+        if known is None and fresh is None:
+            raise NotFoundError(f"there is no tag {tag!r}")
+        permit(known)
+        before = known or fresh
+        assert before is not None
+        after = change(before).model_copy(update={"number": found.number + 1 if found else 1, "changed": timestamp()})
+        if known is None or after.members != before.members or after.gone:
+            put_version(parts.store, after)
+            parts.index.tags.put(after, within=connection)
+            drop_older(parts.store, after)
+    return before, after

@@ -1,0 +1,232 @@
+"""Tags: names for grasps, in the store and in the index; grasps chosen by an expression; what is taken home of them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from api.access.keys import KeyFile, Scope
+from api.app import create_app
+from service.index.rebuild import differences, rebuild
+from service.model import names
+from service.model.tags import MOST_TAGGED
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.readers.where import parse
+from service.store.manifests import ShardManifest
+from service.store.shards import Shard, read_shard
+from tests.api.factories import add_job, finish_all
+
+Grasps = list[dict[str, Any]]
+
+
+@pytest.fixture
+def made(parts: Parts) -> ShardManifest:
+    """A base shard of 32 grasps."""
+    return finish_all(parts, add_job(parts))[0]
+
+
+def named(shard: str, *rows: int) -> Grasps:
+    return [{"shard_id": shard, "row": row} for row in rows]
+
+
+def give(http: TestClient, name: str, **chosen: Any) -> dict[str, Any]:
+    answer = http.post("/v1/tags", json={"name": name, **chosen})
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def rows_of(http: TestClient, **query: Any) -> list[int]:
+    answer = http.get("/v1/grasps", params={"limit": 200, **query})
+    assert answer.status_code == 200, answer.text
+    return sorted(grasp["row"] for grasp in answer.json()["items"])
+
+
+def shard_of(parts: Parts, made: ShardManifest) -> Shard:
+    return read_shard(parts.store.get(made.key))
+
+
+def test_a_tag_is_given_listed_filtered_by_and_taken_off(http: TestClient, made: ShardManifest) -> None:
+    change = give(http, "good", grasps=named(made.shard_id, 3, 5, 8))
+    assert (change["changed"], change["tag"]["grasps"]) == (3, 3)
+    assert give(http, "good", grasps=named(made.shard_id, 8, 9))["changed"] == 1
+    assert rows_of(http, tag="good") == [3, 5, 8, 9]
+    off = http.post("/v1/tags/good/remove", json={"grasps": named(made.shard_id, 5, 6)}).json()
+    assert off["changed"] == 1
+    assert [(tag["name"], tag["grasps"]) for tag in http.get("/v1/tags").json()] == [("good", 3)]
+    assert rows_of(http, tag="good", sort="penetration_depth_mm", max_penetration_depth_mm=1e6) == [3, 8, 9]
+    assert http.delete("/v1/tags/good").status_code == 204
+    assert http.get("/v1/tags/good").status_code == http.get("/v1/grasps?tag=good").status_code == 404
+    assert rows_of(http) == list(range(32))
+
+
+def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest, parts: Parts) -> None:
+    give(http, "deep", filter={"where": "penetration_depth_mm > 0.8", "valid": True})
+    deep = shard_of(parts, made)["quality/penetration_depth_mm"] > 0.8
+    valid = shard_of(parts, made)["quality/valid"] == 1
+    assert rows_of(http, tag="deep") == np.flatnonzero(deep & valid).tolist()
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "epsilon > 0.25",
+        "not (epsilon > 0.25 or contact_area_cm2 <= 8) and valid",
+        "type = power or type = 'lateral' and not held",
+        "hand = allegro and object != mug",
+        "robust >= 0 or not robust < 1",
+        "lift or lift_hard or pushes or clearance_m > -1",
+    ],
+)
+def test_the_index_chooses_what_the_shards_choose(
+    http: TestClient, made: ShardManifest, parts: Parts, expression: str
+) -> None:
+    shard = shard_of(parts, made)
+    rows = np.flatnonzero(parse(expression)(shard.arrays, shard.attributes)).tolist()
+    assert rows_of(http, where=expression) == rows
+
+
+@pytest.mark.parametrize(
+    ("expression", "words"),
+    [
+        ("epsilon >", "ends where a value"),
+        ("__import__('os')", "there is no '__import__'"),
+        ("sound", "the shards do"),
+        ("simulated_displacement_cm > 1", "the shards do"),
+        ("valid and " * 120 + "valid", "1000"),
+    ],
+)
+def test_an_expression_that_cannot_be_used_is_said_in_a_line(http: TestClient, expression: str, words: str) -> None:
+    answer = http.get("/v1/grasps", params={"where": expression})
+    assert answer.status_code == 422
+    assert words in answer.json()["detail"] and "\n" not in answer.json()["detail"]
+
+
+def test_tags_survive_a_rebuild_and_are_what_the_store_says(
+    http: TestClient, made: ShardManifest, parts: Parts
+) -> None:
+    give(http, "good", grasps=named(made.shard_id, 1, 2, 3))
+    give(http, "gone", grasps=named(made.shard_id, 4))
+    http.post("/v1/tags/good/remove", json={"grasps": named(made.shard_id, 2)})
+    http.delete("/v1/tags/gone")
+    assert [line for line in differences(parts.index, parts.store) if line.startswith("tag")] == []
+    assert [entry.key.rpartition("/")[2] for entry in parts.store.list(names.TAGS)] == ["000002.json"]
+    rebuild(parts.index, parts.store)
+    assert rows_of(http, tag="good") == [1, 3]
+    assert [tag["name"] for tag in http.get("/v1/tags").json()] == ["good"]
+
+
+def test_a_tag_is_made_anew_after_its_end_even_if_that_broke_off(
+    http: TestClient, made: ShardManifest, parts: Parts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    give(http, "good", grasps=named(made.shard_id, 1))
+    monkeypatch.setattr("service.pipeline.tagging.drop_older", lambda *_: None)
+    http.delete("/v1/tags/good")
+    rebuild(parts.index, parts.store)
+    assert http.get("/v1/tags").json() == []
+    assert give(http, "good", grasps=named(made.shard_id, 7))["tag"]["grasps"] == 1
+    assert rows_of(http, tag="good") == [7]
+
+
+def test_what_is_not_there_or_too_much_gets_no_tag(
+    http: TestClient, made: ShardManifest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(status: int, **body: Any) -> str:
+        answer = http.post("/v1/tags", json={"name": "good", **body})
+        assert answer.status_code == status, answer.text
+        return str(answer.json()["detail"])
+
+    assert "no grasp 32" in refused(404, grasps=named(made.shard_id, 1, 32))
+    assert "one of both" in refused(422)
+    assert "no grasp passes" in refused(422, filter={"min_epsilon": 1000})
+    refused(422, name="no/name", grasps=named(made.shard_id, 1))
+    refused(422, name="x" * 65, grasps=named(made.shard_id, 1))
+    monkeypatch.setattr("service.pipeline.tagging.MOST_TAGGED", 3)
+    assert "at most 3" in refused(413, grasps=named(made.shard_id, 1, 2, 3, 4))
+    monkeypatch.setattr("api.catalog.grasps.MOST_TAGGED", 3)
+    assert "narrow it" in refused(413, filter={})
+    assert http.get("/v1/tags").json() == [] and MOST_TAGGED > 3
+    monkeypatch.setattr("api.catalog.tags.MOST_TAGS", 1)
+    give(http, "first", grasps=named(made.shard_id, 1))
+    assert "the most" in refused(413, grasps=named(made.shard_id, 1))
+
+
+def test_a_project_has_tags_of_its_own_and_a_key_changes_only_what_is_its(parts: Parts, made: ShardManifest) -> None:
+    keys = KeyFile(parts.settings.resolved_keys_file)
+    people = {
+        name: {"Authorization": f"Bearer {keys.add(name, scope, project=project)}"}
+        for name, scope, project in [
+            ("old", Scope.SUBMIT, ""), ("new", Scope.SUBMIT, ""), ("eve", Scope.READ, ""), ("root", Scope.ADMIN, ""),
+            ("bob", Scope.SUBMIT, "blue"),
+        ]
+    }  # fmt: skip
+    body = {"name": "good", "grasps": named(made.shard_id, 1)}
+    with TestClient(create_app(parts.settings, parts), base_url="https://graspd.example") as http:
+
+        def does(who: str, method: str, path: str, **content: Any) -> int:
+            return http.request(method, path, headers=people[who], **content).status_code
+
+        assert does("old", "POST", "/v1/tags", json=body) == 200
+        assert does("eve", "POST", "/v1/tags", json=body) == does("new", "POST", "/v1/tags", json=body) == 403
+        assert does("new", "POST", "/v1/tags/good/remove", json={"filter": {}}) == 403
+        assert does("new", "DELETE", "/v1/tags/good") == 403
+        # Of another project neither the grasp nor the tag is there.
+        assert does("bob", "POST", "/v1/tags", json=body) == does("bob", "GET", "/v1/tags/good") == 404
+        assert does("bob", "GET", "/v1/grasps?tag=good") == does("bob", "DELETE", "/v1/tags/good") == 404
+        assert does("eve", "GET", "/v1/grasps/export?tag=good&format=zip") == 200
+        assert does("root", "DELETE", "/v1/tags/good") == 204
+
+
+def test_a_tag_is_taken_home_as_rows_and_as_shards_of_its_grasps_alone(
+    http: TestClient, made: ShardManifest, parts: Parts
+) -> None:
+    give(http, "good", grasps=named(made.shard_id, 2, 30))
+    give(http, "best", grasps=named(made.shard_id, 2))
+    address = "/v1/grasps/export?tag=good&format="
+    rows = list(csv.DictReader(io.StringIO(http.get(address + "csv").text)))
+    assert [(row["shard_id"], row["row"], row["tags"]) for row in rows] == [
+        (made.shard_id, "2", "best good"),
+        (made.shard_id, "30", "good"),
+    ]
+    document = http.get(address + "json").json()
+    assert [item["tags"] for item in document["items"]] == [["best", "good"], ["good"]]
+    assert document["chosen"]["filter"]["tag"] == "good"
+    answer = http.get(address + "zip")
+    assert answer.headers["content-disposition"] == 'attachment; filename="grasps.zip"'
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as packed:
+        assert packed.namelist() == ["allegro/mug/base-00000.h5", "subset.json"]
+        part = read_shard(packed.read("allegro/mug/base-00000.h5"), kind="base")
+        assert json.loads(packed.read("subset.json"))["kept"] == 2
+    whole = shard_of(parts, made)
+    np.testing.assert_array_equal(part["grasp/hand_pose"], whole["grasp/hand_pose"][[2, 30]])
+    np.testing.assert_array_equal(part["quality/thresholds_m"], whole["quality/thresholds_m"])
+    assert http.get("/v1/grasps/export?tag=good&format=zip").content == answer.content
+
+
+def test_a_zip_of_nothing_of_too_much_or_of_a_damaged_shard_is_refused(
+    http: TestClient, made: ShardManifest, parts: Parts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = "/v1/grasps/export?format=zip"
+    assert http.get(address + "&min_epsilon=1000").status_code == 422
+    (parts.settings.data_dir / "store" / made.key).write_bytes(b"other bytes")
+    answer = http.get(address)
+    assert answer.status_code == 500 and made.key in answer.json()["detail"]
+    monkeypatch.setattr("api.catalog.grasp_exports.MOST_SHARDS", 0)
+    assert http.get(address).status_code == 413
+
+
+def test_grasps_of_a_dataset_are_those_of_its_cells(http: TestClient, made: ShardManifest, parts: Parts) -> None:
+    matrix = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
+    http.post("/v1/datasets", json=matrix)
+    while DatasetRounds(parts).advance(10):
+        pass
+    finish_all(parts, add_job(parts, seed=5))
+    assert rows_of(http, dataset="d") == list(range(32)) != rows_of(http)
+    assert http.get("/v1/grasps?dataset=none").status_code == 404
