@@ -255,7 +255,7 @@ STUDIES: Final = (
          "003_cracker_box,005_tomato_soup_can,011_banana,024_bowl,037_scissors,048_hammer,056_tennis_ball,"
          "077_rubiks_cube,koala,spot --scene table --faces all --views 2 --want raw -n 64 --yes --wait",
          "graspd datasets export tables-raw -o WORK/raw",
-         "sh examples/train_grasp_predictor/data.sh DATA/objects WORK",
+         "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
          f"{_TRAIN} --hand barrett --raw WORK/raw --ablations --sheet OUT/results/predictor-barrett.png",
          f"{_TRAIN} --hand allegro --sheet OUT/results/predictor-allegro.png"),
         stages=ALL, seeds=(0, 1, 2), needs=(SERVICE, TORCH),

@@ -1,5 +1,5 @@
-#!/bin/sh
-# Grasps of free objects to compare with: sh examples/train_grasp_predictor/data.sh OBJECTS OUT, OBJECTS a folder of
+#!/bin/bash
+# Grasps of free objects to compare with: bash examples/train_grasp_predictor/data.sh OBJECTS OUT, OBJECTS a folder of
 # OBJECT/clean.stl. Writes OUT/free and OUT/peer; what is there already is not made again.
 set -eu
 objects=$1 out=$2
