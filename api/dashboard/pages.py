@@ -12,6 +12,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from api.catalog import events
 from api.dashboard import (
     choice_forms,
+    comparison_pages,
     dataset_pages,
     forms,
     grasp_pages,
@@ -39,6 +40,7 @@ routers: Final = (
             grasp_pages,
             hand_pages,
             dataset_pages,
+            comparison_pages,
             usage_pages,
             forms,
             choice_forms,

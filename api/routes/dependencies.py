@@ -13,6 +13,7 @@ from api.access.keys import Scope
 from api.access.quotas import Quotas
 from api.access.unfinished import unfinished
 from api.catalog.assets import Assets
+from api.catalog.comparison import Comparisons
 from api.catalog.datasets import Datasets
 from api.catalog.grasp_exports import GraspExports
 from api.catalog.grasps import Grasps
@@ -45,6 +46,7 @@ def provide(app: FastAPI, parts: Parts) -> None:
     state.grasps, state.shards = Grasps(parts), Shards(parts)
     state.jobs = Jobs(parts, quotas, Idempotency(redis), state.grasps, state.shards)
     state.datasets, state.assets = Datasets(parts, quotas), Assets(parts)
+    state.comparisons = Comparisons(parts, state.datasets)
     state.overview, state.usage = Overview(parts, state.jobs), Usage(parts, state.keys)
     state.webhooks, state.tags = Webhooks(parts), Tags(parts, state.grasps)
     state.grasp_exports = GraspExports(parts, state.grasps, state.tags)
@@ -74,6 +76,7 @@ def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
 
 JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
 DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
+ComparisonsOf = Annotated[Comparisons, Depends(_provided("comparisons"))]
 AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
 GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
 ShardsOf = Annotated[Shards, Depends(_provided("shards"))]

@@ -101,13 +101,32 @@ class Statistics:
 
         The id of a shard is a digest, so those below a bound are a fair sample, and they lie side by side in the index.
         """
+        share, values = self._values(where, metrics, at_most)
+        found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
+        return Distributions(len(values), share, {metric: data for metric, data in found.items() if data is not None})
+
+    def side_by_side(
+        self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
+    ) -> dict[Metric, list[Distribution | None]]:
+        """Of each metric that some grasp has, one distribution for each filter, all in the same bins; None: there no
+        grasp has it. Grasps are drawn as `distributions` draws them."""
+        samples = [self._values(where, metrics, at_most)[1] for where in filters]
+        found: dict[Metric, list[Distribution | None]] = {}
+        for at, metric in enumerate(metrics):
+            columns = [values[:, at] for values in samples]
+            known = np.concatenate([column[np.isfinite(column)] for column in columns])
+            if known.size:
+                ends = (float(known.min()), float(known.max()))
+                found[metric] = [_distribution(column, bins, ends) for column in columns]
+        return found
+
+    def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> tuple[float, NDArray[np.float64]]:
+        """The share of shards that were looked at, and the metrics (N, M) of their grasps; nan: not measured."""
         with self.database.reading() as connection:
             share, tests = _sampled(connection, where, at_most)
             query = select(*(grasps.c[metric] for metric in metrics)).where(*tests)
             rows = [tuple(row) for row in connection.execute(query)]
-        values = np.array(rows, float).reshape(-1, len(metrics))
-        found = {metric: _distribution(values[:, at], bins) for at, metric in enumerate(metrics)}
-        return Distributions(len(values), share, {metric: data for metric, data in found.items() if data is not None})
+        return share, np.array(rows, float).reshape(-1, len(metrics))
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> Kinds:
         """Types and directions, from about `at_most` grasps as `distributions` draws them."""
@@ -149,10 +168,12 @@ def _size(connection: Connection, where: GraspFilter) -> int:
     return int(connection.scalar(query) or 0)
 
 
-def _distribution(values: NDArray[np.float64], bins: int) -> Distribution | None:
+def _distribution(
+    values: NDArray[np.float64], bins: int, ends: tuple[float, float] | None = None
+) -> Distribution | None:
     known = values[np.isfinite(values)]
     if not known.size:
         return None
-    low, high = float(known.min()), float(known.max())
+    low, high = ends or (float(known.min()), float(known.max()))
     counts, _ = np.histogram(known, bins, (low, high)) if high > low else ([known.size] + [0] * (bins - 1), None)
     return Distribution(known.size, float(known.mean()), low, high, [int(n) for n in counts])

@@ -1,0 +1,76 @@
+"""Two datasets side by side: settings that differ, cells, distributions in the same bins."""
+
+from __future__ import annotations
+
+import pytest
+from starlette.testclient import TestClient
+
+from api.catalog.comparison import Comparisons, Pair
+from api.catalog.datasets import Datasets
+from service.index.filters import GraspFilter
+from service.pipeline.backends import Parts
+from service.pipeline.datasets import actions
+from service.pipeline.datasets.rounds import DatasetRounds
+from service.pipeline.datasets.spec import DatasetRequest
+from tests.api.factories import add_job, finish_all
+
+
+def _two(parts: Parts) -> None:
+    """`rough` is done, one cell of draft grasps; `fine` has another object besides and no grasp yet."""
+    rough = {"name": "rough", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "fidelity": "draft"}
+    fine = {"name": "fine", "hands": ["allegro"], "objects": ["mug", "block"], "grasps": 32}
+    for given in (rough, fine):
+        actions.create(parts, DatasetRequest.model_validate(given))
+    DatasetRounds(parts).advance()
+    finish_all(parts, add_job(parts, fidelity="draft"))
+
+
+def test_the_page_shows_what_differs_and_every_cell(http: TestClient, parts: Parts) -> None:
+    _two(parts)
+    page = " ".join(http.get("/compare", params={"one": "rough", "other": "fine"}).text.split())
+    assert "Fidelity</th><td" in page and ">draft</td>" in page and ">standard</td>" in page
+    assert "Objects of its own</th>" in page and ">block</td>" in page
+    assert page.count("<td>allegro</td>") == 2
+    assert page.count('<figure class="card histo twin">') > 3
+    assert "They ask for the same" not in page
+
+
+def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, parts: Parts) -> None:
+    _two(parts)
+    page = http.get("/compare", params={"one": "rough", "other": "rough"}).text
+    assert "They ask for the same" in page
+    assert "+0 points" in page
+
+
+def test_without_a_choice_the_page_offers_datasets(http: TestClient, parts: Parts) -> None:
+    _two(parts)
+    page = http.get("/compare").text
+    assert page.count("<option>rough</option>") == page.count("<option>fine</option>") == 2
+    assert "/compare?one=rough&amp;other=fine" in http.get("/datasets").text
+
+
+def test_a_dataset_that_is_not_there_is_not_found(http: TestClient, parts: Parts) -> None:
+    _two(parts)
+    assert http.get("/compare", params={"one": "rough", "other": "gone"}).status_code == 404
+
+
+def test_distributions_of_two_share_their_bins_and_count_all(parts: Parts) -> None:
+    _two(parts)
+    filters = [GraspFilter(dataset="rough", valid=valid) for valid in (True, False)]
+    one, other = parts.index.statistics.side_by_side(filters, ["epsilon"], bins=7)["epsilon"]
+    assert one is not None and other is not None
+    assert (one.low, one.high) == (other.low, other.high)
+    both = parts.index.statistics.distributions(GraspFilter(dataset="rough"), ["epsilon"], bins=7).metrics["epsilon"]
+    assert (one.low, one.high) == (both.low, both.high)
+    assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts
+
+
+def test_a_cell_that_only_one_has_makes_no_difference() -> None:
+    assert Pair("hand", "object", None, None).gain is None
+
+
+def test_more_cells_than_anybody_reads_are_left_out(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    _two(parts)
+    monkeypatch.setattr("api.catalog.comparison.MOST_CELLS", 1)
+    datasets = Datasets(parts, None)  # type: ignore[arg-type]
+    assert Comparisons(parts, datasets).of("rough", "fine").pairs == []
