@@ -96,10 +96,10 @@ def way_in(hands: Proposals) -> Floats:
     return poses
 
 
-def table(tips_m: float | None = 0.0) -> Surroundings:
+def table() -> Surroundings:
     """What the robot knows to stand around: a table whose top is z = 0, which fingertips may touch."""
     top = Obstacle.half_space([0.0, 0.0, 1.0], 0.0)
-    return Surroundings((Obstacle(top.planes, top.corners, tips_m=tips_m),), UP)
+    return Surroundings((Obstacle(top.planes, top.corners, tips_m=0.0),), UP)
 
 
 def _room(hand: HandModel, hands: Proposals, opened: Floats) -> Floats:
