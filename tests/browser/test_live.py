@@ -46,6 +46,7 @@ def places(parts: Parts) -> list[str]:
     publish(parts.store, "stability", a_record())
     return [
         "/", "/datasets", "/datasets/kitchen", "/datasets/kitchen?state=queued", f"/jobs/{record.id}",
+        "/compare?one=kitchen&other=kitchen",
         f"/jobs/{waiting.id}", "/grasps", "/grasps?view=table", "/grasps?min_epsilon=99", f"/grasps/{shard}/0",
         "/hands", "/hands/shadow", "/workers", "/chart", "/stability", "/submit", "/problems", "/login",
     ]  # fmt: skip

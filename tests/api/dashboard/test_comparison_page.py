@@ -74,3 +74,8 @@ def test_more_cells_than_anybody_reads_are_left_out(parts: Parts, monkeypatch: p
     monkeypatch.setattr("api.catalog.comparison.MOST_CELLS", 1)
     datasets = Datasets(parts, None)  # type: ignore[arg-type]
     assert Comparisons(parts, datasets).of("rough", "fine").pairs == []
+
+
+def test_datasets_without_a_grasp_say_so(http: TestClient, parts: Parts) -> None:
+    actions.create(parts, DatasetRequest.model_validate({"name": "k", "hands": ["allegro"], "objects": ["mug"]}))
+    assert "No grasp yet" in http.get("/compare", params={"one": "k", "other": "k"}).text
