@@ -55,30 +55,34 @@ def filtered(
     rng = np.random.default_rng(seed)
     order = np.array([rng.permutation(len(free)) for _ in scenes])
     standing = [order[s][_stands(free, order[s], pose, hand)] for s, pose in enumerate(object_pose)]
-    kept: list[list[int]] = [[] for _ in scenes]
+    kept = np.zeros(len(scenes), int)
     parts: list[GraspSet] = []
     owner: list[int] = []
     missing = int(wanted.sum())
     for most in (wanted, np.full(len(scenes), missing)):
         for s, pose in enumerate(object_pose):
-            while standing[s].size and len(kept[s]) < most[s] and missing:
+            while standing[s].size and kept[s] < most[s] and missing:
                 now, standing[s] = standing[s][:_TOGETHER], standing[s][_TOGETHER:]
                 grasps = _on_their_way(hand, obj, free.take(now), pose)
-                grasps = grasps.take(slice(0, min(missing, int(most[s]) - len(kept[s]))))
+                grasps = grasps.take(slice(0, min(missing, int(most[s] - kept[s]))))
                 if len(grasps):
                     parts.append(grasps)
                     owner += [s] * len(grasps)
-                    kept[s] += range(len(grasps))
+                    kept[s] += len(grasps)
                     missing -= len(grasps)
     if not parts:
         return nothing(hand)
-    rows = rows_of(joined(parts), object_pose[owner])
-    return Taught([scenes[s] for s in owner], rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.ones(len(rows)))
+    return _to_be_proposed([scenes[s] for s in owner], rows_of(joined(parts), object_pose[owner]))
 
 
 def nothing(hand: HandModel) -> Taught:
     """No grasp."""
-    return Taught([], np.zeros((0, 12 + 3 * len(hand.joint_names))), np.ones(0), np.zeros(0, bool), np.ones(0))
+    return _to_be_proposed([], np.zeros((0, 12 + 3 * len(hand.joint_names))))
+
+
+def _to_be_proposed(scenes: Sequence[Scene], rows: Floats) -> Taught:
+    """Grasps that nobody lifted, which all count alike."""
+    return Taught(scenes, rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.ones(len(rows)))
 
 
 def _stands(free: GraspSet, order: NDArray[np.intp], pose: Floats, hand: HandModel) -> NDArray[np.bool_]:
