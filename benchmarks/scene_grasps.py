@@ -39,7 +39,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.referee.lifting import judge_lifts
 from worker.scenes.clearance import MARGIN_M
 from worker.scenes.kinds import rest_poses, supports_of
-from worker.scenes.trial import lift_trial
+from worker.scenes.trial import trial_on
 from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed, Scenes
 
@@ -76,13 +76,13 @@ def study(
     count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
     wanted, run = Wanted(count, FIDELITY, seed), Run(threads=1)
-    trial = lift_trial(hand, obj, lambda: pieces)
+    lifts, pushes = (trial_on(run, hand, obj, lambda: pieces, in_scenes=where) for where in (True, False))
     # What a pair is made ready with once is none of a grasp's cost, on either side.
-    for where in (placed.take(slice(0, 1)), None):
+    for where, trial in ((placed.take(slice(0, 1)), lifts), (None, pushes)):
         synthesize(hand, obj, Wanted(1, FIDELITY, SEED, placed=where, trial=trial), run)
-    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, trial=trial), run))
+    planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, trial=lifts), run))
     many = max(count, filtered)
-    free, free_seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, count=many), run))
+    free, free_seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, count=many, trial=pushes), run))
     free_seconds *= count / many
     found = _judged(hand, obj, planned, placed, pieces)
     scenes = Scenes(supports_of(spec), poses).placed(np.arange(many) % len(poses))
