@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -15,6 +15,9 @@ import typer
 
 from examples.train_grasp_predictor import sources
 from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, Proposer, Row, examined
+from examples.train_grasp_predictor.evaluator import learned
+from examples.train_grasp_predictor.practice import practised
+from examples.train_grasp_predictor.refinement import Refined, joined
 from examples.train_grasp_predictor.samples import Sight, Taught, sights
 from examples.train_grasp_predictor.sheet import page
 from examples.train_grasp_predictor.table import markdown
@@ -25,14 +28,22 @@ from worker.engines import backend
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
-from worker.planners.learned.network import ProposalNetwork, propose, save
+from worker.planners.learned.network import ProposalNetwork, Proposals, propose, save
 
 FREE, PEER = "free, filtered", "graspit, filtered"
 ACROSS, NEAREST = "no network: across", "no network: nearest"
+#: What becomes of the first row without its parts, and of the controls with its evaluator.
+ALONE, UNMOVED = "proposals alone", "chosen, not moved"
+JUDGED: Final = {ACROSS: "across, chosen and moved", NEAREST: "nearest, chosen and moved"}
+EXTRAS: Final = (ALONE, UNMOVED, *JUDGED.values())
 #: Pictures of each unseen object, and of each unseen face.
 PICTURES: Final = (16, 4)
-#: Of the noise from which grasps are proposed: of 1, 0.3 and 0.1 what lifted most of the unseen faces.
+#: Of the noise from which grasps are proposed, where nothing chooses among them: of 1, 0.3 and 0.1 what lifted most of
+#: the unseen faces; and where an evaluator does, for each half.
 SPREAD: Final = 0.3
+SPREADS: Final = (0.3, 1.0)
+#: Training steps of an evaluator.
+JUDGE_STEPS: Final = 1500
 #: Noise of the depth camera that all are shown.
 NOISE: Final = "stereo"
 
@@ -138,12 +149,13 @@ def main(
     drawn: dict[str, dict[str, Any]] = {}
     exams = study.exams()
     wanted = study.makers() | (study.ablations() if ablations else {})
-    for source, seed, facts, proposer in _proposers(study, wanted, rows, seeds=seeds, steps=steps, network=network):
-        for exam, row, ready, lifted in examined(
-            model, exams, proposer, seed=seed, epsilon=source not in study.ablations()
-        ):
+    shown = {*study.makers(), ACROSS, NEAREST}
+    for source, seed, facts, proposer in _proposers(
+        study, wanted, rows, seeds=seeds, steps=steps, network=network, ablations=ablations
+    ):
+        for exam, row, ready, lifted in examined(model, exams, proposer, seed=seed, epsilon=source in shown):
             rows.append({"hand": model.name, "source": source, "seed": seed, **facts, **row})
-            if seed == 0 and exam.kind == OBJECT:
+            if seed == 0 and exam.kind == OBJECT and source in shown:
                 drawn.setdefault(exam.object, {})[source] = (exam, ready, lifted)
         output.write_text(json.dumps(rows, indent=1) + "\n")
         typer.echo(_line(source, seed, facts, rows))
@@ -154,45 +166,63 @@ def main(
 
 def _proposers(
     study: Study, wanted: Mapping[str, Callable[[str], Taught]], rows: Sequence[Row], *, seeds: int, steps: int,
-    network: Path | None,
+    network: Path | None, ablations: bool,
 ) -> Iterator[tuple[str, int, Row, Proposer]]:  # fmt: skip
     """Each source and seed that `rows` do not have: what is known of it, and what proposes."""
     done = {(row["hand"], row["source"], row["seed"]) for row in rows}
+    main = study.makers()
     for source, make in wanted.items():
-        if all((study.hand.name, source, seed) in done for seed in range(seeds)):
+        parts = [source, *(EXTRAS if ablations and source == sources.SCENES else ())]
+        missing = [s for s in range(seeds) if any((study.hand.name, part, s) not in done for part in parts)]
+        if not missing:
             continue
         given = [make(obj) for obj in study.objects]
-        lessons = Lessons.of(study.pictures_for(source), given)
+        lessons, tries = Lessons.of(study.pictures_for(source), given), None
         facts: Row = {"grasps": sum(map(len, given)), "views": len(lessons)}
-        for seed in range(seeds):
-            if (study.hand.name, source, seed) in done:
-                continue
+        for seed in missing:
             trained = train(lessons, steps=steps, seed=seed)
             made = _as_file(study.hand, trained, source)
             if network is not None and source == sources.SCENES and seed == 0:
                 save(made, network)
-            yield source, seed, facts | {"loss": trained.loss}, _by(made)
+            told = facts | {"loss": trained.loss}
+            if source not in main:
+                yield source, seed, told, _by(made, (SPREAD,))
+                continue
+            by = _by(made, SPREADS)
+            tries = tries or practised(study.hand, study.models, given, study.seen, by, seed=seed)
+            refined = Refined(study.hand, learned(study.hand, tries, steps=JUDGE_STEPS, seed=seed), by)
+            told |= {"tries": len(tries)}
+            whole: dict[str, Proposer] = {source: refined, ALONE: _by(made, (SPREAD,))}
+            whole |= {UNMOVED: replace(refined, rounds=())}
+            whole |= {JUDGED[name]: replace(refined, source=other) for name, other in _without(study, given).items()}
+            for name in parts:
+                if (study.hand.name, name, seed) not in done:
+                    yield name, seed, told, whole[name]
         if source == sources.SCENES:
-            yield from _without(study, given, done, seeds)
+            for name, proposer in _without(study, given).items():
+                for seed in range(seeds):
+                    if (study.hand.name, name, seed) not in done:
+                        yield name, seed, {"grasps": facts["grasps"] if name == NEAREST else 0}, proposer
 
 
-def _without(study: Study, given: Sequence[Taught], done: set[tuple[str, str, int]], seeds: int) -> Iterator[Any]:
-    nearest, rows = Nearest(study.seen, given), sum(map(len, given))
-    for seed in range(seeds):
-        if (study.hand.name, NEAREST, seed) not in done:
-            yield NEAREST, seed, {"grasps": rows}, lambda sight, n, rng: nearest.propose(sight, n, rng)
-        if (study.hand.name, ACROSS, seed) not in done:
-            yield (
-                ACROSS, seed, {"grasps": 0},
-                lambda sight, n, rng: across(study.hand, sight, n, squeeze=SQUEEZE, rng=rng),
-            )  # fmt: skip
+def _without(study: Study, given: Sequence[Taught]) -> dict[str, Proposer]:
+    nearest = Nearest(study.seen, given)
+    return {
+        NEAREST: nearest.propose,
+        ACROSS: lambda sight, n, rng: across(study.hand, sight, n, squeeze=SQUEEZE, rng=rng),
+    }
 
 
-def _by(made: ProposalNetwork) -> Proposer:
-    def proposer(sight: Sight, count: int, rng: np.random.Generator) -> Any:
+def _by(made: ProposalNetwork, spreads: Sequence[float]) -> Proposer:
+    """Proposals of a network, as many from noise of each of the spreads."""
+
+    def proposer(sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
         shown = slice(0, SHOWN)
         points, normals = sight.points[shown], sight.normals[shown]
-        return propose(made, points, normals, table_height=0.0, count=count, rng=rng, spread=SPREAD)
+        each = count // len(spreads)
+        return joined(*(
+            propose(made, points, normals, table_height=0.0, count=each, rng=rng, spread=spread) for spread in spreads
+        ))  # fmt: skip
 
     return proposer
 

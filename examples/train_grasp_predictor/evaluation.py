@@ -18,9 +18,8 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.lift import LiftOutcome
 
 Row = dict[str, Any]
-#: From a picture, a number and a generator to so many proposals, the best first.
+#: From a picture, a number and a generator to so many proposals, the best first where there is one.
 Proposer = Callable[[Sight, int, np.random.Generator], Proposals]
-
 #: Proposals for a picture, of which those that are clear go first, and how many of them are carried out.
 PROPOSED: Final = 8
 TAKEN: Final = 2

@@ -1,8 +1,8 @@
 """From proposals to lifts: what a robot does that knows its hand, the table and what its camera saw, and nothing else.
 
-A proposal is carried out open loop: from a standoff along its way in, fingers opened wider than it says, then to its
-grasp and its squeeze, then up. Only what the table forbids is mended before: a hand that would stand in it is raised.
-The mesh of the object is the simulator's alone.
+A proposal is carried out open loop: from a standoff along its way in, fingers opened wider than it says where the table
+has room for that, then to its grasp and its squeeze, then up. Only what the table forbids is mended before: a hand that
+would stand in it is raised. The mesh of the object is the simulator's alone.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.lift import LiftOutcome
 from worker.quality.referee.lifting import judge_lifts
 from worker.quality.table import measure
-from worker.simulation.obstacles import MARGIN_M, obstacle_room
-from worker.simulation.surroundings import RISE_M, STANDOFF_M, UP, Obstacle, Placed, Surroundings
+from worker.simulation.obstacles import obstacle_room
+from worker.simulation.surroundings import CLEAR_M, RISE_M, STANDOFF_M, UP, Obstacle, Placed, Surroundings
 
-#: Fingers open by this share of their range beyond the proposed pregrasp.
-OPENED: Final = 0.15
+#: Fingers open by the first of these shares of their range, beyond the proposed pregrasp, for which there is room.
+OPENED: Final = (0.15, 0.1, 0.05, 0.0)
 #: Most by which a hand is raised out of the table [m].
 MOST_RAISED_M: Final = 0.05
 #: Postures of the way in.
@@ -50,29 +50,48 @@ class Ready:
     opened: Floats
     """(N, J) joints of the hand that comes."""
     table: NDArray[np.bool_]
-    """(N,) whether the proposal as it was would have met the table."""
+    """(N,) whether the hand as it was proposed would have stood in the table at its grasp."""
     clear: NDArray[np.bool_]
-    """(N,) whether the way is clear of the table, and of the points that the camera saw."""
+    """(N,) whether grasp and way are clear of the table, and the way of the points that the camera saw."""
 
 
 def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
-    """Proposals for one picture, opened and raised out of the table."""
-    opened = wider(hand, proposed.pregrasp)
-    lacks = np.maximum(0.0, MARGIN_M - _room(hand, proposed, opened))
-    pose = proposed.hand_pose.copy()
-    pose[:, 2] += np.minimum(lacks, MOST_RAISED_M)
-    hands = replace(proposed, hand_pose=pose)
-    clear = (_room(hand, hands, opened) >= 0.5 * MARGIN_M) & (_gap(hand, hands, opened, sight) >= SEEN_M)
-    return Ready(hands, opened, lacks > MARGIN_M, clear)
+    """Proposals for one picture, opened, and raised out of the table by no more than they stand in it.
+
+    How far the hand is to squeeze is no place where it will stand: the object is between.
+    """
+    at_grasp = obstacle_room(hand, Posture(proposed.hand_pose, proposed.joints), [table()])
+    first = _raised(proposed, CLEAR_M - at_grasp)
+    opened, room = wider(hand, proposed.pregrasp, OPENED[0]), np.full(len(proposed), -np.inf)
+    for share in OPENED:
+        tight = np.flatnonzero(room < CLEAR_M)
+        if len(tight):
+            opened[tight] = wider(hand, proposed.pregrasp[tight], share)
+            room[tight] = _room_on_the_way(hand, part_of(first, tight), opened[tight])
+    hands = _raised(first, CLEAR_M - room)
+    lowest = np.minimum(obstacle_room(hand, Posture(hands.hand_pose, hands.joints), [table()]),
+                        _room_on_the_way(hand, hands, opened))  # fmt: skip
+    clear = (lowest >= 0.5 * CLEAR_M) & (_gap(hand, hands, opened, sight) >= SEEN_M)
+    return Ready(hands, opened, at_grasp < 0.0, clear)
+
+
+def _raised(hands: Proposals, by: Floats) -> Proposals:
+    pose = hands.hand_pose.copy()
+    pose[:, 2] += np.clip(by, 0.0, MOST_RAISED_M)
+    return replace(hands, hand_pose=pose)
+
+
+def part_of(hands: Proposals, which: NDArray[np.intp]) -> Proposals:
+    """Some of the proposals."""
+    return Proposals(*(np.asarray(part)[which] for part in vars(hands).values()))
 
 
 def taken(ready: Ready, which: NDArray[np.intp]) -> Ready:
     """Some of the proposals."""
-    hands = Proposals(*(np.asarray(part)[which] for part in vars(ready.hands).values()))
-    return Ready(hands, ready.opened[which], ready.table[which], ready.clear[which])
+    return Ready(part_of(ready.hands, which), ready.opened[which], ready.table[which], ready.clear[which])
 
 
-def wider(hand: HandModel, joints: Floats, share: float = OPENED) -> Floats:
+def wider(hand: HandModel, joints: Floats, share: float) -> Floats:
     """(N, J) joints, closing ones opened by a share of their range."""
     q = hand.reduce(joints)
     return np.asarray(hand.expand(np.clip(q - share * hand.closing * hand.span, hand.lower, hand.upper)))
@@ -102,15 +121,12 @@ def table() -> Surroundings:
     return Surroundings((Obstacle(top.planes, top.corners, tips_m=0.0),), UP)
 
 
-def _room(hand: HandModel, hands: Proposals, opened: Floats) -> Floats:
-    """(N,) least distance from the table at the grasp, the squeeze and on the way [m]; fingertips may touch."""
+def _room_on_the_way(hand: HandModel, hands: Proposals, opened: Floats) -> Floats:
+    """(N,) least distance of the coming hand from the table [m]; fingertips may touch."""
     path = way_in(hands)
     n, steps = path.shape[:2]
-    at_grasp = [Posture(hands.hand_pose, joints) for joints in (hands.joints, hands.squeeze, opened)]
     coming = Posture(path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
-    rooms = [obstacle_room(hand, posture, [table()]) for posture in at_grasp]
-    rooms.append(obstacle_room(hand, coming, [table()]).reshape(n, steps).min(axis=1))
-    return np.asarray(np.min(rooms, axis=0))
+    return np.asarray(obstacle_room(hand, coming, [table()]).reshape(n, steps).min(axis=1))
 
 
 def _gap(hand: HandModel, hands: Proposals, opened: Floats, sight: Sight) -> Floats:

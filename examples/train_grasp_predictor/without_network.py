@@ -21,6 +21,8 @@ DRAWS: Final = 8
 LEANS: Final = np.deg2rad(20.0)
 #: By how much closing joints press beyond contact [rad]: of 0.1, 0.2 and 0.4 what lifts most of objects trained on.
 SQUEEZE: Final = 0.1
+#: Share of their range by which fingers are open before they close.
+_OPEN: Final = 0.15
 #: Share of points beyond which an extent does not count them: a depth camera's edges bleed.
 _OUTSIDE: Final = 0.02
 #: How far below the top of what is seen pads take hold at most [m].
@@ -56,7 +58,7 @@ def across(hand: HandModel, sight: Sight, count: int, *, squeeze: float, rng: np
     pose = np.concatenate([middle - quat_rotate(rotation, known.middle[posture]), rotation], axis=1)
     grasp = hand.expand(known.q[posture])
     return Proposals(
-        pose, quat_rotate(rotation, hand.palm.approach), grasp, wider(hand, grasp), tighter(hand, grasp, squeeze)
+        pose, quat_rotate(rotation, hand.palm.approach), grasp, wider(hand, grasp, _OPEN), tighter(hand, grasp, squeeze)
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,30 @@ def test_a_hand_that_would_stand_in_the_table_is_raised_out_of_it(hand: HandMode
     assert ready.table.all()
     lowest = execution.hand_points(hand, ready.hands.hand_pose, ready.hands.joints)[..., 2].min()
     assert lowest > -1e-3  # fingertips may touch the table; points of the surface are known to less than that
+
+
+def test_fingers_open_as_wide_as_the_table_has_room_for(hand: HandModel) -> None:
+    sight = block_of((0.06, 0.06, 0.12))
+    given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))
+    lying = quat_from_axis_angle(np.array([0, 1.0, 0]), np.array(np.pi / 2))
+
+    def beside_the_table(height: float) -> execution.Ready:
+        """The hand on its side, its fingers open up and down, so far above the table."""
+        pose = np.array([[0.0, 0.0, height, *lying]])
+        return execution.made_ready(hand, replace(given, hand_pose=pose, approach=np.array([[1.0, 0, 0]])), sight)
+
+    high, low = beside_the_table(0.5), beside_the_table(0.0)
+    np.testing.assert_array_equal(high.opened, execution.wider(hand, given.pregrasp, execution.OPENED[0]))
+    np.testing.assert_array_equal(low.opened, execution.wider(hand, given.pregrasp, execution.OPENED[-1]))
+    np.testing.assert_array_equal(high.hands.hand_pose[:, 2], 0.5)
+
+
+def test_where_a_hand_is_to_squeeze_raises_it_by_nothing(hand: HandModel) -> None:
+    sight = block_of((0.06, 0.06, 0.12))
+    given = across(hand, sight, 2, squeeze=SQUEEZE, rng=np.random.default_rng(0))
+    tight = replace(given, squeeze=execution.tighter(hand, given.joints, 2.0))
+    gentle, firm = (execution.made_ready(hand, one, sight).hands.hand_pose for one in (given, tight))
+    np.testing.assert_array_equal(gentle, firm)
 
 
 @pytest.mark.slow

@@ -1,0 +1,92 @@
+"""Of what a network proposes for a picture, the hands that an evaluator believes in, moved until it believes more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from examples.train_grasp_predictor.evaluation import Proposer
+from examples.train_grasp_predictor.evaluator import Evaluator, scores
+from examples.train_grasp_predictor.execution import made_ready, part_of
+from examples.train_grasp_predictor.samples import Floats, Sight
+from service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
+from worker.hands.model import HandModel
+from worker.planners.learned.network import Proposals
+
+#: Moves of size 1, standard deviations: of the place [m], the attitude [rad] and the joints [rad or m], each by itself
+#: and all closing ones together.
+PLACE_M, TURN, JOINT, CLOSING = 0.008, 0.1, 0.05, 0.05
+#: Sizes of the moves, round by round; the hands that go on from each, and the moves of each of these.
+ROUNDS: Final = (1.0, 0.7, 0.5, 0.4)
+KEPT, MOVES = 12, 4
+#: What is not clear of the table and of what was seen counts so much less [logit].
+_BLOCKED: Final = 4.0
+#: Hands whose places are no farther apart are the same proposal [m].
+APART_M: Final = 0.01
+
+#: Proposals that a picture begins with.
+BEGUN: Final = 32
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A `Proposer` of what an evaluator has chosen."""
+
+    hand: HandModel
+    evaluator: Evaluator
+    source: Proposer
+    rounds: tuple[float, ...] = ROUNDS
+
+    def __call__(self, sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
+        """(count,) hands, the best first."""
+        hands, values = self._scored(self.source(sight, BEGUN, rng), sight)
+        for size in self.rounds:
+            best = np.argsort(-values, kind="stable")[:KEPT]
+            hands, values = part_of(hands, best), values[best]
+            parents = part_of(hands, np.repeat(np.arange(len(best)), MOVES))
+            changed, worth = self._scored(moved(self.hand, parents, size, rng), sight)
+            hands, values = joined(hands, changed), np.concatenate([values, worth])
+        return part_of(hands, _apart(hands, np.argsort(-values, kind="stable"), count))
+
+    def _scored(self, hands: Proposals, sight: Sight) -> tuple[Proposals, Floats]:
+        """Hands as they would be carried out, and what they are worth."""
+        ready = made_ready(self.hand, hands, sight)
+        return ready.hands, scores(self.evaluator, self.hand, sight, ready.hands) - _BLOCKED * ~ready.clear
+
+
+def moved(hand: HandModel, hands: Proposals, size: ArrayLike, rng: np.random.Generator) -> Proposals:
+    """Hands (N,), each moved at random a little; `size` () or (N,)."""
+    n = len(hands)
+    by = np.broadcast_to(size, (n,))[:, None]
+    turn = TURN * by * rng.standard_normal((n, 3))
+    angle = np.linalg.norm(turn, axis=1)
+    rotation = quat_from_axis_angle(turn / np.maximum(angle, 1e-12)[:, None], angle)
+    pose = hands.hand_pose.copy()
+    pose[:, :3] += PLACE_M * by * rng.standard_normal((n, 3))
+    pose[:, 3:] = quat_multiply(rotation, pose[:, 3:])
+    own = JOINT * by * rng.standard_normal(hands.joints.shape)
+    closing = CLOSING * by * rng.standard_normal((n, 1)) * hand.closing
+    joints = (
+        np.asarray(hand.expand(np.clip(hand.reduce(part + own) + closing, hand.lower, hand.upper)))
+        for part in (hands.joints, hands.pregrasp, hands.squeeze)
+    )
+    return Proposals(pose, quat_rotate(rotation, hands.approach), *joints)
+
+
+def joined(*parts: Proposals) -> Proposals:
+    """Proposals one after another."""
+    return Proposals(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def _apart(hands: Proposals, order: np.ndarray, count: int) -> np.ndarray:
+    """The first of an order that lie apart, then, where these are too few, the others."""
+    chosen: list[int] = []
+    for index in order:
+        gaps = np.linalg.norm(hands.hand_pose[chosen, :3] - hands.hand_pose[index, :3], axis=1)
+        if len(chosen) < count and (gaps > APART_M).all():
+            chosen.append(int(index))
+    others = [int(index) for index in order if index not in chosen]
+    return np.array((chosen + others)[:count], np.intp)
