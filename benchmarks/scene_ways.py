@@ -2,8 +2,8 @@
 
     python -m benchmarks.scene_ways [--count 24] [--json]
 
-A hand comes straight over 10 cm. The last column counts grasps for which that alone is not free: what an approach that
-bends could save at most.
+Prints Markdown. A hand comes straight over 10 cm. The last column counts grasps for which that alone is not free: what
+an approach that bends could save at most.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ PLACES: Final = (
 )
 SCENES: Final = 4
 SEEDS: Final = (11, 3)  # of the scenes, of the grasps
+COUNTS: Final = ("grasps", "clear", "contact", "closing", "lift", "coming")
+COLUMNS: Final = ("hand", "object", "scene", "beside", *COUNTS)
+ABOUT: Final = """Raw `draft` grasps of the built-in hands. *Beside*: neighbours in the scene. *Clear*: 2 mm from
+everything all the way. The others come too near to something at contact, while they close, in their lift, or only as
+they come in, straight over 10 cm: what an approach that bends could save at most."""
 
 
 def blocked(way: Way) -> dict[str, int]:
@@ -66,9 +71,16 @@ def run(count: int) -> list[dict[str, Any]]:
             way = plan_way(hand, things[target], synthesize(hand, things[target], wanted), placed)
             told = {"hand": name, "object": target, "scene": kind, "beside": len(beside), "grasps": count}
             rows.append(told | blocked(way))
-            sys.stdout.write(" ".join(f"{key}={value}" for key, value in rows[-1].items()) + "\n")
-            sys.stdout.flush()
+            sys.stderr.write(f"{name}: {target}, {kind}\n")
     return rows
+
+
+def page(rows: list[dict[str, Any]], total: dict[str, int]) -> str:
+    """What the counts mean, and a table of the rows with their sums below."""
+    lines = [COLUMNS, ["---"] * 3 + ["--:"] * (len(COLUMNS) - 3)]
+    lines += [[str(row[name]) for name in COLUMNS] for row in rows]
+    lines += [["**all**", "", "", "", *(f"**{count}**" for count in total.values())]]
+    return ABOUT + "\n\n" + "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def main() -> None:
@@ -77,8 +89,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     rows = run(given.count)
-    total = {key: sum(row[key] for row in rows) for key in ("grasps", "clear", "contact", "closing", "lift", "coming")}
-    sys.stdout.write((json.dumps({"rows": rows, "total": total}) if given.json else f"all: {total}") + "\n")
+    total = {key: sum(row[key] for row in rows) for key in COUNTS}
+    sys.stdout.write((json.dumps({"rows": rows, "total": total}) if given.json else page(rows, total)) + "\n")
 
 
 if __name__ == "__main__":

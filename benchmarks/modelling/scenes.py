@@ -172,5 +172,8 @@ def slabs(tables: list[OnTable]) -> Row:
 def study(subjects: list[Subject], count: int) -> dict[str, Any]:
     """Everything about scenes, of `count` grasps of each object."""
     tables = [OnTable(replace(subject, count=count)) for subject in subjects]
+    for one in tables:
+        # Grasps, ways and pieces are there before a clock starts.
+        assert len(one.clear[0]) and len(one.subject.pieces)
     rows = judged(tables)
     return {"variants": rows, "straight_only": straight(tables), "slab": slabs(tables)}
