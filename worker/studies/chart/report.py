@@ -80,7 +80,7 @@ def _head(chart: Row) -> str:
         f"Objects: {objects}. Warm, repeats in turn.{' ' + chart['remark'] if chart.get('remark') else ''}\n\n"
         f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['referee']['level']}*) and is sound\n"
         "- speeds are end to end, as a job works: planned, judged, and measured where it holds; *planner's*: grasps "
-        "that hold over the seconds of planner and postures alone\n"
+        "that hold over the seconds of planner and postures alone; on a CPU a second is one of one core\n"
         "- *letter*: holds by the letter of the protocol; *hard*: at half the friction; *robust*: share of "
         f"{chart['models']} models around the nominal one in which a grasp that holds does, on average\n"
         f"- ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
@@ -189,7 +189,7 @@ def _sweep_head(sweeps: Sequence[Row]) -> str:
     first = sweeps[0]
     return (
         f"{first['hand']} on {first['object']}, {first['grasps']} grasps a value, standard with one knob turned; "
-        "speed is against the default, by processor seconds on a CPU."
+        "speed is against the default."
     )
 
 
@@ -201,12 +201,12 @@ def _mean(values: Sequence[float | None]) -> float:
 def sweeps_table(sweeps: Sequence[Row]) -> str:
     """A row per value of each knob: gain in speed and price in accuracy against the default's row."""
     lines = [
-        "| knob | value | processor s/grasp | speed | GSR | ε | penetration mm |",
+        "| knob | value | s/grasp | speed | GSR | ε | penetration mm |",
         "| --- | --- | --: | --: | --: | --: | --: |",
     ]
     lines += [
         f"| {row['knob']} | {row['value']}{' (default)' if row['default'] else ''} "
-        f"| {row['processor_seconds_per_grasp']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
+        f"| {1.0 / row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
         f"| {_with_bar(row, 'epsilon', '.3f')} | {_with_bar(row, 'pd_mm', '.2f')} |"
         for row in sweeps
     ]

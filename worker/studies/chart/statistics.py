@@ -31,7 +31,6 @@ def figures(cell: Trial) -> dict[str, Any]:
     draws = _draws(cell)
     row: dict[str, Any] = {
         "seconds": [round(s, 6) for s in cell.seconds],
-        "processor_seconds_per_grasp": sum(cell.processor_seconds) / len(held),
         "grasps": len(held),
         "valid": int(held.sum()),
         "grasps_per_second": len(held) / seconds.sum(),

@@ -132,20 +132,13 @@ def sweep(
     rows = []
     for turn in turns(quick, knobs):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
-        faster = _cost(base, run.device) / _cost(found, run.device)
+        faster = found["grasps_per_second"] / base["grasps_per_second"]
         rows.append(
             {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
             | {"speedup": plain(faster), **found}
         )
         say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
     return rows
-
-
-def _cost(row: dict[str, Any], device: str) -> float:
-    """Seconds per grasp."""
-    if wp.get_device(device).is_cuda:
-        return 1.0 / float(row["grasps_per_second"])
-    return float(row["processor_seconds_per_grasp"])
 
 
 def _setting(turn: Turn, batch: int, run: Run) -> Setting:

@@ -95,8 +95,7 @@ class Trial:
     pieces: ConvexPieces
     """Of `true`."""
     seconds: list[float] = field(default_factory=list)
-    processor_seconds: list[float] = field(default_factory=list)
-    """Of all threads: what a call costs whatever else the machine does; without meaning for a GPU."""
+    """On a CPU those of all threads together, which do not ask what else the machine does; on a GPU those that pass."""
     end_seconds: list[float] = field(default_factory=list)
     """End to end: planned, judged, and measured where they hold."""
     made: list[GraspSet] = field(default_factory=list)
@@ -122,6 +121,10 @@ class Trial:
     def _pieces(self) -> ConvexPieces:
         return self.pieces
 
+    @property
+    def _clock(self) -> Callable[[], float]:
+        return time.perf_counter if self.setting.run.device.startswith("cuda") else time.process_time
+
     def warm_up(self) -> None:
         """One call that is not counted: kernels, grids and samples are there afterwards."""
         self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, trial=self.tried, warm=True)
@@ -129,12 +132,11 @@ class Trial:
     def repeat(self) -> None:
         """One timed call, then quality and verdict of its grasps."""
         batch = self.setting.batch
-        began, used = time.perf_counter(), time.process_time()
+        began = self._clock()
         found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), trial=self.tried)
-        self.seconds.append(time.perf_counter() - began)
-        self.processor_seconds.append(time.process_time() - used)
+        self.seconds.append(self._clock() - began)
         success, sound, table = self._finished(found)
-        self.end_seconds.append(time.perf_counter() - began)
+        self.end_seconds.append(self._clock() - began)
         lost = self._measured(found.take(np.flatnonzero(success != 1)))
         self.made.append(found)
         self.success.append(success)
@@ -173,16 +175,16 @@ class Trial:
     def time_first(self, grasps: int) -> None:
         """Time a call of few grasps, as somebody would make who waits for the first valid one.
 
-        Where a grasp takes longer than a second the time follows from the batch: threads work on one grasp each.
+        Where a grasp takes longer than a second the time follows from the batch.
         """
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:
             self.first_calls.append(each * grasps)
             return
-        began = time.perf_counter()
+        began = self._clock()
         self._finished(self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), trial=self.tried))
-        self.first_calls.append(time.perf_counter() - began)
+        self.first_calls.append(self._clock() - began)
 
     def values(self, key: str) -> Floats:
         """A column of all repeats."""
