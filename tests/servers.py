@@ -122,6 +122,8 @@ class S3Server(Server):
         ports = dict(zip(parts, free_ports(len(parts)), strict=True))
         options = [f"-{part}.port{'.grpc' * bool(grpc)}={port}" for name, port in ports.items()
                    for part, _, grpc in [name.partition(".")]]  # fmt: skip
+        # Its parts also listen on sockets that it leaves where it made them.
+        self._sockets = [Path(f"/tmp/seaweedfs-{part.replace('.', '-')}-{port}.sock") for part, port in ports.items()]
         self.url = f"s3://{self.bucket}"
         self.environment = {
             "AWS_ACCESS_KEY_ID": "graspd-test",
@@ -144,9 +146,14 @@ class S3Server(Server):
 
     def start(self) -> None:
         (self.folder / "data").mkdir(exist_ok=True)
-        # The server takes the same variables as its own credentials.
-        environment = {**os.environ, **self.environment}
+        # The server takes the same variables as its own credentials; its logs go with its folder.
+        environment = {**os.environ, **self.environment, "TMPDIR": str(self.folder)}
         self._run(self._command, lambda: obstore.put(self.client(), "health/started", b"1"), env=environment)
+
+    def close(self) -> None:
+        super().close()
+        for socket in self._sockets:
+            socket.unlink(missing_ok=True)
 
     def client(self, **changes: str) -> S3Store:
         """A plain S3 client of the bucket, with other credentials if given."""
