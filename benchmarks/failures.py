@@ -138,10 +138,12 @@ def main() -> None:
         f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, judged at level `certificate` (revision "
         f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand the {WORST} objects on which least hold, of "
         f"{len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
-        "margin is the worst motion over its limit. The pictures show the moment of contact: the first three fail, the "
-        "last one holds. What is said of a pair are medians over its lost grasps.\n",
+        "margin is the worst motion over its limit. The pictures show the moment of contact: up to three that fail, then "
+        "one that holds. What is said of a pair are medians over its lost grasps.\n",
     ]
     told: list[dict[str, Any]] = []
+    for older in (args.out / "failures").glob("*.png"):
+        older.unlink()
     for hand in args.hands:
         every = list(cells(args.data, args.work, hand, args.grasps, args.objects))
         figures = []
@@ -166,7 +168,7 @@ def main() -> None:
             name = f"failures/{hand}-{cell.object_name}.png"
             picture(cell, found, args.out / name)
             lines += [f"**{cell.object_name}**, {np.mean(found['success']):.0%} hold: {why(found)}.\n",
-                      f"![{hand} on {cell.object_name}: three grasps that fail, one that holds]({name})\n"]  # fmt: skip
+                      f"![{hand} on {cell.object_name}: grasps that fail, one that holds]({name})\n"]  # fmt: skip
     (args.out / "failures.md").write_text("\n".join(lines))
     write_json(args.out / "failures.json", told)
 
