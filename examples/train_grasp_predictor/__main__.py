@@ -79,9 +79,6 @@ class Study:
             found.append(Exam.of(name, FACE, self.models[name], mine, PICTURES[1]))
         return [exam for exam in found if exam.seen]
 
-    def all_of(self, obj: str) -> Taught:
-        return sources.in_scenes(self.shards, obj, self.held, 10**6)
-
     def usual(self, obj: str) -> Taught:
         return sources.in_scenes(self.shards, obj, self.held, self.count)
 
@@ -101,11 +98,11 @@ class Study:
 
     def ablations(self) -> dict[str, Callable[[str], Taught]]:
         def spread(obj: str, *, alike: bool) -> Taught:
-            return sources.spread(self.all_of(obj), self.held, self.count, alike=alike)
+            return sources.spread(self.usual(obj), self.held, self.count // 4, alike=alike)
 
         made: dict[str, Callable[[str], Taught]] = {
             sources.QUARTER: lambda obj: sources.first(self.usual(obj), self.count // 4),
-            sources.FOURFOLD: self.all_of,
+            sources.SIXTEENTH: lambda obj: sources.first(self.usual(obj), self.count // 16),
             sources.ALIKE: lambda obj: spread(obj, alike=True),
             sources.UNLIKE: lambda obj: spread(obj, alike=False),
             sources.HARD: lambda obj: sources.by_friction(self.usual(obj)),
@@ -124,8 +121,8 @@ def main(
     free: Annotated[str, Option(help="Shards of valid grasps of free objects, to be put on tables and filtered.")] = "",
     peer: Annotated[str, Option(help="The same of the graspit baseline.")] = "",
     raw: Annotated[str, Option(help="Shards planned on tables with `want raw`, with views: failures told.")] = "",
-    grasps: Annotated[int, Option(help="Grasps of each object.")] = 64,
-    steps: Annotated[int, Option(help="Training steps of each network.")] = 1500,
+    grasps: Annotated[int, Option(help="Grasps of each object, at most.")] = 256,
+    steps: Annotated[int, Option(help="Training steps of each network.")] = 3000,
     seeds: Annotated[int, Option(help="Networks trained on each source.")] = 3,
     ablations: Annotated[bool, Option(help="Other sizes and choices of the data besides.")] = False,
     threads: Annotated[int, Option(help="Threads of torch.")] = 1,

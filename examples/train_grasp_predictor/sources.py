@@ -17,9 +17,9 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.simulation.surroundings import UP
 
-#: Sizes of the ablation beside the usual one.
-QUARTER, FOURFOLD = "scenes, a quarter", "scenes, four times"
-ALIKE, UNLIKE = "scenes, most alike", "scenes, most unlike"
+#: Sizes of the ablation beside the usual one, and other quarters than the first.
+QUARTER, SIXTEENTH = "scenes, a quarter", "scenes, a sixteenth"
+ALIKE, UNLIKE = "scenes, the quarter most alike", "scenes, the quarter most unlike"
 FAILED, HARD = "scenes, failures told", "scenes, by half the friction"
 SCENES: Final = "scenes in the loop"
 #: How often a grasp is shown that lifts at half the friction too, for each that does not.
