@@ -152,8 +152,8 @@ class S3Server(Server):
 
     def close(self) -> None:
         super().close()
-        for socket in self._sockets:
-            socket.unlink(missing_ok=True)
+        for file in self._sockets:
+            file.unlink(missing_ok=True)
 
     def client(self, **changes: str) -> S3Store:
         """A plain S3 client of the bucket, with other credentials if given."""
