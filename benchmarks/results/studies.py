@@ -33,7 +33,7 @@ _LITTLE = "--hands barrett --objects 077_rubiks_cube --grasps 4"
 
 
 _TRAIN = (
-    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free --peer WORK/peer "
+    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free "
     "--meshes DATA/objects --held-out 006_mustard_bottle,025_mug,035_power_drill,061_foam_brick "
     "-o OUT/results/predictor.json"
 )
@@ -251,12 +251,8 @@ STUDIES: Final = (
         ("results/predictor.json", "results/predictor-barrett.png", "results/predictor-allegro.png"),
         ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
          "graspd datasets export tables -o WORK/tables",
-         "graspd datasets create tables-raw --hands barrett --objects "
-         "003_cracker_box,005_tomato_soup_can,011_banana,024_bowl,037_scissors,048_hammer,056_tennis_ball,"
-         "077_rubiks_cube,koala,spot --scene table --faces all --views 2 --want raw -n 64 --yes --wait",
-         "graspd datasets export tables-raw -o WORK/raw",
          "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
-         f"{_TRAIN} --hand barrett --raw WORK/raw --ablations --sheet OUT/results/predictor-barrett.png",
+         f"{_TRAIN} --hand barrett --sheet OUT/results/predictor-barrett.png",
          f"{_TRAIN} --hand allegro --sheet OUT/results/predictor-allegro.png"),
         stages=ALL, seeds=(0, 1, 2), needs=(SERVICE, TORCH),
     ),
