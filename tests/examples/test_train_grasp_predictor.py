@@ -171,10 +171,22 @@ def test_fingers_open_as_wide_as_the_table_has_room_for(hand: HandModel) -> None
 
 def test_where_a_hand_is_to_squeeze_raises_it_by_nothing(hand: HandModel) -> None:
     sight = block_of((0.06, 0.06, 0.12))
-    given = across(hand, sight, 2, squeeze=SQUEEZE, rng=np.random.default_rng(0))
-    tight = replace(given, squeeze=execution.tighter(hand, given.joints, 2.0))
-    gentle, firm = (execution.made_ready(hand, one, sight).hands.hand_pose for one in (given, tight))
-    np.testing.assert_array_equal(gentle, firm)
+    given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))
+
+    def lowest(joints: Floats) -> float:
+        return float(execution.hand_points(hand, given.hand_pose, joints)[..., 2].min())
+
+    # Of wider and tighter hands the ones that reach lowest and least low; the table is half-way between the two.
+    every = [execution.tighter(hand, given.joints, by) for by in np.linspace(-2.0, 2.0, 17)]
+    low, high = min(every, key=lowest), max(every, key=lowest)
+    assert lowest(low) < lowest(high) - 0.02
+    pose = given.hand_pose.copy()
+    pose[:, 2] -= 0.5 * (lowest(low) + lowest(high))
+    gentle = replace(given, hand_pose=pose, joints=high, pregrasp=high, squeeze=high)
+    once, again = (
+        execution.made_ready(hand, one, sight).hands.hand_pose for one in (gentle, replace(gentle, squeeze=low))
+    )
+    np.testing.assert_array_equal(once, again)
 
 
 @pytest.mark.slow
