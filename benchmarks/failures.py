@@ -142,8 +142,7 @@ def main() -> None:
         "then one that holds. What is said of a pair are medians over its lost grasps.\n",
     ]
     told: list[dict[str, Any]] = []
-    for older in (args.out / "failures").glob("*.png"):
-        older.unlink()
+    drawn: set[Path] = set()
     for hand in args.hands:
         every = list(cells(args.data, args.work, hand, args.grasps, args.objects))
         figures = []
@@ -167,8 +166,11 @@ def main() -> None:
             cell, found = every[at], figures[at]
             name = f"failures/{hand}-{cell.object_name}.png"
             picture(cell, found, args.out / name)
+            drawn.add(args.out / name)
             lines += [f"**{cell.object_name}**, {np.mean(found['success']):.0%} hold: {why(found)}.\n",
                       f"![{hand} on {cell.object_name}: grasps that fail, one that holds]({name})\n"]  # fmt: skip
+    for older in set((args.out / "failures").glob("*.png")) - drawn:
+        older.unlink()
     (args.out / "failures.md").write_text("\n".join(lines))
     write_json(args.out / "failures.json", told)
 

@@ -175,6 +175,7 @@ def _proposers(
             continue
         given = [make(obj) for obj in study.objects]
         lessons, tries = Lessons.of(study.pictures_for(source), given), None
+        controls = _without(study, given) if source == sources.SCENES else {}
         facts: Row = {"grasps": sum(map(len, given)), "views": len(lessons)}
         for seed in missing:
             trained = train(lessons, steps=steps, seed=seed)
@@ -189,17 +190,17 @@ def _proposers(
             tries = tries or practised(study.hand, study.models, given, study.seen, by, seed=seed)
             refined = Refined(study.hand, learned(study.hand, tries, steps=JUDGE_STEPS, seed=seed), by)
             told |= {"tries": len(tries)}
-            whole: dict[str, Proposer] = {source: refined, ALONE: _by(made, (SPREAD,))}
-            whole |= {UNMOVED: replace(refined, rounds=())}
-            whole |= {JUDGED[name]: replace(refined, source=other) for name, other in _without(study, given).items()}
+            whole: dict[str, Proposer] = {source: refined}
+            if source == sources.SCENES:
+                whole |= {ALONE: _by(made, (SPREAD,)), UNMOVED: replace(refined, rounds=())}
+                whole |= {JUDGED[name]: replace(refined, source=other) for name, other in controls.items()}
             for name in parts:
                 if (study.hand.name, name, seed) not in done:
                     yield name, seed, told, whole[name]
-        if source == sources.SCENES:
-            for name, proposer in _without(study, given).items():
-                for seed in range(seeds):
-                    if (study.hand.name, name, seed) not in done:
-                        yield name, seed, {"grasps": facts["grasps"] if name == NEAREST else 0}, proposer
+        for name, proposer in controls.items():
+            for seed in range(seeds):
+                if (study.hand.name, name, seed) not in done:
+                    yield name, seed, {"grasps": facts["grasps"] if name == NEAREST else 0}, proposer
 
 
 def _without(study: Study, given: Sequence[Taught]) -> dict[str, Proposer]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from worker.rendering.scene_setup import CameraPlan, Setting
 from worker.rendering.views import SAMPLES, Extras, render
 from worker.run import Run
 from worker.scenes.simulate import drop
+from worker.studies.clock import clock_of
 
 SCENES: Final = 2
 VIEWS: Final = 4
@@ -111,7 +111,7 @@ def bench_render(
 
 class _Timer:
     def __init__(self, device: str, repeats: int) -> None:
-        self._clock = time.process_time if device == "cpu" else time.perf_counter
+        self._clock = clock_of(device)
         self._repeats = repeats
 
     def __call__(self, run: Callable[[], object]) -> Timing:

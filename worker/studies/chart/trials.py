@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,6 +24,7 @@ from worker.quality.referee.robust import robust
 from worker.quality.table import measure
 from worker.run import ALONE, Run
 from worker.scenes.trial import trial_on
+from worker.studies.clock import clock_of
 
 Floats = NDArray[np.float64]
 
@@ -123,7 +123,7 @@ class Trial:
 
     @property
     def _clock(self) -> Callable[[], float]:
-        return time.perf_counter if self.setting.run.device.startswith("cuda") else time.process_time
+        return clock_of(self.setting.run.device)
 
     def warm_up(self) -> None:
         """One call that is not counted: kernels, grids and samples are there afterwards."""
