@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 #: Fingers open until this far from the object [m]: enough for the errors of a calibrated arm, and what opens farther
 #: comes back faster and kicks the object away more often.
-CLEARANCE_M: Final = 0.005
+CLEARANCE_M: Final = 0.003
 #: A finger that cannot get this far along its contact normals opens plainly [m].
 STUCK_M: Final = 0.003
 #: The root retreats only where the open hand is nearer than this [m]: a palm left in touch kicks the object, but so

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
 from worker.quality.probe import Probe, probe_of
 from worker.simulation.device import to_xyzw
 from worker.simulation.kernels import balance, jamming, opening, optimizers, touching
@@ -37,15 +38,21 @@ class Posing:
     points: Any
     effort: Any
     """(D,)"""
+    finger: Any
+    """(L,) of each body, -1: none."""
+    fingers: int
 
     @classmethod
     def of(cls, probe: Probe) -> Posing:
         with wp.ScopedDevice(probe.device):
             for module in (touching, balance, opening, jamming, optimizers):
                 wp.load_module(module=module, device=probe.device)
+            finger = finger_of_body(probe.hand)
             return cls(
-                probe, chain_of(probe.hand, probe.device), _points(probe), wp.array(probe.hand.effort, dtype=wp.float64)
-            )
+                probe, chain_of(probe.hand, probe.device), _points(probe),
+                wp.array(probe.hand.effort, dtype=wp.float64), wp.array(finger, dtype=wp.int32),
+                max(1, int(finger.max()) + 1),
+            )  # fmt: skip
 
     @property
     def hand(self) -> HandModel:
@@ -104,6 +111,16 @@ class Posing:
                 outputs=[near],
             )  # fmt: skip
         return bodies, near
+
+    def touching_links(self, posture: Posture) -> NDArray[np.int32]:
+        """(N,) bodies of posed hands with points nearer to the object than `LINK_CONTACT_M`; the quality table, which
+        looks from both sides, finds as many or more."""
+        found, body = np.zeros(len(posture), np.int32), self.points.body.numpy()
+        for rows in self.parts(len(posture)):
+            distance = self.touch(posture.take(rows), LINK_CONTACT_M)[1].distance.numpy()
+            least = [distance[:, body == link].min(axis=1) for link in np.unique(body)]
+            found[rows] = contact_links(np.stack(least, axis=1))
+        return found
 
 
 def _points(probe: Probe) -> Any:

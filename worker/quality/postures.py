@@ -32,6 +32,9 @@ WIDE: Final = 0.4
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
+#: A finger that stands off presses with its points within so much [m]: commanded to close, or the others push a free
+#: object past it.
+CLOSING_M: Final = 0.009
 #: Sum of the contact forces' normal components [N], and the Coulomb coefficient they are balanced with: less than that
 #: of what is held, for forces at the edge of their cones slip as soon as a contact is not quite where it was thought.
 TOTAL_NORMAL_FORCE: Final = 50.0
@@ -93,7 +96,7 @@ def squeeze(
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
         return jaw_squeeze(probe, jaws, grasp, total_normal_force=total_normal_force)
     holds = hold_forces(
-        hand, obj, grasp, total_normal_force=total_normal_force, friction=friction, device=device
+        hand, obj, grasp, total_normal_force=total_normal_force, friction=friction, closing=CLOSING_M, device=device
     )  # fmt: skip
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
     return Posture(np.array(grasp.hand_pose, float), hand.expand(q))
@@ -106,13 +109,21 @@ def hold_forces(
     *,
     total_normal_force: float = TOTAL_NORMAL_FORCE,
     friction: float = FRICTION,
+    closing: float = 0.0,
     device: str = "cpu",
 ) -> Holds:
-    """Balanced contact forces of N grasps; `Holds.residual` predicts whether a grasp will hold."""
+    """Balanced contact forces of N grasps; `Holds.residual` predicts whether a grasp will hold. Fingers that touch
+    nothing press with their points that are nearer than `closing` [m]."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     return balanced(
-        posing, grasp, total_normal_force=total_normal_force, friction=friction, within=PRESSING_M, most=MAX_PRESSING
+        posing, grasp, total_normal_force=total_normal_force, friction=friction, within=PRESSING_M, most=MAX_PRESSING,
+        closing=closing,
     )  # fmt: skip
+
+
+def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
+    """(N,) bodies of the hand in contact, as the geometric gate counts them."""
+    return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
 
 
 def _in_the_way(hand: HandModel, opening: Openings, placed: Placed | None) -> Blocked | None:

@@ -41,8 +41,9 @@ class Holds:
 
 
 def balanced(
-    posing: Posing, grasp: Posture, *, total_normal_force: float, friction: float, within: float, most: int
-) -> Holds:
+    posing: Posing, grasp: Posture, *, total_normal_force: float, friction: float, within: float, most: int,
+    closing: float = 0.0,
+) -> Holds:  # fmt: skip
     """Balanced contact forces of N grasps within the hand's torque limits.
 
     Where the torques exceed a limit all forces shrink together, so the balance stays.
@@ -54,28 +55,30 @@ def balanced(
         friction: Coulomb coefficient of the pyramids.
         within: hand points that are nearer to the object press on it [m].
         most: as many of them are taken, those that spread most widely.
+        closing: points of a finger that has none so near press where they are nearer than this [m].
     """
     hand = posing.hand
     found = Holds(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
     for rows in posing.parts(len(grasp)):
-        residual, torque = _balanced(posing, grasp.take(rows), total_normal_force, friction, within, most)
+        residual, torque = _balanced(posing, grasp.take(rows), total_normal_force, friction, (within, closing), most)
         found.residual[rows], found.torque[rows] = residual.numpy(), torque.numpy()
     return found
 
 
 def _balanced(
-    posing: Posing, grasp: Posture, total: float, friction: float, within: float, most: int
+    posing: Posing, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
 ) -> tuple[Any, Any]:
-    bodies, near = posing.touch(grasp, within)
+    bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
     with wp.ScopedDevice(posing.device):
         scratch = [wp.empty((count, points), dtype=kind) for kind in (wp.int32, wp.float64)]
+        touches = wp.empty((count, posing.fingers), dtype=wp.bool)
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
         wp.launch(
             touching.choose, count,
-            inputs=[near, within, wp.float64(FACING_COS), wp.float64(radius)],
-            outputs=[*scratch, chosen, used],
+            inputs=[posing.points, posing.finger, near, *reach, wp.float64(FACING_COS), wp.float64(radius)],
+            outputs=[touches, *scratch, chosen, used],
         )  # fmt: skip
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
         wp.launch(

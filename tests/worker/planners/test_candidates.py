@@ -16,7 +16,7 @@ from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import Wanted, synthesize
-from worker.planners.fast_graspd import candidates
+from worker.planners.fast_graspd import candidates, planner
 from worker.planners.fast_graspd.candidates import Seated
 from worker.planners.fast_graspd.planner import ATTEMPTS
 from worker.quality.referee.decomposition import ConvexPieces
@@ -38,10 +38,11 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: Placed, *, de
 
 
 def taken(
-    scores: list[list[float]], monkeypatch: pytest.MonkeyPatch, merit: list[list[float]] | None = None
-) -> tuple[list[int], list[int], list[int]]:
+    scores: list[list[float]], monkeypatch: pytest.MonkeyPatch, merit: list[list[float]] | None = None,
+    unsound: tuple[int, ...] = (),
+) -> tuple[list[int], list[int], list[int]]:  # fmt: skip
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
-    were tried, and those that were seated."""
+    were tried, and those that were seated. Some are unsound."""
     monkeypatch.setattr(candidates, "with_postures", plain)
     n, each = np.shape(scores)
     flat, worth = np.ravel(scores), np.ravel(merit if merit is not None else np.tile(0.01 * np.arange(each), (n, 1)))
@@ -62,7 +63,8 @@ def taken(
             np.zeros((rows.size, 4)),
             np.zeros((rows.size, 2)),
         )
-        return Seated(state, rows.ravel().astype(float), worth[rows.ravel()].astype(float))
+        flat_rows = rows.ravel()
+        return Seated(state, flat_rows.astype(float), worth[flat_rows].astype(float), np.isin(flat_rows, unsound))
 
     placed = Placed(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
     found = candidates.tried(two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, trial)
@@ -93,6 +95,16 @@ def test_what_balances_too_badly_is_not_tried_but_where_there_is_nothing_else(mo
     rows, tries, _ = taken([[3.0, 0.1, 0.1, 0.2], [3.0, 2.0, 0.1, 0.1]], monkeypatch, merit=merit)
     assert tries == [0, 3, 5]
     assert rows == [3, 5]
+
+
+def test_what_is_unsound_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    took, tries, _ = taken([[0.5, 3.0], [4.0, 0.5]], monkeypatch, unsound=(0,))
+    assert (took, sorted(tries)) == ([1, 3], [1, 2, 3])
+
+
+def test_what_is_unsound_is_taken_where_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    took, tries, _ = taken([[0.5, 0.6]], monkeypatch, unsound=(0, 1))
+    assert (took, tries) == ([0], [])
 
 
 def test_where_none_is_good_enough_the_least_score_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,9 +167,19 @@ def test_what_a_trial_chooses_of_a_free_grasp_depends_on_no_other_grasp_and_no_t
     assert np.array_equal(one.grasp.hand_pose[:2], fewer.grasp.hand_pose)
 
 
-def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad_hand_stays(free) -> None:
+def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad_hand_stays(
+    free, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hand, obj, wanted, _ = free
     scores: list[float] = []
+    attempts: list[int] = []
+    set_out = planner._set_out
+
+    def counted(launch, rows, attempt: int = 0):
+        attempts.append(attempt)
+        return set_out(launch, rows, attempt)
+
+    monkeypatch.setattr(planner, "_set_out", counted)
 
     def never(grasps: GraspSet, placed: Placed | None) -> np.ndarray:
         assert placed is None
@@ -165,6 +187,7 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
         return np.array(scores[-len(grasps) :])
 
     found = synthesize(hand, obj, replace(wanted, count=1, trial=never), Run(threads=1))
-    # Half of the hands that set out without a trial, each tried, and as many again at each further attempt.
-    assert len(scores) == (1 + ATTEMPTS) * QUICK.starts // 2
+    assert attempts == list(range(1 + ATTEMPTS))
+    # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
+    assert ATTEMPTS // 2 < len(scores) <= (1 + ATTEMPTS) * QUICK.starts // 2
     assert len(found) == 1

@@ -12,7 +12,7 @@ from worker.hands.jacobian import generalized_forces
 from worker.hands.jaws import slides
 from worker.hands.kinematics import body_poses
 from worker.hands.model import Floats, HandModel
-from worker.quality.contact import choose_contacts
+from worker.quality.contact import choose_contacts, finger_of_body
 from worker.quality.opening import (
     CLEARANCE_M,
     JAM_LOOKS,
@@ -150,10 +150,16 @@ def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
     return Posture(poses[np.arange(count), chosen], joints)
 
 
-def balanced(probe: Probe, grasp: Posture, *, total_normal_force: float, friction: float) -> list[tuple[float, Floats]]:
+def balanced(
+    probe: Probe, grasp: Posture, *, total_normal_force: float, friction: float, closing: float = 0.0
+) -> list[tuple[float, Floats]]:
     """Residual and torques (D,) of the forces that balance in each grasp; least squares by SciPy."""
-    found = probe.touch(grasp, reach=PRESSING_M)
+    found = probe.touch(grasp, reach=max(PRESSING_M, closing))
     pressing = probe.facing(found) & (found.distance < PRESSING_M)
+    finger = finger_of_body(probe.hand)[probe.points.body]
+    for f in range(finger.max() + 1):
+        idle = ~pressing[:, finger == f].any(axis=1)
+        pressing |= probe.facing(found) & (found.distance < closing) & idle[:, None] & (finger == f)
     out = []
     for b in range(len(grasp)):
         place, normal = found.closest[b], found.normal[b]

@@ -11,7 +11,7 @@ import trimesh
 from service.model.errors import InputError, TaskCancelled
 from service.model.metrics import GRASP_METRICS
 from service.model.transforms import compose
-from service.store.shards import SCHEMAS
+from service.store.columns import SCHEMAS
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, plate_hand, posture
 from worker.grasps import Posture

@@ -11,7 +11,8 @@ from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
-from worker.quality.postures import hold_forces, pregrasp, squeeze
+from worker.quality.contact import LINK_CONTACT_M
+from worker.quality.postures import CLOSING_M, hold_forces, pregrasp, squeeze, touching_links
 from worker.quality.probe import Probe
 
 OBJ = object_from_path("mug", face_error_m=0.002)
@@ -55,6 +56,21 @@ def test_forces_balance_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> N
     np.testing.assert_allclose(held.residual, [residual for residual, _ in wanted], atol=1e-8)
     np.testing.assert_allclose(held.torque, [torque for _, torque in wanted], atol=1e-7)
     assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
+
+
+def test_fingers_that_stand_off_are_commanded_to_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+    hand, probe, grasp = case
+    wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3, closing=CLOSING_M)
+    near = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
     command = squeeze(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
     pressed = (hand.reduce(command.joint_positions) - hand.reduce(grasp.joint_positions)) * hand.stiffness
-    np.testing.assert_allclose(pressed, held.torque, atol=1e-9)
+    np.testing.assert_allclose(pressed, [torque for _, torque in wanted], atol=1e-7)
+    assert any(np.abs(a - b).max() > 1e-3 for (_, a), (_, b) in zip(near, wanted, strict=True))
+
+
+def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+    hand, probe, grasp = case
+    near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
+    wanted = [len(np.unique(probe.points.body[one])) for one in near]
+    assert touching_links(hand, OBJ, grasp).tolist() == wanted
+    assert len(set(wanted)) > 2

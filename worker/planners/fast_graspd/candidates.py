@@ -48,6 +48,9 @@ class Seated:
     """L_stable of each."""
     merit: Floats
     """The smaller the better."""
+    unsound: NDArray[np.bool_]
+    """Whether it is too deep in the object for the geometric gate, or touches it with too few links: no trial can save
+    it."""
 
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Seated]
@@ -82,7 +85,7 @@ def tried(
     """Of the hands of each grasp the first that the trial finds good enough, or else the one with the least score.
 
     `together` of each grasp are seated and tried in the order of their merit, then, of grasps that have none yet, as
-    many again. Hands that balance too badly are not tried, but for the first of each grasp.
+    many again. Hands that balance too badly or are unsound are not tried, but the first of each grasp is taken.
 
     Args:
         hand: the hand.
@@ -100,7 +103,8 @@ def tried(
             break
         seated = seat(wave[left], left)
         for rows in ranked(seated.merit, len(left)).T:
-            open_ = ~(taken.score[left] < 1.0) & ((seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR))
+            worth = ((seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)) & ~seated.unsound[rows]
+            open_ = ~(taken.score[left] < 1.0) & (worth | np.isinf(taken.score[left]))
             if not open_.any():
                 continue
             which = left[open_]
@@ -118,7 +122,9 @@ def _try(
 ) -> None:
     """One hand each (k,) of the grasps `which` (k,), as grasps."""
     state, losses = seated.state[rows], seated.losses[rows]
-    score = np.nan_to_num(trial(found, which), nan=HOPELESS, posinf=HOPELESS)
+    score, sound = np.full(len(rows), HOPELESS), np.flatnonzero(~seated.unsound[rows])
+    if len(sound):
+        score[sound] = np.nan_to_num(trial(found.take(sound), which[sound]), nan=HOPELESS, posinf=HOPELESS)
     for k in np.flatnonzero(score < taken.score[which]):
         grasp = int(which[k])
         taken.grasps[grasp] = found.take(slice(k, k + 1))

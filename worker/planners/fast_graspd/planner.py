@@ -22,12 +22,14 @@ from worker.planners.fast_graspd.batches import Batches, finalists
 from worker.planners.fast_graspd.candidates import TOGETHER, Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.selection import FRICTION, SCENE_FRICTION, best_of_each, merits, ranked
+from worker.planners.fast_graspd.selection import FRICTION, SCENE_FRICTION, best_of_each, merits, posture_of, ranked
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.fast_graspd.withdrawal import hindrance
 from worker.planners.port import Asked, Wanted
 from worker.planners.threads import cut, run_parts
+from worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
+from worker.quality.postures import touching_links
 from worker.run import Run
 from worker.simulation.data import Data
 from worker.simulation.launches import Launches
@@ -48,8 +50,9 @@ PART: Final = 4
 SET_OUT_AGAIN: Final = 0.05
 #: The same of scores in a trial, see `worker.planners.port.Trial`: a tenth to a quarter of such grasps hold.
 FAILED: Final = 2.0
-#: How often grasps whose hands are tried may set out again.
-ATTEMPTS: Final = 4
+#: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
+#: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
+ATTEMPTS: Final = 10
 
 
 @dataclass
@@ -174,6 +177,14 @@ class _Launch:
         hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
         friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
+
+    def unsound(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
+        """(n,) whether hands of these depths [m] cannot pass the geometric gate; asked of those that will be tried."""
+        if not self.batches.has_trial:
+            return np.zeros(len(depths), bool)
+        hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
+        links = touching_links(hand, obj, posture_of(hand, obj, state), device=device)
+        return (depths > 1e-3 * MAX_PENETRATION_MM) | (links < MIN_CONTACT_LINKS)
 
 
 @dataclass(frozen=True)
@@ -323,9 +334,8 @@ class _Seats:
             losses = _losses(data, len(flat))
         # Without iterations this only tells how deep each hand is.
         state, depths = Projection(launch.fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
-        if rows.shape[1] == 1:
-            return Seated(state, losses, np.zeros(len(flat)))
-        return Seated(state, losses, launch.merits(state, losses, depths))
+        merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
+        return Seated(state, losses, merit, launch.unsound(state, depths))
 
 
 def _obstacles(pair: Pair, placed: Placed | None) -> DeviceObstacles | None:

@@ -24,7 +24,7 @@ Level = Literal["letter", "certificate", "screen"]
 #: Raise when the code of the protocol or of the scene changes what it says, constants aside.
 REVISION: Final = 5
 
-_EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "LOST_ROTATION")
+_EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "LOST_ROTATION")
 #: The constants that move a verdict, module by module, and those that only one level reads. A constant of these modules
 #: that stands in neither moves none.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
@@ -39,7 +39,7 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "CLEARANCE_M", "STUCK_M", "PALM_CLEARANCE_M", "PLAIN_OPENING", "OPENING_STEP", "SLIDING_STEP_M",
         "OPENING_STEPS", "JAM_M", "WAY", "JAM_LOOKS", "RETREATS_M",
     ),
-    postures: ("PRESSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS"),
+    postures: ("PRESSING_M", "CLOSING_M", "TOTAL_NORMAL_FORCE", "FRICTION", "MAX_PRESSING", "_POINTS"),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """The DexGraspBench force-closure test of one grasp, at three levels of cost (research: what each shortcut changes).
 
 letter: as published; each of the 6 pushes starts from the closed hand as if it had closed anew and is held for 2 s.
-certificate: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside the limits.
+certificate: the same physics; a push ends as soon as linear extrapolation to 2 s stays inside half of the limits.
 screen: coarser physics (fixed root, 6 ms); where the margin is not clear, the certificate decides.
 """
 
@@ -37,6 +37,9 @@ LETTER_INTERVAL_S: Final = 0.2
 #: Sequential test: first look and interval. Earlier looks miss slow creepers under a weak squeeze.
 FIRST_LOOK_S: Final = 0.08
 INTERVAL_S: Final = 0.04
+#: Share of the limits that extrapolation must stay inside: what creeps faster is watched until it slows, breaks a limit
+#: or 2 s are over. Of 250 grasps of Shadow that are held at the whole of them 11 creep out later, at half of them 4.
+SURE: Final = 0.5
 #: The object is lost while closing beyond this; no grasp that passes was ever seen past half of it.
 LOST_ROTATION: Final = math.radians(30.0)
 #: Coarse physics are trusted where their worst displacement or rotation over its limit is outside this band. What they
@@ -200,7 +203,7 @@ class Test:
         self.data.xfrc_applied[self.scene.object_body, :3] = PUSH * np.array(DIRECTIONS[direction])
 
     def _hold(self, trial: Trial) -> Outcome:
-        """Sequential test: reject on a broken limit, accept when the present rates keep it unbroken for 2 s."""
+        """Sequential test: reject on a broken limit, accept when the present rates keep well inside it for 2 s."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
         before, turned_before = self._offset(), self._motion()[1]
@@ -213,7 +216,8 @@ class Test:
             now, turned = self._offset(), self._motion()[1]
             more = (HOLD_S - elapsed) / INTERVAL_S
             ahead = float(np.linalg.norm(now + more * (now - before)))
-            if ahead < MAX_DISPLACEMENT_M and turned + more * (turned - turned_before) < MAX_ROTATION:
+            turns = turned + more * (turned - turned_before)
+            if ahead < SURE * MAX_DISPLACEMENT_M and turns < SURE * MAX_ROTATION:
                 return Outcome.HELD
             before, turned_before = now, turned
         return Outcome.HELD

@@ -78,29 +78,46 @@ def apart(touching: Touching, radius: wp.float64, b: wp.int32, i: wp.int32, j: w
 
 @wp.kernel
 def choose(
+    # Model:
+    points_in: Points,
+    finger_in: wp.array(dtype=wp.int32),
     # In:
     touching_in: Touching,
     near_in: wp.float32,
+    far_in: wp.float32,
     facing_in: wp.float64,
     radius_in: wp.float64,
     # Out:
+    touches_out: wp.array2d(dtype=wp.bool),
     list_out: wp.array2d(dtype=wp.int32),
     least_out: wp.array2d(dtype=wp.float64),
     chosen_out: wp.array2d(dtype=wp.int32),
     count_out: wp.array(dtype=wp.int32),
 ):
-    """At most C points (B, C) of each hand that press: nearer than `near` and faced with a cosine below `facing`; of
-    more than C those that spread most widely, each farthest from those before it (Gonzalez 1985). Launch over B.
+    """At most C points (B, C) of each hand that press: nearer than `near`, or than `far` on a finger (of each body, -1:
+    none) that has no such point, and faced with a cosine below `facing`; of more than C those that spread most widely,
+    each farthest from those before it (Gonzalez 1985). Launch over B.
 
-    `list`, `least` (B, N) are scratch; `count` (B,) is how many there are.
+    `touches` (B, F), `list`, `least` (B, N) are scratch; `count` (B,) is how many there are.
     """
     b = wp.tid()
     limit = chosen_out.shape[1]
+    for f in range(touches_out.shape[1]):
+        touches_out[b, f] = False
+    for i in range(touching_in.distance.shape[1]):
+        f = finger_in[points_in.body[i]]
+        if f >= 0 and touching_in.distance[b, i] < near_in and touching_in.cosine[b, i] < facing_in:
+            touches_out[b, f] = True
     n = wp.int32(0)
     place = wp.vec3d(wp.float64(0.0))
     turn = wp.vec3d(wp.float64(0.0))
     for i in range(touching_in.distance.shape[1]):
-        if touching_in.distance[b, i] < near_in and touching_in.cosine[b, i] < facing_in:
+        reach = near_in
+        f = finger_in[points_in.body[i]]
+        if f >= 0:
+            if not touches_out[b, f]:
+                reach = wp.max(near_in, far_in)
+        if touching_in.distance[b, i] < reach and touching_in.cosine[b, i] < facing_in:
             list_out[b, n] = i
             place += wp.vec3d(touching_in.closest[b, i]) / radius_in
             turn += wp.vec3d(touching_in.normal[b, i])

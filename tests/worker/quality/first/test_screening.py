@@ -13,7 +13,7 @@ import pytest
 
 from service.model.domain import JobOptions
 from service.model.errors import InputError
-from service.store.shards import SCHEMAS
+from service.store.columns import SCHEMAS
 from tests.worker.quality.first.engine import Stand
 from tests.worker.quality.first.test_worlds import every_kind
 from tests.worker.quality.test_referee import BOX, PADS, WHOLE

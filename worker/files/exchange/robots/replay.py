@@ -19,7 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-STAGES, STAGE_S, HOLD_S, FIRST_LOOK_S, LOOK_S = 10, 0.04, 2.0, 0.08, 0.04
+STAGES, STAGE_S, HOLD_S, FIRST_LOOK_S, LOOK_S, SURE = 10, 0.04, 2.0, 0.08, 0.04, 0.5
 MAX_MOVED_M, MAX_TURNED = 0.05, math.radians(15)
 MAX_DEPTH_M, OVERHANG_M, LOOKS = 0.010, 0.002, 20
 PUSHES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
@@ -89,7 +89,7 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """As the referee holds: over as soon as the present rates keep the object in its limits until the end."""
+        """As the referee holds: over as soon as the present rates keep the object in half of its limits to the end."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:
@@ -102,7 +102,8 @@ class Replay:
                 return "turned"
             more = (HOLD_S - elapsed) / LOOK_S
             ahead = np.linalg.norm(moved + more * (moved - before[0]))
-            if not self.full and ahead < MAX_MOVED_M and turned + more * (turned - before[1]) < MAX_TURNED:
+            turns = turned + more * (turned - before[1])
+            if not self.full and ahead < SURE * MAX_MOVED_M and turns < SURE * MAX_TURNED:
                 return "held"
             before = now
         return "held"

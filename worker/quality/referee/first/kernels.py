@@ -22,6 +22,7 @@ PUSHES = wp.constant(len(protocol.DIRECTIONS))
 PUSH = wp.constant(protocol.PUSH)
 MOVED = wp.constant(protocol.MAX_DISPLACEMENT_M)
 TURNED = wp.constant(protocol.MAX_ROTATION)
+SURE = wp.constant(protocol.SURE)
 LOST_TURN = wp.constant(protocol.LOST_ROTATION)
 HELD = wp.constant(int(Outcome.HELD))
 LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
@@ -270,7 +271,7 @@ def look(
                 more = float(HOLD - looks)
                 ahead = wp.length(now + more * (now - worlds_out.before[w]))
                 turns = angle + more * (angle - worlds_out.turned_before[w])
-                if looks >= HOLD or (ahead < MOVED and turns < TURNED):
+                if looks >= HOLD or (ahead < SURE * MOVED and turns < SURE * TURNED):
                     found_out.outcome[g, number] = HELD
                     over = number + 1 == PUSHES
                     if not over:
