@@ -16,8 +16,9 @@ from service.model.transforms import compose
 from service.readers.files import Shards, open_shards
 from service.store import standing
 from service.store.attributes import Attribute
+from service.store.columns import SCHEMAS
 from service.store.manifests import INDEX_THRESHOLD_M
-from service.store.shards import SCHEMAS, Shard, read_shard, write_shard
+from service.store.shards import Shard, read_shard, write_shard
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]

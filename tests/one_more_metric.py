@@ -31,8 +31,8 @@ def main(folder: Path, older_index: str) -> None:
     from service.docs import schema_table
     from service.index.index import Index
     from service.model.domain import Stage
+    from service.store.columns import SCHEMAS
     from service.store.manifests import load_manifest
-    from service.store.shards import SCHEMAS
     from tests.api.conftest import BASE_URL
     from tests.worker.cards.conftest import case
     from worker.cards.tables import quality_table

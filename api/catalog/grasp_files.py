@@ -12,8 +12,9 @@ from api.models import GraspDetail, Posture, Push
 from service.index.views import GraspView, ShardView
 from service.model.errors import InputError, NotFoundError
 from service.model.metrics import GRASP_METRICS
+from service.store.columns import SCHEMAS
 from service.store.integrity import read_checked
-from service.store.shards import SCHEMAS, Shard, read_shard
+from service.store.shards import Shard, read_shard
 from service.store.store import Store
 
 #: A base shard of 32 grasps is some 60 kB; a page of grasps reads as many as it has rows, at worst.

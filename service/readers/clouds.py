@@ -46,7 +46,7 @@ class Clouds(Sequence[dict[str, Any]]):
             grasp/hand_pose_table, grasp/hand_pose_object in each of the frames; grasp/joint_positions (K, J)
         grasp/base_row (K,), base_id, and the columns of `grasp_quality` of the pictures
 
-    Points, plane and poses are in `frame`. Grasps are those that the pictures keep: by default the certified ones
+    Points, plane and poses are in `frame`. Grasps are those that the pictures keep: by default the valid ones
     that are clear in the scene.
     """
 

@@ -17,12 +17,13 @@ from service.model.planning import plan
 from service.model.records import JobRecord
 from service.readers.cache import DEFAULT_BYTES, ShardCache
 from service.readers.ranges import RangeReader
+from service.store.columns import ShardKind
 from service.store.datasets import newest_snapshot
 from service.store.integrity import check_file
 from service.store.packs import Finder
 from service.store.parts import is_part
 from service.store.records import read_record
-from service.store.shards import ShardKind, kind_of, open_shard
+from service.store.shards import kind_of, open_shard
 from service.store.store import Store, open_store
 from service.user_cache import folder
 

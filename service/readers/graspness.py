@@ -20,7 +20,7 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
 
     Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count, of a parallel gripper's poses laid out around each
     point, those that hold and are clear. A hand with fingers touches in several places, and its grasps are found, not
-    laid out: of the certified grasps of a scene, those count for a point that touch it.
+    laid out: of the valid grasps of a scene, those count for a point that touch it.
 
     Args:
         points: (P, 3) in the object's frame [m].

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from service.model.errors import InputError
 from service.readers.files import ShardFile, Shards
 from service.store import standing
-from service.store.shards import SCHEMAS, open_shard, read_column
+from service.store.columns import SCHEMAS
+from service.store.shards import open_shard, read_column
 
 Array = NDArray[Any]
 #: From the columns of one base shard to a mask (N,) of the grasps to keep.

@@ -15,7 +15,8 @@ from service.model.errors import InputError
 from service.readers.chunks import RowTable, read_file
 from service.readers.files import ShardFile, Shards
 from service.store import standing
-from service.store.shards import SCHEMAS, read_shard
+from service.store.columns import SCHEMAS
+from service.store.shards import read_shard
 
 if TYPE_CHECKING:
     from service.readers.clouds import Clouds

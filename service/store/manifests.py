@@ -19,9 +19,10 @@ from service.model.metrics import indexed
 from service.model.robust import axis_word
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.store import standing
+from service.store.columns import SCHEMAS, ShardKind
 from service.store.integrity import read_checked
 from service.store.records import put_record, read_record
-from service.store.shards import SCHEMAS, Shard, ShardKind, read_shard
+from service.store.shards import Shard, read_shard
 from service.store.store import Store
 
 #: Contact threshold at which the sweep's metrics enter the index [m]: the widest that the literature reports.

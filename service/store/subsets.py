@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from service.model.digests import digest_json
 from service.store.attributes import Attribute
-from service.store.shards import SCHEMAS, Shard, write_shard
+from service.store.columns import SCHEMAS
+from service.store.shards import Shard, write_shard
 
 
 def carried(shard: Shard) -> dict[str, Attribute]:

@@ -6,7 +6,7 @@ import pytest
 from service.model.domain import JobOptions
 from service.model.errors import InputError
 from service.store.attributes import ATTRIBUTES, check_attributes
-from service.store.shards import SCHEMAS
+from service.store.columns import SCHEMAS
 from tests.worker.models import two_finger_hand
 from worker.files.base_attributes import base_attributes
 from worker.grasps import GraspSet, Posture

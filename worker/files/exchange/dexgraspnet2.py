@@ -88,6 +88,10 @@ def write(
     seen = by_scene(list(looks(pictures))).values()
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
+        if any(some[0].base in known for some in seen):
+            raise InputError(
+                "no grasp is valid and clear in the scenes of the pictures; plan them in scenes: synth --scene"
+            )
         raise InputError("no picture shows a scene with grasps; put views beside the grasps: graspd render")
     done = Written({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
     numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from tests.worker.files.exchange.conftest import run
 from tests.worker.files.exchange.dexgraspnet2_loader import sample, some_views
 from worker.files.exchange import archives, dexgraspnet2
 from worker.files.exchange.archives import load_npz
+from worker.files.exchange.lots import Look
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -177,3 +180,13 @@ def test_a_header_that_promises_what_is_not_there_is_told(tmp_path: Path) -> Non
 def test_no_pictures_no_scenes(on_tables: Path, tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="no picture shows"):
         run("export", on_tables / "block.h5", "--format", "dexgraspnet2", "-o", tmp_path / "out")
+
+
+def test_pictures_of_scenes_in_which_no_grasp_is_clear_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = Look(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
+    monkeypatch.setattr(dexgraspnet2, "looks", lambda pictures: [none])
+    lots: list[Any] = [SimpleNamespace(id="base")]
+    with pytest.raises(InputError, match="no grasp is valid and clear"):
+        dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())

@@ -1,0 +1,255 @@
+"""The HDF5 schema of shards: every dataset's shape, unit and meaning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from service.model.metrics import GRASP_METRICS
+from service.model.robust import MEANINGS
+
+ShardKind = Literal["base", "scene", "views"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One dataset of a shard. Letters of `shape` that repeat must have one length throughout the shard."""
+
+    shape: str
+    dtype: str
+    units: str
+    frame: str
+    description: str
+    optional: bool = False
+
+
+_POSE = "position x y z [m] and unit quaternion w x y z of the hand's root link"
+
+
+def _posture(prefix: str, what: str) -> dict[str, Column]:
+    return {
+        f"{prefix}/hand_pose": Column("N 7", "f8", "m, 1", "object", f"{what}: {_POSE}"),
+        f"{prefix}/joint_positions": Column(
+            "N J", "f8", "rad or m", "joint", f"{what}: all moving joints, order in attribute joint_names"
+        ),
+    }
+
+
+def _measured(*, optional: bool) -> dict[str, Column]:
+    return {
+        metric.path: Column(
+            "N T" if metric.swept else "N",
+            "i4" if metric.whole else "f8",
+            metric.units,
+            "none",
+            metric.meaning,
+            optional,
+        )
+        for metric in GRASP_METRICS
+        if metric.optional == optional
+    }
+
+
+SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
+    "base": {
+        **_posture("grasp", "posture at contact"),
+        **_posture("pregrasp", "posture before contact, fingers clear of the object"),
+        **_posture("squeeze", "commanded posture that presses on the object"),
+        "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
+        **_measured(optional=False),
+        "quality/valid": Column(
+            "N", "u1", "bool", "none", "1: sound, and the referee judged that it holds; 0 where nobody judged"
+        ),
+        "quality/sound": Column("N", "u1", "bool", "none", "1: passed the geometric gate", optional=True),
+        "quality/success": Column(
+            "N",
+            "i1",
+            "bool",
+            "none",
+            "verdict of the referee at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested",
+            optional=True,
+        ),
+        "quality/verdict_outcome": Column(
+            "N D",
+            "u1",
+            "enum",
+            "none",
+            "of each push +x -x +y -y +z -z: 0 not tried, 1 held, 2 penetration, 3 lost while closing, 4 displaced, "
+            "5 rotated, 6 diverged",
+            optional=True,
+        ),
+        "quality/verdict_margin": Column(
+            "N",
+            "f8",
+            "1",
+            "none",
+            "worst displacement or rotation of the pushes over its limit; below 1: held",
+            optional=True,
+        ),
+        "quality/judged_by": Column(
+            "N",
+            "u1",
+            "enum",
+            "none",
+            "whose verdict success is: 0 MuJoCo on the CPU, which alone certifies, 1 MuJoCo Warp, the first judge",
+            optional=True,
+        ),
+        "quality/audit": Column(
+            "N",
+            "i1",
+            "bool",
+            "none",
+            "verdict by the letter of the protocol: 1 held, 0 dropped, -1 not audited",
+            optional=True,
+        ),
+        "quality/published": Column(
+            "N", "i1", "bool", "none", "imported grasps: verdict that came with them: 1 held, 0 dropped, -1 none", True
+        ),
+        **_measured(optional=True),
+        "quality/robust_weakest": Column(
+            "N",
+            "u1",
+            "enum",
+            "none",
+            "what differed in the first model around the nominal one in which it does not hold: 0 none, "
+            + ", ".join(f"{axis:d} {words}" for axis, words in MEANINGS.items()),
+            optional=True,
+        ),
+        # Grasps that were planned for a scene say which, and how they are reached and lifted there.
+        "scene/object_pose": Column(
+            "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up", optional=True
+        ),
+        "scene/rest_probability": Column(
+            "S",
+            "f8",
+            "1",
+            "none",
+            "share of drops that come to rest on the same face of the convex hull",
+            optional=True,
+        ),
+        "scene/neighbour_pose": Column(
+            "S M 7",
+            "f8",
+            "m, 1",
+            "scene",
+            "frames of the other objects in each scene; names in attribute neighbours",
+            optional=True,
+        ),
+        "grasp/scene_index": Column("N", "i4", "1", "none", "row of the grasp's scene in /scene", optional=True),
+        "grasp/approach": Column(
+            "N W 7",
+            "f8",
+            "m, 1",
+            "object",
+            f"way in from the standoff to the pregrasp, in the joints of approach_joint_positions: {_POSE}",
+            optional=True,
+        ),
+        "grasp/approach_joint_positions": Column(
+            "N J", "f8", "rad or m", "joint", "joints of the open hand that comes, order in joint_names", optional=True
+        ),
+        "grasp/lift": Column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}", optional=True),
+        "quality/lift_outcome": Column(
+            "N",
+            "u1",
+            "enum",
+            "none",
+            "lift test: 0 not tried, 1 lifted, 2 penetration, 3 touched on the way, 4 lost while closing, 5 not lifted,"
+            " 6 turned, 7 diverged, 8 neighbour moved",
+            optional=True,
+        ),
+        "quality/lift_hard": Column(
+            "N", "i1", "bool", "none", "lift test at half the friction: 1 lifted, 0 not, -1 not tested", optional=True
+        ),
+        "quality/pushes": Column(
+            "N", "i1", "bool", "none", "six pushes without the scene: 1 held, 0 dropped, -1 not tested", optional=True
+        ),
+    },
+    "scene": {
+        "scene/object_pose": Column("S 7", "f8", "m, 1", "table", "object frame at rest; table top is z = 0"),
+        "scene/rest_probability": Column(
+            "S", "f8", "1", "none", "share of drops that come to rest on the same face of the convex hull"
+        ),
+        "scene/drop_seconds": Column("S", "f8", "s", "none", "simulated time until rest"),
+        "grasp/base_index": Column("K", "i4", "1", "none", "row of the grasp in the base shard"),
+        "grasp/scene_index": Column("K", "i4", "1", "none", "row of the scene in /scene"),
+        "grasp/hand_pose": Column("K 7", "f8", "m, 1", "table", f"posture at contact: {_POSE}"),
+        "grasp/table_clearance_m": Column(
+            "K", "f8", "m", "table", "lowest point of the hand above the table at contact and on the way in"
+        ),
+        "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear of what is around, at contact and before"),
+        "grasp/rejection": Column(
+            "K",
+            "u1",
+            "enum",
+            "none",
+            "0 kept; too near to: 1 the table at contact, 2 the table on approach, 3 a neighbour at contact, "
+            "4 a neighbour on approach",
+            optional=True,
+        ),
+        "grasp/contact_table_clearance_m": Column(
+            "K", "f8", "m", "table", "lowest point of the hand above the table at contact", optional=True
+        ),
+        "grasp/neighbour_clearance_m": Column(
+            "K",
+            "f8",
+            "m",
+            "table",
+            "signed distance of the hand from the neighbours' convex hulls at contact and on the way in, at most 0.1",
+            optional=True,
+        ),
+        "scene/neighbour_pose": Column(
+            "S M 7",
+            "f8",
+            "m, 1",
+            "table",
+            "frames of the other objects at rest; names in attribute neighbours",
+            optional=True,
+        ),
+    },
+    "views": {
+        "camera/intrinsics": Column("V 3 3", "f8", "px", "image", "pinhole K; pixel centres at +0.5"),
+        "camera/extrinsics": Column(
+            "V 4 4",
+            "f8",
+            "m, 1",
+            "table -> camera",
+            "x_camera = E x_table; camera x right, y down, z forward",
+        ),
+        "camera/scene_index": Column("V", "i4", "1", "none", "row of the scene in the scene shard"),
+        "camera/eye": Column("V", "u1", "enum", "none", "0 mono, 1 left, 2 right"),
+        "camera/stereo_baseline_m": Column(
+            "V", "f8", "m", "camera", "distance of the right eye from the left; 0: mono"
+        ),
+        "image/rgb": Column("V H W 3", "u1", "sRGB", "image", "colour"),
+        "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: nothing there"),
+        "image/segmentation": Column(
+            "V H W", "u1", "enum", "image", "0 background, 1 table, 2 object, 3 + m: neighbour m"
+        ),
+        "box/bounding_box_2d_tight": Column(
+            "V 4",
+            "f4",
+            "px",
+            "image",
+            "x_min y_min x_max y_max of the visible object pixels; nan: not visible",
+        ),
+        "box/bounding_box_2d_loose": Column(
+            "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
+        ),
+        "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
+        "box/occlusion_ratio": Column(
+            "V", "f4", "1", "image", "share of the object's pixels that is hidden; nan: not in view", optional=True
+        ),
+        "image/distance": Column(
+            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: nothing there", optional=True
+        ),
+        "image/normals": Column(
+            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: nothing there", optional=True
+        ),
+        "image/rgb_hand": Column(
+            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for people", optional=True
+        ),
+        "camera/hand_grasp": Column(
+            "V", "i4", "1", "none", "row of the grasp that rgb_hand shows in the scene shard; -1: none", optional=True
+        ),
+    },
+}
