@@ -49,6 +49,8 @@ class Entry:
     options: dict[str, Any] = field(default_factory=dict)
     said: str = ""
     """The options as the command line has them."""
+    sides: tuple[float, float] = SIDES
+    """Where its picture is taken from."""
 
 
 _AIRO = ("airo-models, MIT", "airo_models/grippers")
@@ -72,8 +74,11 @@ _LINKAGE_PR2 = {
 }
 
 
-def _of(source: tuple[str, str], name: str, title: str, path: str, said: str = "", **options: Any) -> Entry:
-    return Entry(name, title, source[0], f"{source[1]}/{path}", options, said)
+def _of(
+    source: tuple[str, str], name: str, title: str, path: str, said: str = "", *, sides: tuple[float, float] = SIDES,
+    **options: Any,
+) -> Entry:  # fmt: skip
+    return Entry(name, title, source[0], f"{source[1]}/{path}", options, said, sides)
 
 
 HANDS = (
@@ -99,7 +104,8 @@ HANDS = (
         "in `asset.json` `stiffness` 5 N m/rad instead of 20, at which its 0.3 N m are reached within 1 mm of a "
         "fingertip's way", stiffness=5.0),
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
-    _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml"),
+    _of(_MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml",
+        sides=(-1.4, -3.1)),  # elsewhere the fingers hide what they hold
     _of(_DATA, "unitree-dex3", "Unitree Dex3 of a G1", "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
         "`--root right_hand_palm_link`", root="right_hand_palm_link"),
     _of(_SUITE, "fourier", "Fourier 6-dof hand", "fourier_right_hand.xml"),
@@ -142,7 +148,7 @@ def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | Non
     except GraspdError as error:
         return {"key": "", "title": entry.title, "self_test": failed(str(error))}
     if found.best:
-        draw(hand, found.best, picture)
+        draw(hand, found.best, picture, entry.sides)
     jaws = jaws_of(hand)
     return {
         "key": key, "title": entry.title, "dofs": hand.dofs, "joints": len(hand.joint_names),
@@ -151,10 +157,10 @@ def tried(entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | Non
     }  # fmt: skip
 
 
-def draw(hand: HandModel, best: Best, picture: Path) -> None:
+def draw(hand: HandModel, best: Best, picture: Path, azimuths: tuple[float, float]) -> None:
     """The grasp from two sides, beside each other, in few colours: pages of many pictures stay light."""
     sides = grasp_pictures(
-        hand, best.obj, best.grasp.hand_pose, best.grasp.joint_positions, (EDGE, EDGE), azimuths=SIDES
+        hand, best.obj, best.grasp.hand_pose, best.grasp.joint_positions, (EDGE, EDGE), azimuths=azimuths
     )[0]
     drawn = Image.fromarray(np.concatenate(list(sides), axis=1)).quantize(128, dither=Image.Dither.NONE)
     data = io.BytesIO()

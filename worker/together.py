@@ -12,6 +12,7 @@ import numpy as np
 
 from service.model.domain import BATCH_SIZE, JobOptions
 from worker.certified import Certified, certified_grasps
+from worker.engines.joins import PER_LAUNCH
 from worker.hands.model import HandModel
 from worker.meeting import Meeting
 from worker.objects.model import ObjectModel
@@ -20,10 +21,6 @@ from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.run import ALONE, Progress, Run
 from worker.simulation.surroundings import Scenes
 
-#: Modules whose work may be done by a `Pool`.
-MODULES: Final = ("worker.quality.referee.judge", "worker.quality.table")
-#: Batches at work for each one in a launch: while one half is on the device, the other is judged and measured.
-PER_LAUNCH: Final = 2
 #: Times that batches are made for grasps that were too like those of another batch.
 _REFILLS: Final = 3
 

@@ -16,9 +16,10 @@ from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.meeting import Meeting
 from worker.objects.prepare import object_from_path
+from worker.pool.modules import MODULES
 from worker.pool.pool import Pool
 from worker.run import Run
-from worker.together import MODULES, certified_batches, distinct_batches
+from worker.together import certified_batches, distinct_batches
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), audits=0, grasps=6)
 

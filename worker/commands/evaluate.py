@@ -87,12 +87,7 @@ def evaluate_command(
     json: JsonFlag = False,
 ) -> None:
     """Measure grasps and let an independent engine judge them. Numbers are medians, ε and areas at 5 mm."""
-    if protocol not in get_args(Protocol):
-        raise InputError(f"unknown protocol {protocol!r}; choose {', '.join(get_args(Protocol))}")
-    levels = get_args(LiftLevel if protocol == "lift" else Level)
-    level = level or ("lift" if protocol == "lift" else "certificate")
-    if level not in levels:
-        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
+    level = _checked_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError("--robust judges pushes or lifts in other models: choose --protocol dexgraspbench or lift")
     if judge_hand is None and joint_map:
@@ -126,6 +121,22 @@ def evaluate_command(
                 run=Run(threads=threads, progress=partial(_show, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
+    _tell(rows, other.name if other else "", json=json)
+
+
+def _checked_level(protocol: str, level: str) -> str:
+    """The level of a protocol, its own default where none is said; InputError for what is neither's."""
+    if protocol not in get_args(Protocol):
+        raise InputError(f"unknown protocol {protocol!r}; choose {', '.join(get_args(Protocol))}")
+    levels = get_args(LiftLevel if protocol == "lift" else Level)
+    level = level or ("lift" if protocol == "lift" else "certificate")
+    if level not in levels:
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {', '.join(levels)}")
+    return level
+
+
+def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
+    """The rows of all files and what they are together, for people or for machines."""
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
@@ -135,7 +146,7 @@ def evaluate_command(
         if whole.get("robust_share") is not None:
             typer.echo(_said_of_models(whole))
         if "foreign_held" in whole:
-            typer.echo(_foreign(whole, other.name if other else ""))
+            typer.echo(_foreign(whole, foreign))
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)

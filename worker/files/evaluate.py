@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -20,7 +21,7 @@ from worker.hands.same_hand import SameHand
 from worker.quality.contact import contact_distance_consistency_mm
 from worker.quality.diversity import explained_variance, hand_points, nearest
 from worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
-from worker.quality.referee.decomposition import decompose
+from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.quality.referee.displacement import simulated_displacement_cm
 from worker.quality.referee.foreign import foreign_verdicts, share_counts
 from worker.quality.referee.judge import Verdicts, judge
@@ -35,6 +36,8 @@ from worker.scenes.way import plan_way
 from worker.simulation.surroundings import Placed
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
+#: Judges grasps in models around the nominal one: `_in_others` but for its first argument.
+InOthers = Callable[..., dict[str, Any]]
 
 #: Contact threshold of the row's area, epsilon and volume: the paper's [m].
 THRESHOLD_M: Final = 0.005
@@ -83,40 +86,58 @@ def evaluate(
         row["note"] = str(error)
         sd = None
     else:
+        judged = partial(_in_others, case, models=models, hard=hard, pieces=pieces, tell=tell, run=run)
         if protocol == "dexgraspbench":
-            verdicts = judge(
-                case.hand, case.obj, case.grasps, level=cast(Level, level), hard=hard, pieces=pieces, run=run,
-            )  # fmt: skip
-            row |= _success(case, verdicts, verdicts.seconds)
-            if models:
-                found = robust(
-                    case.hand, case.obj, case.grasps, held=verdicts.success, models=models, hard=hard, pieces=pieces,
-                    seed=MODELS_SEED, run=run,
-                )  # fmt: skip
-                tell(found)
-                row |= in_models(found, row.get("verdicts", []))
-            if judge_hand is not None:
-                both = foreign_verdicts(judge_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
-                row |= both.facts()
-                for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
-                    one |= {"held_foreign": bool(held), "reason_foreign": reason}
+            row |= _pushed(case, cast(Level, level), judge_hand, judged, hard=hard, pieces=pieces, run=run)
         if protocol == "lift" and case.placed is not None:
-            grasps, clear = _with_ways(case, case.placed)
             chosen: LiftLevel = "letter" if level == "letter" else "lift"
-            lifts = judge_lifts(
-                case.hand, case.obj, grasps, case.placed, level=chosen, hard=hard, pieces=pieces, run=run
-            )  # fmt: skip
-            row |= _lifted(lifts, clear)
-            if models:
-                found = robust(
-                    case.hand, case.obj, grasps, held=lifts.success, placed=case.placed, level=chosen, models=models,
-                    hard=hard, pieces=pieces, seed=MODELS_SEED, run=run,
-                )  # fmt: skip
-                tell(found)
-                row |= in_models(found, row["verdicts"])
+            row |= _lifted_out(case, case.placed, chosen, judged, hard=hard, pieces=pieces, run=run)
         sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
         row |= pieces.facts
     return row | _medians(case, table, sd)
+
+
+def _pushed(
+    case: Case, level: Level, judge_hand: SameHand | None, in_others: InOthers, *, hard: bool, pieces: ConvexPieces,
+    run: Run,
+) -> dict[str, Any]:  # fmt: skip
+    """What six pushes say, in the nominal model and in others."""
+    verdicts = judge(case.hand, case.obj, case.grasps, level=level, hard=hard, pieces=pieces, run=run)
+    row = _success(case, verdicts, verdicts.seconds)
+    row |= in_others(case.grasps, row.get("verdicts", []), held=verdicts.success)
+    if judge_hand is not None:
+        both = foreign_verdicts(judge_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
+        row |= both.facts()
+        for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
+            one |= {"held_foreign": bool(held), "reason_foreign": reason}
+    return row
+
+
+def _lifted_out(
+    case: Case, placed: Placed, level: LiftLevel, in_others: InOthers, *, hard: bool, pieces: ConvexPieces, run: Run
+) -> dict[str, Any]:
+    """What the lift out of their scenes says, in the nominal model and in others."""
+    grasps, clear = _with_ways(case, placed)
+    lifts = judge_lifts(case.hand, case.obj, grasps, placed, level=level, hard=hard, pieces=pieces, run=run)
+    row = _lifted(lifts, clear)
+    return row | in_others(grasps, row["verdicts"], held=lifts.success, placed=placed, level=level)
+
+
+def _in_others(
+    case: Case,
+    grasps: GraspSet,
+    verdicts: list[dict[str, Any]],
+    *,
+    models: int,
+    tell: Callable[[Robustness], None],
+    **given: Any,
+) -> dict[str, Any]:
+    """What models around the nominal one say, if any are asked; each verdict gets its share."""
+    if not models:
+        return {}
+    found = robust(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
+    tell(found)
+    return in_models(found, verdicts)
 
 
 def _success(case: Case, verdicts: Verdicts | None, seconds: float) -> dict[str, Any]:

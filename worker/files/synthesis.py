@@ -29,11 +29,12 @@ from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.objects.prepare import object_from_path
 from worker.planners import planner
+from worker.pool.modules import MODULES
 from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.run import FirstJudge, Progress, Run
 from worker.scenes.beside import scenes_of
-from worker.together import MODULES, certified_batches, distinct_batches
+from worker.together import certified_batches, distinct_batches
 
 Arrays = dict[str, NDArray[Any]]
 #: Threshold of the metrics that a summary tells [m].

@@ -16,11 +16,11 @@ from service.model.domain import TaskMessage
 from service.queue.port import Event, EventKind, Events
 from service.queue.rq_queue import WORKERS
 from service.queue.taking import message_of, take_alike
+from worker.engines.joins import PER_LAUNCH
 from worker.process.heartbeat import Hold
 from worker.process.runner import Runner
 from worker.stages.context import TaskContext
 from worker.stages.packing import Packer
-from worker.together import PER_LAUNCH
 
 log = logging.getLogger(__name__)
 #: The same for tasks that may be done together; None: by itself.

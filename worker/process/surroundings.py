@@ -13,12 +13,12 @@ from service.settings import Settings
 from service.store.store import Store
 from worker.engines.devices import Device
 from worker.engines.joins import batches_at_once, parse_join
+from worker.pool.modules import MODULES
 from worker.pool.pool import Pool
 from worker.pool.size import processes_at_once
 from worker.process.memory import limit_mb, resident_mb
 from worker.stages.context import TaskContext
 from worker.stages.packing import WAIT_S, Packer
-from worker.together import MODULES
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from cachetools import LRUCache
 
 from service.model.digests import digest_bytes
 from service.model.errors import InputError
-from service.store.network_file import ProposalNetwork, from_bytes, read_file, to_bytes
+from service.store.network_file import ProposalNetwork, from_bytes, read_file
 
 _known: Final[LRUCache[str, ProposalNetwork]] = LRUCache(16)
 _lock: Final = threading.Lock()
@@ -22,16 +22,11 @@ def keep_file(path: Path) -> str:
     Raises:
         InputError: no network.
     """
-    return _kept(read_file(path), str(path))
-
-
-def keep(network: ProposalNetwork) -> str:
-    """Keep a network that is in memory; the digest of its file.
-
-    Raises:
-        InputError: it could not be written.
-    """
-    return _kept(to_bytes(network), "the network")
+    data = read_file(path)
+    network, digest = from_bytes(data, str(path)), digest_bytes(data)
+    with _lock:
+        _known[digest] = network
+    return digest
 
 
 def kept(digest: str) -> ProposalNetwork:
@@ -45,10 +40,3 @@ def kept(digest: str) -> ProposalNetwork:
     if found is None:
         raise InputError(f"network {digest[:12]} is not known here; give its file: --option network=FILE.npz")
     return found
-
-
-def _kept(data: bytes, what: str) -> str:
-    network, digest = from_bytes(data, what), digest_bytes(data)
-    with _lock:
-        _known[digest] = network
-    return digest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from worker.planners import Asked, Wanted, method, planner, synthesize
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.scene_starts import ROOM, free_ways
 from worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
-from worker.planners.learned.known import keep
+from worker.planners.learned.known import keep_file
 from worker.planners.learned.network import Proposals, encode, save
 from worker.planners.learned.seeds import RETREATS, Seeds
 from worker.planners.registry import of_this_machine
@@ -58,6 +59,13 @@ def network(hand: HandModel) -> ProposalNetwork:
 def on_table(obj: ObjectModel, count: int, seed: int = 0) -> Placed:
     poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
     return Placed(supports_of(TABLE), poses, np.arange(count) % 2)
+
+
+def keep(network: ProposalNetwork) -> str:
+    """A network's digest, its file read by this process."""
+    with tempfile.TemporaryDirectory() as folder:
+        save(network, Path(folder) / "net.npz")
+        return keep_file(Path(folder) / "net.npz")
 
 
 def made(hand: HandModel, obj: ObjectModel, network: ProposalNetwork, count: int, **given: Any) -> GraspSet:
