@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from worker.studies.chart.labels import Label, place
 from worker.studies.chart.statistics import most_valid
 
 Row = Mapping[str, Any]
@@ -28,8 +29,6 @@ OF_ONE: Final = frozenset({"letter", "hard", "robust", "lift", "lift_letter", "l
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
 INK: Final = "#1f2937"
-#: Heights of neighbouring labels over their points, so that none lies on the next.
-LABELS_PT: Final = (6, -14, 18, -26)
 
 
 def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
@@ -38,23 +37,24 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
 
     figure = Figure(figsize=(15.5, 8.6), layout="constrained")
     panels = figure.subplots(2, 3)
-    styles = _styles(rows)
+    styles, words = _styles(rows), "valid grasps per second, end to end"
+    labels = []
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
-        _over_speed(axes, rows, styles, key, title, "valid grasps per second, end to end", SPEED)
-    last = panels.flat[5]
-    _panel(last, [r for r in rows if r["seconds_to_first_valid"]], styles, x="seconds_to_first_valid", y="letter")
+        labels += _over_speed(axes, rows, styles, key, title, words, SPEED)
+    last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
+    labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="letter")
     last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
     last.set_title("Success by the letter", loc="left", fontsize=11)
     last.set_ylim(-0.07, 1.04)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    for file in files:
-        figure.savefig(file, dpi=150)
+    _save(figure, labels, files)
 
 
 def draw_hands(
-    by_hand: Mapping[str, Sequence[Row]], files: Sequence[Path], *, key: str, speed: str, words: tuple[str, str]
-) -> None:
-    """A panel for each hand: one accuracy over speed, both in words."""
+    by_hand: Mapping[str, Sequence[Row]], files: Sequence[Path], *, key: str, speed: str, words: tuple[str, str],
+    label: Callable[[Row, Sequence[Row]], str] | None = None,
+) -> None:  # fmt: skip
+    """A panel for each hand: one accuracy over speed, both in words; `label` gives a point's word."""
     from matplotlib.figure import Figure
 
     columns = min(3, len(by_hand))
@@ -62,12 +62,18 @@ def draw_hands(
     figure = Figure(figsize=(5.4 * max(columns, 2), 4.6 * lines), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False)
     styles = _styles([row for rows in by_hand.values() for row in rows])
+    labels = []
     for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
-        _over_speed(axes, rows, styles, key, hand, words[1], speed)
+        labels += _over_speed(axes, rows, styles, key, hand, words[1], speed, label=label)
     for axes in panels.flat[len(by_hand) :]:
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    _save(figure, labels, files)
+
+
+def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
+    place(figure, labels)
     for file in files:
         figure.savefig(file, dpi=150)
 
@@ -75,37 +81,42 @@ def draw_hands(
 def _over_speed(
     axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], key: str, title: str, words: str, speed: str,
     label: Callable[[Row, Sequence[Row]], str] | None = None,
-) -> None:  # fmt: skip
-    """One accuracy over a speed, with the front."""
+) -> list[Label]:  # fmt: skip
+    """One accuracy over a speed, with the front; the words that belong to it."""
     known = [row for row in rows if row[key] is not None]
-    _panel(axes, known, styles, x=speed, y=key, label=label)
+    labels = _panel(axes, known, styles, x=speed, y=key, label=label)
     _front(axes, known, key, speed)
     axes.set_xlabel(words)
     axes.set_title(title, loc="left", fontsize=11)
     if key in OF_ONE:
         axes.set_ylim(-0.07, 1.07)
+    return labels
 
 
-def draw_scenes(rows: Sequence[Row], files: Sequence[Path]) -> None:
-    """Shares of tries over lifted grasps per CPU second, and what is lifted over the seconds to the first."""
+def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
+    """Shares of tries over lifted grasps per second, and what is lifted over the seconds to the first.
+
+    Args:
+        second: what a second is called.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15.5, 8.6), layout="constrained")
     panels = figure.subplots(2, 3)
     styles = _styles(rows)
-    words = "lifted grasps per CPU second, end to end"
+    words = f"lifted grasps per {second}, end to end"
+    labels = []
     for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        _over_speed(axes, rows, styles, key, title, words, SPEED, label=_one_of_several)
+        labels += _over_speed(axes, rows, styles, key, title, words, SPEED, label=one_of_several)
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
-    _panel(last, timed, styles, x="seconds_to_first", y="lift", label=_one_of_several)
-    last.set_xlabel("CPU seconds to the first that is lifted (less is better)")
+    labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=one_of_several)
+    last.set_xlabel(f"{second}s to the first that is lifted (less is better)")
     last.set_title("Lifted; of those that lift in every pair", loc="left", fontsize=11)
     last.set_ylim(-0.07, 1.07)
     panels.flat[5].set_visible(False)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    for file in files:
-        figure.savefig(file, dpi=150)
+    _save(figure, labels, files)
 
 
 def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
@@ -117,7 +128,8 @@ def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
 def _panel(
     axes: Any, rows: Sequence[Row], styles: Mapping[str, tuple[str, str]], *, x: str, y: str,
     label: Callable[[Row, Sequence[Row]], str] | None = None,
-) -> None:  # fmt: skip
+) -> list[Label]:  # fmt: skip
+    """The points; the words that belong to them."""
     shown: set[str] = set()
     labels = []
     for row in rows:
@@ -137,20 +149,19 @@ def _panel(
         )  # fmt: skip
         shown.add(row["method"])
         text = (label or _label)(row, rows)
-        labels.append((at, row[y], ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none))), colour))
-    _logarithmic(axes, [at * (0.5 if "0 of" in text else 1.0) for at, _, text, _ in labels])
+        words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
+        ends = {f"{axis}_bar": _ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")}
+        labels.append(Label(axes, at, row[y], words, colour, **({"x_bar": (0.45 * at, at)} if none else {}), **ends))
+    _logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
     top = max([row[f"{y}_high"] for row in rows] or [1.0])
     axes.set_ylim(-0.09 * top, 1.08 * top)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    placed: list[tuple[float, float]] = []
-    for at_x, at_y, text, colour in sorted(labels):
-        # Above its point, or below it where a label stands already.
-        near = any(at_x / left < 2.5 and abs(at_y - up) < 0.07 * top for left, up in placed)
-        placed += [] if near else [(at_x, at_y)]
-        axes.annotate(
-            text, (at_x, at_y), xytext=(7, -13 if near else 6), textcoords="offset points", fontsize=8, color=colour
-        )
+    return labels
+
+
+def _ends(row: Row, key: str) -> tuple[float, float] | None:
+    return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
 
 
 def _logarithmic(axes: Any, values: Sequence[float]) -> None:
@@ -161,7 +172,8 @@ def _logarithmic(axes: Any, values: Sequence[float]) -> None:
     low, high = min(values, default=1.0), max(values, default=1.0)
     wider = max(1.0, (10 / (high / low)) ** 0.5)
     axes.set_xlim(low / wider / 1.4, high * wider * 2.2)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    # Over four decades the numbers between would stand on each other.
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
@@ -179,7 +191,7 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
 
 
-def _one_of_several(row: Row, rows: Sequence[Row]) -> str:
+def one_of_several(row: Row, rows: Sequence[Row]) -> str:
     """The fidelity where a method has several; the legend names the others."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
@@ -201,18 +213,16 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     lines = -(-len(knobs) // columns)
     figure = Figure(figsize=(11, 3.1 * lines), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    labels = []
     for axes, knob in zip(panels.flat, knobs, strict=False):
         own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
         axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
-        for number, row in enumerate(own):
+        for row in own:
             axes.errorbar(
                 row["speedup"], row["gsr"], yerr=_error(row, "gsr"), fmt="o", color=COLOURS[0], capsize=2,
                 elinewidth=1, markerfacecolor=COLOURS[0] if row["default"] else "white", markersize=6,
             )  # fmt: skip
-            axes.annotate(
-                str(row["value"]), (row["speedup"], row["gsr"]), xytext=(5, LABELS_PT[number % 4]),
-                textcoords="offset points", fontsize=8,
-            )  # fmt: skip
+            labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)
         axes.grid(alpha=0.25)
@@ -225,4 +235,4 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
         axes.tick_params(labelbottom=True)
     figure.supxlabel("speed against the default (full marker)", fontsize=10)
     figure.supylabel("success in MuJoCo", fontsize=10)
-    figure.savefig(file, dpi=150)
+    _save(figure, labels, [file])
