@@ -11,6 +11,7 @@ from service.model.diversity import CELLS
 from service.model.domain import Digest, JobRequest, Stage, State
 from service.model.labels import Name
 from service.model.metric_fields import OfferedName, filters, means, with_fields
+from service.model.records import Choice
 from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind
 from service.model.where import LONGEST
@@ -85,6 +86,7 @@ class JobDetail(Job):
     request: JobRequest
     hand_digest: str
     object_digest: str
+    choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
     note: str | None = Field(None, description="what a reader of the numbers should know")
     audited: int = Field(0, description="valid grasps judged again by the letter of the protocol")
     audit_held: int = Field(0, description="of these, grasps that held")

@@ -1,14 +1,25 @@
-"""Empty indexes of SQLite in milliseconds: the migrations run once a process, and their outcome is copied."""
+"""Empty indexes in milliseconds: the migrations run once a process, and their outcome is copied or used again."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Final
+
+from sqlalchemy import Connection, create_engine, text
 
 from service.index.index import Index
+from tests.servers import PostgresServer, schema_of
 
 _PREFIX = "sqlite:///"
+#: Tables of a schema that hold pages, but for the one that names the revision.
+_WRITTEN: Final = text("""
+    SELECT c.oid::regclass::text FROM pg_class c JOIN pg_namespace n ON n.oid = c.relnamespace
+    WHERE n.nspname = :schema AND c.relkind = 'r' AND c.relname <> 'alembic_version' AND pg_relation_size(c.oid) > 0
+""")
 
 
 def empty_index(url: str) -> Index:
@@ -25,3 +36,42 @@ def _migrated() -> bytes:
         file = Path(folder) / "index.sqlite"
         Index(f"{_PREFIX}{file}").close()
         return file.read_bytes()
+
+
+class MigratedSchemas:
+    """Schemas of a PostgreSQL with the empty tables of an index. One that was given back is emptied and lent again once
+    nobody is connected to it any more; who changes tables, and not only rows, takes `server.database()`."""
+
+    def __init__(self, server: PostgresServer) -> None:
+        self._server = server
+        self._returned: list[str] = []
+        self._engine = create_engine(server.url(), isolation_level="AUTOCOMMIT")
+
+    @contextmanager
+    def lent(self) -> Iterator[str]:
+        """URL of an index that holds nothing."""
+        with self._engine.connect() as connection:
+            url = self._emptied(connection) or self._made(connection)
+        yield url
+        self._returned.append(url)
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._engine.dispose()
+
+    def _emptied(self, connection: Connection) -> str | None:
+        busy = set(connection.scalars(text("SELECT application_name FROM pg_stat_activity")))
+        url = next((url for url in self._returned if schema_of(url) not in busy), None)
+        if url is not None:
+            self._returned.remove(url)
+            # Not DELETE: what comes later lies where it would lie in new tables.
+            if written := connection.scalars(_WRITTEN, {"schema": schema_of(url)}).all():
+                connection.exec_driver_sql(f"TRUNCATE {', '.join(written)}")
+        return url
+
+    def _made(self, connection: Connection) -> str:
+        url = self._server.database()
+        Index(url).close()
+        written = connection.scalars(_WRITTEN, {"schema": schema_of(url)}).all()
+        assert not written, f"migrations put rows into {written}: to empty these would lose them"
+        return url

@@ -10,7 +10,8 @@ from typing import Final
 from api.models import GraspScene, Neighbour, Waypoint
 from service.model.scene_kinds import supports_in
 from service.readers.ways import scene_spec_of, stop_places, way_of
-from service.store.shards import SCHEMAS, Shard
+from service.store.columns import SCHEMAS
+from service.store.shards import Shard
 
 _LIFT: Final = "quality/lift_outcome"
 #: What the numbers of the column mean, as its description in the schema says.

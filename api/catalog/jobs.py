@@ -58,7 +58,8 @@ class Jobs:
                 job, is_new = job_actions.enter(self._parts, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job was there already")
-        return self._detail(job)
+        # The same job may be there by its fidelity's name: whoever asked with a target is told what it came to.
+        return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
         """Stop a job.
@@ -151,6 +152,7 @@ class Jobs:
         return JobDetail(
             **self._job(job, self._running(job.id)).model_dump(),
             request=job.request,
+            choice=job.choice,
             note=job.note,
             audited=job.audited,
             audit_held=job.audit_held,

@@ -57,7 +57,7 @@ def submit(
     ] = None,
     fidelity: Annotated[str, typer.Option(help="draft, standard, fine, or auto with --target.")] = "standard",
     target: Annotated[
-        str, typer.Option(help="With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest that meets it is taken.")
+        str, typer.Option(help="With auto: gsr>=0.6 or pd_mm<=1, in a scene lift>=0.9; the cheapest that meets it.")
     ] = "",
     seed: Annotated[int, typer.Option(help="The same seed gives the same grasps.")] = 0,
     scene: Annotated[

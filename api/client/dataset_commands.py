@@ -237,15 +237,16 @@ def _matrix(client: Client, asked: Wanted) -> tuple[Objects | None, dict[str, An
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
+    known = {found.name: found.objects for found in DatasetClient(client).object_sets()}
     path = Path(objects)
-    if files := files_of_set(path):
+    # A set goes by its name also where the folder lies that it was added from; ./NAME is the folder.
+    if objects not in known and (files := files_of_set(path)):
         matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
         return files, asked.shared_out(matrix, len(files))
-    if path.is_file():
+    if objects not in known and path.is_file():
         raise InputError(f"{objects} is one object; `graspd objects add {objects}`, then name it here")
     if "/" in objects:
         raise InputError(f"there is no folder {objects}; give one that exists, or names of objects and sets")
-    known = {found.name: found.objects for found in DatasetClient(client).object_sets()}
     single = [name for name in names if name not in known]
     matrix |= {"objects": single, "sets": [name for name in names if name in known]}
     members = {*single, *(member for name in names for member in known.get(name, ()))}

@@ -19,7 +19,7 @@ _HELP: Final = {
     "grasps": "Grasps for each hand and object.",
     "fidelity": f"{', '.join(OFFERED)}, or auto with --target.",
     "options": "An option of the planner, such as steps=20000; several times.",
-    "target": "With auto: gsr>=0.6, epsilon>=0.2 or pd_mm<=1; for each cell the cheapest that meets it is taken.",
+    "target": "With auto: gsr>=0.6 or pd_mm<=1, in a scene lift>=0.9; for each cell the cheapest that meets it.",
     "method": "Planner.",
     "seed": "The same seed gives the same grasps.",
     "scene": "Where the grasps are used: free, table, bin, shelf, or a JSON or YAML file.",

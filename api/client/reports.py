@@ -76,6 +76,8 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
         "state": job.state.value,
         "hand": job.hand,
         "object": job.object,
+        "fidelity": job.fidelity,
+        "choice": job.choice and job.choice.model_dump(),
         "grasps": job.grasps,
         "valid": job.valid,
         "tried": job.tried,
@@ -140,6 +142,8 @@ def diversity_of(found: Diversity) -> str:
 def _print_job(job: JobDetail, url: str) -> None:
     console = Console(highlight=False)
     console.print(f"{job.hand} × {job.object}  {job.state.value}  {url}/jobs/{job.id}", markup=False, soft_wrap=True)
+    if job.choice:
+        console.print(f"fidelity: {job.fidelity}, {job.choice}", markup=False, soft_wrap=True)
     if job.reason:
         console.print(f"reason: {job.reason}", markup=False)
     if job.note:

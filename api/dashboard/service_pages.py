@@ -90,22 +90,35 @@ def _by_holder(shards: list[Keeping]) -> dict[str, list[Keeping]]:
 
 
 @router.get("/chart", dependencies=[Depends(may_read)])
-def chart_page(request: Request, store: StoreOf, y: str = "gsr", hand: str = "", object: str = "") -> HTMLResponse:
-    """Speed against accuracy of methods and fidelities, as `graspd chart` measured them last."""
+def chart_page(
+    request: Request, store: StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
+) -> HTMLResponse:
+    """Speed against accuracy of methods and fidelities, free and in scenes, as `graspd chart` measured them last."""
     measured = tradeoff.load(store)
-    axis = y if y in tradeoff.AXES else "gsr"
+    axis = {
+        False: y if y in tradeoff.FREE else "gsr",
+        True: lifts if lifts in tradeoff.IN_SCENES else "lift",
+    }
+    drawn = [tradeoff.draw(one, axis=axis[one.scene is not None], hand=hand, object=object) for one in measured]
     return render(
         request,
         "chart.html",
         page="/chart",
         poll_s=_STUDY_S,
-        measured=measured,
-        chart=tradeoff.draw(measured, axis=axis, hand=hand, object=object) if measured else None,
-        axes=tradeoff.AXES,
-        axis=axis,
+        charts=list(zip(measured, drawn, strict=True)),
+        # Title, name in the address, accuracies and the one chosen, of each kind of chart that there is.
+        choices=[
+            (title, field, axes, axis[in_scene])
+            for title, field, axes, in_scene in (
+                ("Accuracy", "y", tradeoff.FREE, False), ("In scenes", "lifts", tradeoff.IN_SCENES, True),
+            )
+            if any((one.scene is not None) == in_scene for one in measured)
+        ],
+        hands=sorted({run.hand for one in measured for run in one.runs}),
+        objects=sorted({run.object for one in measured for run in one.runs}),
         hand=hand,
         object=object,
-    )
+    )  # fmt: skip
 
 
 @router.get("/stability", dependencies=[Depends(may_read)])

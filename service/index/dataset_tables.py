@@ -42,6 +42,7 @@ dataset_cells: Final = Table(
     Column("object_digest", String(32), nullable=False),
     Column("job_id", String(32), nullable=False),
     Column("fidelity", String(64), nullable=True),
+    Column("choice", JSON(none_as_null=True)),
     Index("dataset_cells_by_job", "job_id"),
 )
 

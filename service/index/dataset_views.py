@@ -6,6 +6,7 @@ from pydantic import Field
 
 from service.index.views import View
 from service.model.domain import JobOptions, State
+from service.model.records import Choice
 
 
 class DatasetView(View):
@@ -51,6 +52,7 @@ class CellView(View):
     object: str
     job_id: str
     fidelity: str = Field("", description="its name; of a dataset with `auto`, what the chart promised for this cell")
+    choice: Choice | None = Field(None, description="how a chart chose that fidelity")
     planned: bool = Field(description="whether the job exists yet")
     state: State
     asked: int = Field(description="grasps asked for")

@@ -48,6 +48,7 @@ jobs: Final = Table(
     Column("reason", Text),
     # Digests of its neighbours, with a space between; a list would need a table.
     Column("neighbours", String(300), nullable=False, server_default=""),
+    Column("choice", JSON(none_as_null=True)),
     Index("jobs_beside", "neighbours"),
     Index("jobs_newest", "created", "id"),
     Index("jobs_by_state", "state", "created", "id"),

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
 from service.model.metric_fields import values, with_fields
+from service.model.records import Choice
 
 T = TypeVar("T")
 
@@ -50,6 +51,7 @@ class JobView(View):
     owner: str = Field("", description="id of the key that submitted it; empty: none, or not known")
     project: str = Field("", description="project that it belongs to; empty: the one without a name")
     finished: str | None
+    choice: Choice | None = Field(None, description="how a chart chose its fidelity, where the request said auto")
     reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
     stages: list[StageProgress] = []
     grasps: int = Field(0, description="grasps kept so far")

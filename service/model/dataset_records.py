@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -16,7 +16,7 @@ from service.model.clock import timestamp
 from service.model.digests import digest_json
 from service.model.domain import AUTO, Digest, JobOptions, JobRequest, Lane, Name
 from service.model.projects import Project
-from service.model.records import JobRecord, Record
+from service.model.records import Choice, JobRecord, Record
 
 
 class Member(Record):
@@ -36,11 +36,14 @@ class Cell:
     job_id: str
     fidelity: str = ""
     """What the chart promised for this cell, where the dataset's fidelity is `auto`."""
+    choice: Choice | None = None
+    """How that was chosen; None also of datasets from before it was written down."""
 
 
 class DatasetRecord(Record):
     """`dataset.json`. `jobs` are those of the cells, hand by hand, and in each hand object by object; with fidelity
-    `auto`, `fidelities` are what the chart promised for them when the dataset was created."""
+    `auto`, `fidelities` are what the chart promised for them when the dataset was created, and `chosen` the places in
+    `choices` of how each was chosen."""
 
     version: Literal[1] = 1
     name: Name
@@ -51,6 +54,8 @@ class DatasetRecord(Record):
     revisions: dict[str, int]
     jobs: tuple[Digest, ...]
     fidelities: tuple[str, ...] = ()
+    choices: tuple[Choice, ...] = Field((), exclude_if=lambda value: not value)
+    chosen: tuple[Annotated[int, Field(ge=0)], ...] = Field((), exclude_if=lambda value: not value)
     created: str
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
     project: Project = Field("", description="project of that key; empty: the one without a name")
@@ -61,13 +66,17 @@ class DatasetRecord(Record):
             raise ValueError("a dataset has a job for each hand and object")
         if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
             raise ValueError("a dataset has a fidelity for each cell if its own is auto, and else none")
+        if self.chosen and (len(self.chosen) != len(self.jobs) or max(self.chosen) >= len(self.choices)):
+            raise ValueError("a dataset says of each cell how its fidelity was chosen, or of none")
         return self
 
     def cells(self) -> Iterator[Cell]:
         """The cells in their order."""
         pairs = ((hand, obj) for hand in self.hands for obj in self.objects)
         for position, ((hand, obj), job) in enumerate(zip(pairs, self.jobs, strict=True)):
-            yield Cell(position, hand, obj, job, self.fidelities[position] if self.fidelities else "")
+            fidelity = self.fidelities[position] if self.fidelities else ""
+            choice = self.choices[self.chosen[position]] if self.chosen else None
+            yield Cell(position, hand, obj, job, fidelity, choice)
 
 
 class DatasetEvent(Record):
@@ -145,6 +154,7 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
         created=timestamp(),
         owner=owner,
         project=project,
+        choice=cell.choice,
     )
 
 

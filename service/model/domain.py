@@ -240,8 +240,9 @@ class JobOptions(Model):
     target: str = Field(
         "",
         max_length=40,
-        description="with fidelity `auto`: the accuracy wanted, gsr>=0.6, epsilon>=0.2 or pd_mm<=1; the cheapest "
-        "fidelity that meets it in the stored chart is taken when the job is submitted",
+        description="with fidelity `auto`: the accuracy wanted, such as gsr>=0.6, letter>=0.9, epsilon>=0.2 or "
+        "pd_mm<=1, with a scene lift>=0.9, lift_letter, lift_hard or robust; the cheapest fidelity that meets it in "
+        "the stored chart of such grasps is taken when the job is submitted",
     )
 
     @field_validator("fidelity")
@@ -260,7 +261,8 @@ class JobOptions(Model):
     @model_validator(mode="after")
     def _auto_needs_a_target(self) -> Self:
         if self.fidelity == AUTO and not self.target:
-            raise ValueError("fidelity auto needs a target, such as gsr>=0.6")
+            example = "lift>=0.9" if self.in_scene else "gsr>=0.6"
+            raise ValueError(f"fidelity auto needs a target, such as {example}")
         if self.target and self.fidelity != AUTO:
             raise ValueError("a target goes with fidelity auto")
         return self

@@ -17,6 +17,21 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
+class Choice(Record):
+    """How a chart put a fidelity in the place of `auto`."""
+
+    target: str = Field(description="the accuracy wanted")
+    chart: str = Field(description="key of the chart in the store")
+    measured_on: Literal["hand and object", "hand", "all"] = Field(
+        description="runs of the chart that counted: those of the same hand and object, of the same hand, or all"
+    )
+    reached: float = Field(description="the accuracy that the chosen fidelity had there")
+
+    def __str__(self) -> str:
+        where = "all of its runs" if self.measured_on == "all" else f"the same {self.measured_on}"
+        return f"chosen for {self.target}, reached {self.reached:.3g} with {where} in {self.chart}"
+
+
 class JobRecord(Record):
     """`job.json`: a request on the very hand and object it was made for, and the revision of each stage that its tasks
     are planned for."""
@@ -32,6 +47,9 @@ class JobRecord(Record):
     origin: Origin | None = None
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none, or not known")
     project: Project = Field("", description="project of that key; empty: the one without a name")
+    choice: Choice | None = Field(
+        None, exclude_if=lambda value: value is None, description="of a request with fidelity `auto`"
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -1,85 +1,143 @@
-"""The cheapest setting that the stored chart of speed against accuracy promises for a wanted accuracy."""
+"""The cheapest setting that the stored charts of speed against accuracy promise for a wanted accuracy."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, Literal, NamedTuple
 
+from service.model.charts import FREE, IN_SCENE, IN_SCENES, SPEEDS
 from service.model.domain import AUTO, OFFERED, JobRequest
 from service.model.errors import InputError
+from service.model.records import Choice
 from service.store.store import Store
-from service.store.study_records import latest
+from service.store.study_records import charts_of, latest_key
 
-#: Accuracies that a target may name, and whether more is better.
-METRICS: Final = {"gsr": True, "epsilon": True, "pd_mm": False}
+Row = Mapping[str, Any]
+Near = Literal["hand and object", "hand", "all"]
 
-_TARGET: Final = re.compile(r"\s*(gsr|epsilon|pd_mm)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
+_TARGET: Final = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
+_EXAMPLES: Final = {False: "gsr>=0.6, epsilon>=0.2 or pd_mm<=1", True: "lift>=0.9, lift_hard>=0.7 or robust>=0.95"}
+#: What runs of a chart have in common with a request, the nearest first.
+_NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
+    ("hand and object", ("hand", "object")), ("hand", ("hand",)), ("all", ()),
+)  # fmt: skip
 
 
-def explicit(store: Store, request: JobRequest) -> JobRequest:
-    """The request with a fidelity in the place of `auto`.
+class Found(NamedTuple):
+    """A fidelity, and why it."""
 
-    Raises:
-        InputError: no chart was published, or nothing in it meets the target.
-    """
-    return Resolver(store)(request)
+    fidelity: str
+    measured_on: Near
+    reached: float
+
+
+@dataclass
+class _Chart:
+    """A stored chart, with what was measured in it."""
+
+    key: str
+    content: Row
+    found: dict[tuple[str, str, str, str], Found] = field(default_factory=dict)
+
+    @cached_property
+    def pairs(self) -> set[tuple[str, str]]:
+        """Hand and object of each run."""
+        return {(run["hand"], run["object"]) for run in self.content["runs"]}
+
+    @cached_property
+    def hands(self) -> set[str]:
+        """Hands of the runs."""
+        return {hand for hand, _ in self.pairs}
 
 
 class Resolver:
-    """`explicit` for many requests: the chart is read once, when the first of them needs it."""
+    """Puts fidelities in the place of `auto`. Each chart is read once, when the first request needs it.
+
+    A request around a free object asks the newest chart of free objects, one with a scene the newest of its kind of
+    scene (`charts_of`), never the other: what holds against six pushes need not come out of a bin.
+    """
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._chart: dict[str, Any] | None = None
-        self._hands: set[str] = set()
-        self._pairs: set[tuple[str, str]] = set()
-        self._found: dict[tuple[str, str, str, str], str] = {}
+        self._charts: dict[Any, _Chart] = {}
 
     def __call__(self, request: JobRequest) -> JobRequest:
-        """The request with a fidelity in the place of `auto`; see `explicit`."""
+        """The request with a fidelity in the place of `auto`; errors as in `choose`."""
+        return self.choose(request)[0]
+
+    def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
+        """The request with a fidelity in the place of `auto`, and how that was chosen; None where it names one.
+
+        Raises:
+            InputError: no chart for its scene was published, or nothing in it meets the target.
+        """
         if request.fidelity != AUTO:
-            return request
-        if self._chart is None:
-            self._read()
+            return request, None
+        chart = self._chart(request)
         pair = (request.hand, request.object)
         # What the chart does not know is alike to it.
-        hand = request.hand if request.hand in self._hands else ""
-        key = (request.method, request.target, *(pair if pair in self._pairs else (hand, "")))
-        if key not in self._found:
+        hand = request.hand if request.hand in chart.hands else ""
+        key = (request.method, request.target, *(pair if pair in chart.pairs else (hand, "")))
+        if key not in chart.found:
             method, target, hand, object_ = key
-            self._found[key] = cheapest(self._chart or {}, target, method=method, hand=hand, object_=object_)
-        return request.model_copy(update={"fidelity": self._found[key], "target": ""})
+            chart.found[key] = cheapest(chart.content, target, method=method, hand=hand, object_=object_)
+        found = chart.found[key]
+        how = Choice(
+            target=request.target, chart=chart.key, measured_on=found.measured_on, reached=round(found.reached, 4)
+        )
+        return request.model_copy(update={"fidelity": found.fidelity, "target": ""}), how
 
-    def _read(self) -> None:
-        self._chart = latest(self._store, "charts")
-        if self._chart is None:
-            raise InputError("fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity")
-        self._pairs = {(run["hand"], run["object"]) for run in self._chart["runs"]}
-        self._hands = {hand for hand, _ in self._pairs}
+    def _chart(self, request: JobRequest) -> _Chart:
+        if request.scene not in self._charts:
+            key = latest_key(self._store, charts_of(request.place))
+            if not key:
+                raise InputError(_no_chart(request))
+            self._charts[request.scene] = _Chart(key, json.loads(self._store.get(key)))
+        return self._charts[request.scene]
 
 
-def parse_target(text: str) -> tuple[str, float]:
-    """`gsr>=0.6` as its metric and bound.
+def _no_chart(request: JobRequest) -> str:
+    if not request.in_scene:
+        return "fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity"
+    scene = request.place.kind
+    asked, named = ("FILE", "of a scene file with the same supports") if scene == "file" else (scene, f"in a {scene}")
+    return (
+        f"fidelity auto needs a chart of scenes, here {named}; that of free objects says nothing of lifts: run "
+        f"`graspd chart --scene {asked} --publish` once, or name a fidelity"
+    )
+
+
+def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
+    """`gsr>=0.6` as its metric and bound; in a scene `lift>=0.9`.
 
     Raises:
-        InputError: another form, or a bound on the side where it would ask for a worse grasp.
+        InputError: another form, an accuracy that charts of such grasps do not hold, or a bound on the side where it
+            would ask for a worse grasp.
     """
+    known, examples = IN_SCENES if in_scene else FREE, _EXAMPLES[in_scene]
     found = _TARGET.fullmatch(text)
     if found is None:
-        raise InputError(f"{text!r} is no target; write gsr>=0.6, epsilon>=0.2 or pd_mm<=1")
+        raise InputError(f"{text!r} is no target; write {examples}")
     metric, sign, bound = found.groups()
-    if (sign == ">=") != METRICS[metric]:
-        raise InputError(f"{text!r}: write {metric}{'>=' if METRICS[metric] else '<='}{bound}")
+    if metric not in known:
+        where = "in scenes" if in_scene else "of free objects"
+        raise InputError(f"{text!r}: charts {where} hold {', '.join(known)}; write {examples}")
+    if (sign == ">=") != known[metric]:
+        raise InputError(f"{text!r}: write {metric}{'>=' if known[metric] else '<='}{bound}")
     return metric, float(bound)
 
 
 def cheapest(
-    chart: Mapping[str, Any], target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
-) -> str:
+    chart: Row, target: str, *, method: str, hand: str, object_: str, offered: Sequence[str] = OFFERED
+) -> Found:
     """The fidelity of a method with most valid grasps per second among those that meet a target.
 
-    What was measured of this very hand and object counts; else of this hand; else everything.
+    What was measured of this very hand and object counts; else of this hand; else everything. In a chart of scenes
+    only grasps that were planned for them count, by lifted grasps per second.
 
     Args:
         chart: as `graspd chart` writes it.
@@ -92,27 +150,45 @@ def cheapest(
     Raises:
         InputError: no such target, nothing measured of the method, or nothing that meets the target.
     """
-    metric, bound = parse_target(target)
+    in_scene = "scene" in chart
+    metric, bound = parse_target(target, in_scene=in_scene)
+    more = (IN_SCENES if in_scene else FREE)[metric]
+    again = f"`graspd chart {'--scene ... ' if in_scene else ''}--publish`"
     runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in offered]
-    known = [run for run in runs if run.get(metric) is not None]
-    for same in (("hand", "object"), ("hand",), ()):
-        wanted = {"hand": hand, "object": object_}
-        near = [run for run in known if all(run[name] == wanted[name] for name in same)]
-        if near:
-            break
-    else:
-        raise InputError(f"the stored chart has no run of {method}; run `graspd chart --publish`, or name a fidelity")
-    means = {
-        fidelity: (_mean(near, fidelity, "valid_per_second"), _mean(near, fidelity, metric))
-        for fidelity in dict.fromkeys(run["fidelity"] for run in near)
-    }
-    good = [name for name, (_, value) in means.items() if (value >= bound if METRICS[metric] else value <= bound)]
+    runs = [run for run in runs if run.get("way", IN_SCENE) == IN_SCENE]
+    if not runs:
+        raise InputError(f"the stored chart has no run of {method}; run {again}, or name a fidelity")
+    found = _nearest(runs, metric, {"hand": hand, "object": object_})
+    if found is None:
+        raise InputError(f"the stored chart does not hold {metric} of {method}; run {again}, or ask for another target")
+    measured_on, near = found
+    names = dict.fromkeys(run["fidelity"] for run in near)
+    means = {name: (_speed(near, name), _mean(near, name, metric)) for name in names}
+    known = {name: (speed, value) for name, (speed, value) in means.items() if value is not None}
+    good = [name for name, (_, value) in known.items() if (value >= bound if more else value <= bound)]
     if not good:
-        best = (max if METRICS[metric] else min)(value for _, value in means.values())
+        best = (max if more else min)(value for _, value in known.values())
         raise InputError(f"no fidelity of {method} meets {target}; the best measured {metric} is {best:.3g}")
-    return max(good, key=lambda name: means[name][0])
+    chosen = max(good, key=lambda name: known[name][0])
+    return Found(chosen, measured_on, known[chosen][1])
 
 
-def _mean(runs: Sequence[Mapping[str, Any]], fidelity: str, name: str) -> float:
-    values = [float(run[name] or 0.0) for run in runs if run["fidelity"] == fidelity]
-    return sum(values) / len(values)
+def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
+    """The nearest runs of which one has the accuracy."""
+    for measured_on, same in _NEAR:
+        near = [run for run in runs if all(run[name] == wanted[name] for name in same)]
+        if any(run.get(metric) is not None for run in near):
+            return measured_on, near
+    return None
+
+
+def _speed(runs: Sequence[Row], fidelity: str) -> float:
+    """Mean over a fidelity's runs; one that found nothing, or was refused, is as slow as can be."""
+    own = [run for run in runs if run["fidelity"] == fidelity]
+    return sum(float(next((run[key] for key in SPEEDS if key in run), None) or 0.0) for run in own) / len(own)
+
+
+def _mean(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
+    """Mean over a fidelity's runs that have the accuracy; where nothing holds nobody knows how robustly it would."""
+    values = [float(run[metric]) for run in runs if run["fidelity"] == fidelity and run.get(metric) is not None]
+    return sum(values) / len(values) if values else None

@@ -20,8 +20,8 @@ from service.model.errors import ConflictError, InputError, NotFoundError, Unava
 from service.model.planning import lane_of, message_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
-from service.pipeline import fidelity_choice
 from service.pipeline.backends import Parts
+from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
 from service.pipeline.usable import usable, with_neighbours
@@ -70,7 +70,8 @@ def prepare(
     request, beside = with_neighbours(parts, request, reach)
     check_scene(request, obj, beside)
     parts.queue.ping()
-    request = fidelity_choice.explicit(parts.store, request.model_copy(update={"hand": hand.name, "object": obj.name}))
+    named = request.model_copy(update={"hand": hand.name, "object": obj.name})
+    request, choice = Resolver(parts.store).choose(named)
     return JobRecord(
         id=job_id(request, hand.digest, obj.digest, reach.project),
         request=request,
@@ -81,6 +82,7 @@ def prepare(
         origin=_present_origin(),
         owner=owner,
         project=reach.project,
+        choice=choice,
     )
 
 

@@ -17,10 +17,13 @@ from service.run.embedded import server_command
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets
-from tests.indexes import empty_index
+from tests.indexes import MigratedSchemas, empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer
 from tests.waiting import until
+
+#: The kinds of databases that an index may be in.
+DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)]
 
 
 @pytest.fixture(scope="session")
@@ -57,13 +60,23 @@ def rq_queue(redis_server: str) -> Iterator[RqQueue]:
     queue.close()
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
-def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database of each kind in turn."""
+@pytest.fixture(scope="session")
+def migrated_schemas(postgres_server: PostgresServer) -> Iterator[MigratedSchemas]:
+    """Schemas of the PostgreSQL of this test process that tests lend one after another."""
+    made = MigratedSchemas(postgres_server)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=DATABASES)
+def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """Where `empty_index` opens an index without rows: on a database of each kind in turn."""
     if request.param == "postgres":
-        server: PostgresServer = request.getfixturevalue("postgres_server")
-        return server.database()
-    return f"sqlite:///{tmp_path / 'index.sqlite'}"
+        schemas: MigratedSchemas = request.getfixturevalue("migrated_schemas")
+        with schemas.lent() as url:
+            yield url
+    else:
+        yield f"sqlite:///{tmp_path / 'index.sqlite'}"
 
 
 @pytest.fixture

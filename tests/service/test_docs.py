@@ -28,9 +28,3 @@ def test_settings_named_in_the_docs_exist() -> None:
     for page in pages:
         named = set(re.findall(r"GRASPD_[A-Z][A-Z_]*[A-Z]", page.read_text()))
         assert named <= known, f"{page.name} names unknown settings"
-
-
-def test_local_links_of_the_docs_lead_somewhere() -> None:
-    for page in [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md")]:
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"

@@ -6,7 +6,10 @@ import shlex
 import sys
 from collections.abc import Sequence
 from functools import partial
+from importlib import import_module
+from json import loads
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import typer
@@ -15,6 +18,7 @@ from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.model.domain import FIDELITIES, OFFERED
 from service.model.errors import InputError
 from service.model.robust import MODELS
+from service.model.scene_spec import SceneSpec, parse_scene
 from worker.engines.devices import Device
 from worker.run import Run
 
@@ -57,6 +61,9 @@ def chart(
     work: Annotated[
         Path | None, typer.Option(help="With --scene: folder that keeps each result; a stopped run goes on there.")
     ] = None,
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A chart.json: draw and publish it, measure nothing.")
+    ] = None,
     publish: Annotated[
         bool, typer.Option("--publish", help="Also into the store, for the dashboard and `fidelity: auto`.")
     ] = False,
@@ -65,15 +72,17 @@ def chart(
 ) -> None:
     """Speed against accuracy: every method and fidelity on the same hands and objects, judged by MuJoCo."""
     from worker.hands.load import hand_from_path
-    from worker.studies.chart.chart import chart as run
-    from worker.studies.chart.report import markdown, write
     from worker.studies.chart.settings import settings_of
     from worker.studies.chart.sweeps import sweep as turn
     from worker.studies.chart.sweeps import turns
 
+    if source is not None:
+        _finish(_read(source), out, data_dir, publish=publish, json=json)
+        return
     turns(knobs=knob or ())  # a wrong name is told before an hour of work
-    if scene != "free" and (sweep or publish):
-        raise InputError("--sweep and --publish are of free objects' charts; leave out --scene")
+    if scene != "free" and sweep:
+        raise InputError("--sweep is of free objects' charts; leave out --scene")
+    place = _place(scene)
     on = Run(Device(device).resolve(), threads)
     batches, models_around = [_number(part) for part in _parts(batch)], MODELS
     if quick:
@@ -86,53 +95,69 @@ def chart(
     models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
 
-    if scene != "free":
-        _in_scenes(models, things, chosen, scene, models=models_around, work=work, said=said, out=out, json=json)
-        return
-
     def keep(so_far: dict[str, Any]) -> None:
         if out is not None:
-            write(so_far | said, out)
+            _write(so_far | said, out)
 
-    result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep) | said
+    if place is None:
+        from worker.studies.chart.chart import chart as run
+
+        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep) | said
+    else:
+        from worker.studies.chart.scenes import scene_chart
+
+        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_say, keep=keep) | said
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on,
             knobs=knob or (), say=_say,
         )  # fmt: skip
+    _finish(result, out, data_dir, publish=publish, json=json)
+
+
+def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
     if out is not None:
-        write(result, out)
+        _write(result, out)
     if publish:
         _publish(result, data_dir)
     if json:
         emit(result)
     else:
-        typer.echo(markdown(result))
+        typer.echo(_report(result).markdown(result))
 
 
-def _in_scenes(
-    hands: Sequence[Any], things: Sequence[Any], settings: Sequence[Any], scene: str, *, models: int, work: Path | None,
-    said: dict[str, str], out: Path | None, json: bool,
-) -> None:  # fmt: skip
-    from service.model.scene_spec import parse_scene
-    from worker.studies.chart.scene_report import markdown, write
-    from worker.studies.chart.scenes import scene_chart
+def _report(chart: dict[str, Any]) -> ModuleType:
+    """The module that writes it: a chart in scenes has other columns."""
+    return import_module(f"worker.studies.chart.{'scene_report' if 'scene' in chart else 'report'}")
 
+
+def _write(chart: dict[str, Any], out: Path) -> None:
+    _report(chart).write(chart, out)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found = loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError:
+        found = None
+    if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
+        raise InputError(f"{path} is no chart.json; `graspd chart --out FOLDER` writes one")
+    if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
+        raise InputError(f"{path} has no {missing[0]}: an earlier graspd measured it, measure again")
+    return found
+
+
+def _place(scene: str) -> SceneSpec | None:
+    """The scene of a chart; None: around free objects."""
+    if scene == "free":
+        return None
     spec = parse_scene(scene)
     if spec.neighbours:
         raise InputError(f"{scene} has neighbours; the chart compares methods among supports alone: leave them out")
     # Every stable face of an object, where it is dropped.
-    spec = spec if spec.target is not None else parse_scene(scene, faces="all")
-
-    def keep(so_far: dict[str, Any]) -> None:
-        if out is not None:
-            write(so_far | said, out)
-
-    result = scene_chart(hands, things, settings, spec, models=models, work=work, say=_say, keep=keep) | said
-    if json:
-        emit(result)
-    else:
-        typer.echo(markdown(result))
+    return spec if spec.target is not None else parse_scene(scene, faces="all")
 
 
 def _short(word: str) -> str:
@@ -188,7 +213,7 @@ def _things(objects: Sequence[str]) -> list[Any]:
 
 def _publish(result: dict[str, Any], data_dir: Path | None) -> None:
     from service.store.store import open_store
-    from service.store.study_records import publish
+    from service.store.study_records import kind_of, publish
 
-    key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), "charts", result)
+    key = publish(open_store(load_settings(data_dir=data_dir).resolved_store_url), kind_of(result), result)
     _say(f"published as {key}")

@@ -1,32 +1,63 @@
-"""The chart of speed against accuracy that `graspd chart` leaves in the store: read, summed up, drawn as SVG."""
+"""The charts of speed against accuracy that `graspd chart` leaves in the store: read, summed up, drawn as SVG.
+
+One of free objects, and one for each kind of scene: they ask different questions, so none has points of another.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
+from service.model.charts import FILTERED
+from service.model.scene_spec import SceneSpec
 from service.store.store import Store
-from service.store.study_records import latest
+from service.store.study_records import CHARTS, latest, scene_kinds
 
 WIDTH: Final = 860
 HEIGHT: Final = 420
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
-#: Room of the longest label.
-_LABEL: Final = 190
-#: Accuracies to choose from: label, unit, whether more is better, factor from the stored number.
-AXES: Final[dict[str, tuple[str, str, bool, float]]] = {
-    "gsr": ("Success in MuJoCo", "%", True, 100.0),
-    "epsilon": ("ε", "", True, 1.0),
-    "pd_mm": ("Penetration", "mm", False, 1.0),
+#: A letter of a label, and a line of it; from a point to its label, and the point itself [px].
+_LETTER, _LINE, _AWAY, _DOT = 6.9, 15.0, 12.0, 7.0
+#: How far a label may move up or down from its point, the wanted places first [px].
+_MOVES: Final = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
+#: Of methods that know no fidelities; their label is their name.
+_NO_FIDELITY: Final = "as published"
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An accuracy to choose."""
+
+    label: str
+    unit: str = "%"
+    more_is_better: bool = True
+    factor: float = 100.0
+    """From the stored number."""
+
+
+#: Accuracies of grasps around free objects, and of grasps in scenes; the first one is drawn where none is chosen.
+FREE: Final[dict[str, Axis]] = {
+    "gsr": Axis("Success in MuJoCo"),
+    "letter": Axis("Success by the letter"),
+    "hard": Axis("Success at half the friction"),
+    "robust": Axis("Robust share of those that hold"),
+    "epsilon": Axis("ε", "", factor=1.0),
+    "pd_mm": Axis("Penetration", "mm", more_is_better=False, factor=1.0),
+}
+IN_SCENES: Final[dict[str, Axis]] = {
+    "lift": Axis("Lifted, of all tries"),
+    "lift_letter": Axis("Lifted by the letter"),
+    "lift_hard": Axis("Lifted at half the friction"),
+    "robust": Axis("Robust share of those lifted"),
 }
 
 
 class Run(BaseModel):
-    """One method at one fidelity on one hand and object."""
+    """One method at one fidelity on one hand and object; in scenes planned there, or filtered."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -34,11 +65,47 @@ class Run(BaseModel):
     fidelity: str
     hand: str
     object: str
+    way: str = ""
     valid_per_second: float | None = None
+    end_seconds: list[float] | float | None = None
+    kept: int | None = None
+    lift_count: int | None = None
     seconds_to_first_valid: float | None = None
+    seconds_to_first: float | None = None
     gsr: float | None = None
+    letter: float | None = None
+    hard: float | None = None
+    robust: float | None = None
     epsilon: float | None = None
     pd_mm: float | None = None
+    lift: float | None = None
+    lift_letter: float | None = None
+    lift_hard: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The method, and whether its grasps were put into the scene afterwards."""
+        return f"{self.method}, filtered" if self.way == FILTERED else self.method
+
+    @property
+    def label(self) -> str:
+        """That, with the fidelity where the method knows any."""
+        return self.name if self.fidelity == _NO_FIDELITY else f"{self.name} {self.fidelity}"
+
+    @property
+    def found(self) -> int | None:
+        """Grasps that are valid, in a scene lifted; None in charts of graspd 0.1."""
+        return self.kept if self.lift_count is None else self.lift_count
+
+    @property
+    def seconds(self) -> float:
+        """What they took end to end."""
+        return sum(self.end_seconds) if isinstance(self.end_seconds, list) else self.end_seconds or 0.0
+
+    @property
+    def first_s(self) -> float | None:
+        """Seconds to the first of them."""
+        return self.seconds_to_first_valid if self.seconds_to_first is None else self.seconds_to_first
 
 
 class Measured(BaseModel):
@@ -49,6 +116,17 @@ class Measured(BaseModel):
     runs: list[Run]
     created: str | None = None
     device: str | None = None
+    scene: SceneSpec | None = None
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """The accuracies that it may hold."""
+        return IN_SCENES if self.scene else FREE
+
+    @property
+    def counted(self) -> str:
+        """What its speeds count."""
+        return "lifted" if self.scene else "valid"
 
 
 @dataclass(frozen=True)
@@ -65,12 +143,20 @@ class Point:
     x: float = 0.0
     y: float = 0.0
     label_y: float = 0.0
+    is_left: bool = False
+    """Whether its label stands on its left."""
     series: int = 0
 
     @property
-    def is_right(self) -> bool:
-        """Whether a label to the right of the point would leave the chart."""
-        return self.x > WIDTH - _LABEL
+    def label(self) -> tuple[str, str]:
+        """Method and fidelity as they are written beside it."""
+        return self.method, "" if self.fidelity == _NO_FIDELITY else self.fidelity
+
+    def label_box(self, move: float, *, is_left: bool) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom of its label."""
+        width = _LETTER * len(" ".join(self.label))
+        start = self.x - _AWAY - width if is_left else self.x + _AWAY
+        return start, self.y + move - _LINE / 2, start + width, self.y + move + _LINE / 2
 
 
 @dataclass(frozen=True)
@@ -81,39 +167,43 @@ class Drawing:
     front: str
     x_ticks: list[tuple[float, str]]
     y_ticks: list[tuple[float, str]]
-    methods: list[str]
-    hands: list[str]
-    objects: list[str]
+    axis: Axis
+    nothing: list[str]
+    """Methods and fidelities that found nothing: they have no place on an axis of speeds."""
 
 
-def load(store: Store) -> Measured | None:
-    """The chart that was published last; None where there is none that can be read."""
-    try:
-        found = latest(store, "charts")
-        return None if found is None else Measured.model_validate(found)
-    except ValueError:
-        return None
+def load(store: Store) -> list[Measured]:
+    """The charts that were published last, that of free objects first; those that cannot be read are left out."""
+    found = []
+    for kind in (CHARTS, *scene_kinds(store)):
+        try:
+            content = latest(store, kind)
+            found += [] if content is None else [Measured.model_validate(content)]
+        except ValueError:
+            continue
+    return found
 
 
 def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
     """Points of every method and fidelity over the runs of a hand and an object (empty: all of them)."""
-    more_is_better, scale = AXES[axis][2], AXES[axis][3]
+    shown = measured.axes[axis]
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
-    methods = sorted({run.method for run in measured.runs})
-    points = [point for group in _groups(chosen) if (point := _point(group, axis, scale, methods)) is not None]
+    names = sorted({run.name for run in measured.runs})
+    groups = [group for group in _groups(chosen) if any(getattr(run, axis) is not None for run in group)]
+    points = [point for group in groups if (point := _point(group, axis, shown.factor, names)) is not None]
     points.sort(key=lambda point: point.speed)
-    front = pareto([(point.speed, point.accuracy if more_is_better else -point.accuracy) for point in points])
+    front = pareto([(p.speed, p.accuracy if shown.more_is_better else -p.accuracy) for p in points])
     across, x_ticks = _logarithmic([point.speed for point in points])
-    up, y_ticks = _linear([point.accuracy for point in points], top=100.0 if axis == "gsr" else None)
+    up, y_ticks = _linear([point.accuracy for point in points], top=100.0 if shown.unit == "%" else None)
     placed = _labelled(
         [
-            Point(**{**vars(point), "on_front": index in front, "x": across(point.speed), "y": up(point.accuracy)})
+            replace(point, on_front=index in front, x=across(point.speed), y=up(point.accuracy))
             for index, point in enumerate(points)
         ]
     )
     line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
-    hands, objects = (sorted({getattr(run, name) for run in measured.runs}) for name in ("hand", "object"))
-    return Drawing(placed, line, x_ticks, y_ticks, methods, hands, objects)
+    nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
+    return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
@@ -128,39 +218,65 @@ def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
 def _groups(runs: Sequence[Run]) -> list[list[Run]]:
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        groups.setdefault((run.method, run.fidelity), []).append(run)
+        groups.setdefault((run.name, run.fidelity), []).append(run)
     return list(groups.values())
 
 
-def _point(runs: list[Run], axis: str, scale: float, methods: list[str]) -> Point | None:
-    speeds = [run.valid_per_second for run in runs if run.valid_per_second]
+def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point | None:
+    speed = _speed(runs)
     values = [value for run in runs if (value := getattr(run, axis)) is not None]
-    firsts = [run.seconds_to_first_valid for run in runs if run.seconds_to_first_valid is not None]
-    if not speeds or not values:
+    firsts = [run.first_s for run in runs if run.first_s is not None]
+    if not speed or not values:
         return None
-    # Speeds of easy and hard objects differ by a factor, so their mean is the geometric one.
-    speed = math.exp(sum(map(math.log, speeds)) / len(speeds))
     return Point(
-        method=runs[0].method,
+        method=runs[0].name,
         fidelity=runs[0].fidelity,
         pairs=len(runs),
         speed=speed,
-        first_valid_s=sum(firsts) / len(firsts) if firsts else None,
+        # Of pairs on which nothing was found nobody knows how long it takes: a mean without them would flatter.
+        first_valid_s=sum(firsts) / len(firsts) if len(firsts) == len(runs) else None,
         accuracy=scale * sum(values) / len(values),
-        series=methods.index(runs[0].method) % 6,
+        series=names.index(runs[0].name) % 6,
     )
 
 
+def _speed(runs: Sequence[Run]) -> float:
+    """All that was found over all seconds that it took, end to end; 0 where nothing was found.
+
+    Charts of graspd 0.1 have speeds alone. Those of easy and hard objects differ by a factor: their mean is geometric.
+    """
+    if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
+        return sum(run.found or 0 for run in runs) / seconds
+    speeds = [run.valid_per_second for run in runs if run.valid_per_second]
+    return math.exp(sum(map(math.log, speeds)) / len(speeds)) if speeds else 0.0
+
+
 def _labelled(points: list[Point]) -> list[Point]:
-    """Labels beside their points, pushed down where two would lie on each other."""
+    """Labels beside their points: on the left or the right, up or down, where they cover the least."""
+    taken = [(p.x - _DOT, p.y - _DOT, p.x + _DOT, p.y + _DOT) for p in points]
     placed: list[Point] = []
     for point in sorted(points, key=lambda point: point.y):
-        at = point.y + 4
-        for other in placed:
-            if abs(other.x - point.x) < 130 and abs(other.label_y - at) < 15:
-                at = other.label_y + 15
-        placed.append(Point(**{**vars(point), "label_y": at}))
+        offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
+        boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
+        costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
+        # Of places that cover as little the first one, which is the nearest.
+        best = costs.index(min(costs))
+        move, is_left = offers[best]
+        taken.append(boxes[best])
+        placed.append(replace(point, label_y=point.y + move + 4, is_left=is_left))
     return sorted(placed, key=lambda point: point.speed)
+
+
+def _covered(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    across, up = (max(0.0, min(one[i + 2], other[i + 2]) - max(one[i], other[i])) for i in (0, 1))
+    return across * up
+
+
+def _outside(box: tuple[float, float, float, float]) -> float:
+    """How far a label would leave the chart, or stand on its ticks: worse than any cover."""
+    left, top, right, bottom = box
+    over = (_LEFT - left, right - (WIDTH - 4), -top, bottom - (HEIGHT - _BOTTOM))
+    return 1e4 * sum(max(0.0, part) for part in over)
 
 
 def _logarithmic(values: Sequence[float]) -> tuple[Callable[[float], float], list[tuple[float, str]]]:

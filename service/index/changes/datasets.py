@@ -49,6 +49,7 @@ class DatasetChanges:
                 "object_digest": cell.object.digest,
                 "job_id": cell.job_id,
                 "fidelity": cell.fidelity or None,
+                "choice": cell.choice and cell.choice.model_dump(),
             }
             for cell in record.cells()
         ]

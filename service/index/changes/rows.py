@@ -38,6 +38,7 @@ def job_row(record: JobRecord) -> Row:
         "finished": None,
         "reason": None,
         "neighbours": beside(record.request),
+        "choice": record.choice and record.choice.model_dump(),
     }
 
 

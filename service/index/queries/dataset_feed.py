@@ -12,6 +12,7 @@ from service.index.dataset_tables import dataset_cells, datasets
 from service.index.tables import jobs
 from service.model.dataset_records import Cell, Member
 from service.model.domain import JobOptions, State
+from service.model.records import Choice
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class DatasetFeed:
                     Member(name=row["object"], digest=row["object_digest"]),
                     row["job_id"],
                     row["fidelity"] or "",
+                    row["choice"] and Choice.model_validate(row["choice"]),
                 )
                 for row in connection.execute(query).mappings()
             ]

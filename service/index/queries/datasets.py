@@ -224,6 +224,9 @@ def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
     return dict(connection.execute(query).mappings().one())
 
 
+_OF_A_CELL: Final = ("position", "hand", "object", "job_id", "choice", "state", "planned", "reason")
+
+
 def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions) -> list[CellView]:
     ids = [row["job_id"] for row in rows]
     work = _work_by_job(connection, ids)
@@ -238,7 +241,10 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         yields = made.get(job, {"grasps": 0, "valid": 0, "tried": 0, "seconds": 0.0})
         views.append(
             CellView(
-                **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "reason")},
+                **{
+                    name: row[name]
+                    for name in ("position", "hand", "object", "job_id", "state", "planned", "reason", "choice")
+                },
                 fidelity=row["fidelity"] or options.knobs.name,
                 asked=options.grasps,
                 **yields,

@@ -50,7 +50,7 @@ def create(
     new = False
     # One that is there stays what it is: a later chart changes none of its fidelities.
     if not parts.store.exists(key):
-        found = describe(request.name, hands, objects, shared, Resolver(parts.store), owner, reach.project)
+        found = describe(request.name, hands, objects, shared, Resolver(parts.store).choose, owner, reach.project)
         new = put_record(parts.store, key, found)
     record = load_dataset(parts.store, request.name)
     if record.project != reach.project:

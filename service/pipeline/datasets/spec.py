@@ -11,6 +11,7 @@ from service.model.clock import timestamp
 from service.model.dataset_records import DatasetRecord, Member, request_of
 from service.model.digests import digest_json, job_id
 from service.model.domain import AUTO, JobOptions, JobRequest, Name
+from service.model.records import Choice
 from service.model.version import STAGE_REVISIONS
 
 #: Larger matrices are split by their user: the record of this many cells has 4 MB.
@@ -61,22 +62,24 @@ class DatasetRequest(Matrix):
 
 def describe(
     name: str, hands: Sequence[Member], objects: Sequence[Member], options: JobOptions,
-    resolve: Callable[[JobRequest], JobRequest], owner: str = "", project: str = "",
+    choose: Callable[[JobRequest], tuple[JobRequest, Choice | None]], owner: str = "", project: str = "",
 ) -> DatasetRecord:  # fmt: skip
     """The record of a dataset. Equal hands, objects, options and chosen fidelities have the same digest, whatever the
     name.
 
     Args:
-        resolve: puts a fidelity in the place of `auto`.
+        choose: puts a fidelity in the place of `auto`, and says how it was chosen.
         owner: id of the API key that submits it; no part of the digest.
         project: project of that key; its jobs belong to it.
 
     Raises:
         InputError: no fidelity meets the target on one of the cells.
     """
-    cells = [(hand, obj, resolve(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
+    cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
     # A fidelity that is chosen has a name.
-    fidelities = tuple(str(request.fidelity) for _, _, request in cells) if options.fidelity == AUTO else ()
+    fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
+    found = [choice for *_, choice in cells if choice is not None]
+    places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}
     content = {
         "hands": [[hand.name, hand.digest] for hand in hands],
         "objects": [[obj.name, obj.digest] for obj in objects],
@@ -90,8 +93,10 @@ def describe(
         objects=tuple(objects),
         options=options,
         revisions=dict(STAGE_REVISIONS),
-        jobs=tuple(job_id(request, hand.digest, obj.digest, project) for hand, obj, request in cells),
+        jobs=tuple(job_id(request, hand.digest, obj.digest, project) for hand, obj, request, _ in cells),
         fidelities=fidelities,
+        choices=tuple(places),
+        chosen=tuple(places[choice] for choice in found),
         created=timestamp(),
         owner=owner,
         project=project,

@@ -8,20 +8,24 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from typer.testing import CliRunner
 
 from api.client.reports import job_summary
 from api.models import JobDetail, MeanMetrics
+from graspd.cli import build
 from service.model.domain import AssetKind, JobRequest, State
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.library import load_asset_files
 from service.store.store import open_store
+from service.store.study_records import publish
+from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
@@ -29,13 +33,24 @@ STL = b"solid box\nendsolid box\n"
 
 @dataclass(frozen=True)
 class Shell:
-    """Runs `graspd` as a user does."""
+    """Runs `graspd` as a user does: in a process of its own, or in this one, which has imported it already."""
 
     environment: dict[str, str]
+    in_process: bool = True
+
+    @property
+    def apart(self) -> Shell:
+        return replace(self, in_process=False)
 
     def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "graspd", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, env=self.environment, timeout=60, check=False)
+        if not self.in_process:
+            return subprocess.run(
+                command, capture_output=True, text=True, env=self.environment, timeout=60, check=False
+            )
+        ours = {name: None for name in os.environ if name.startswith("GRASPD_")}
+        done = CliRunner().invoke(build(), arguments, env={**ours, **self.environment})
+        return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)
 
     def json(self, *arguments: str) -> dict[str, Any]:
         done = self(*arguments, "--json")
@@ -91,7 +106,7 @@ def test_a_job_has_neighbours_by_name_and_in_a_scene_file(graspd: Shell, tmp_pat
 
 
 def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
-    assert "allegro" in {hand["name"] for hand in graspd.json("hands", "list")["hands"]}
+    assert "allegro" in {hand["name"] for hand in graspd.apart.json("hands", "list")["hands"]}
     assert graspd.json("objects", "show", "mug")["verdict"] == "accept"
 
 
@@ -138,7 +153,7 @@ def test_an_unknown_job_is_exit_2(graspd: Shell, command: str) -> None:
 
 
 def test_no_service_is_exit_1_and_says_how_to_start_one(graspd: Shell) -> None:
-    done = Shell(graspd.environment | {"GRASPD_API_URL": "http://127.0.0.1:9"})("jobs")
+    done = Shell(graspd.environment | {"GRASPD_API_URL": "http://127.0.0.1:9"}).apart("jobs")
     assert done.returncode == 1
     assert "graspd up" in said(done)
 
@@ -151,13 +166,13 @@ def test_an_address_that_is_no_graspd_is_said_so(graspd: Shell) -> None:
 
 def test_a_taken_port_is_one_line_and_exit_1(graspd: Shell) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        done = graspd("api", "--port", str(taken.getsockname()[1]))
+        done = graspd.apart("api", "--port", str(taken.getsockname()[1]))
     assert done.returncode == 1
     assert "taken" in said(done)
 
 
 def test_the_api_refuses_strangers_without_a_key(graspd: Shell) -> None:
-    done = graspd("api", "--host", "0.0.0.0", "--port", "0")
+    done = graspd.apart("api", "--host", "0.0.0.0", "--port", "0")
     assert done.returncode == 2
     assert "graspd keys add" in said(done)
 
@@ -166,13 +181,13 @@ def test_a_store_that_cannot_be_written_is_one_line_and_exit_1(graspd: Shell, tm
     blocked = tmp_path / "file"
     blocked.write_bytes(b"")
     environment = graspd.environment | {"GRASPD_STORE_URL": (blocked / "store").as_uri()}
-    done = Shell(environment)("api", "--port", "0")
+    done = Shell(environment).apart("api", "--port", "0")
     assert done.returncode == 1
     assert str(blocked) in said(done)
 
 
 def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None:
-    shell = Shell(graspd.environment | {"GRASPD_DATA_DIR": str(tmp_path)})
+    shell = Shell(graspd.environment | {"GRASPD_DATA_DIR": str(tmp_path)}).apart
     made = shell.json("keys", "add", "lab", "--scope", "read")
     assert made["key"].startswith("gd_")
     assert [(key["name"], key["revoked"]) for key in shell.json("keys", "list")["keys"]] == [("lab", None)]
@@ -201,3 +216,17 @@ def test_the_keys_that_scripts_rely_on_are_there() -> None:
     summary = job_summary(job)
     assert {"job", "state", "grasps", "valid", "stages", "mean", "shards"} <= set(summary)
     assert set(summary["mean"]) == {"epsilon", "contact_area_cm2", "intersection_volume_cm3"}
+
+
+def test_a_job_with_a_target_says_which_fidelity_was_chosen_and_by_what(graspd: Shell, service: Supervisor) -> None:
+    asked = ("submit", "--hand", "allegro", "--object", "mug", "--scene", "shelf", "--fidelity", "auto", "--target")
+    done = graspd(*asked, "lift>=0.8")
+    assert done.returncode == 2 and "graspd chart --scene shelf --publish" in said(done)
+    key = publish(open_store(service.settings.resolved_store_url), "scene_charts/shelf", scene_chart("shelf"))
+    done = graspd(*asked, "lift>=0.8")
+    assert done.returncode == 0, done.stderr
+    told = f"fidelity: standard, chosen for lift>=0.8, reached 0.85 with the same hand and object in {key}"
+    assert told in done.stdout
+    assert graspd.json(*asked, "lift>=0.9")["choice"]["reached"] == 0.95
+    done = graspd(*asked, "gsr>=0.8")
+    assert done.returncode == 2 and "charts in scenes hold lift, lift_letter, lift_hard, robust" in said(done)

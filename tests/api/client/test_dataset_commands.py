@@ -83,6 +83,19 @@ def test_a_mistake_is_one_line_that_says_what(graspd: Shell, changes: tuple[str,
     assert done.returncode == 2 and words in said(done)
 
 
+def test_a_set_goes_by_its_name_beside_the_folder_it_was_added_from(
+    graspd: Shell, service: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Client(service.api_url) as client:
+        DatasetClient(client).add_object_set("kit", ["mug", "block"])
+    (tmp_path / "kit").mkdir()
+    (tmp_path / "kit" / "cup.stl").write_bytes(b"solid cup\nendsolid cup\n")
+    monkeypatch.chdir(tmp_path)
+    cells = {place: graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"]
+             for place in ("kit", "./kit")}  # fmt: skip
+    assert cells == {"kit": 2, "./kit": 1}
+
+
 def test_an_estimate_is_of_a_million_grasps_too(graspd: Shell) -> None:
     found = graspd.json("datasets", "estimate", "--hands", "shadow", "--objects", "mug", "--grasps", "1000000")
     assert found["asked"] == 1_000_000 and len(found["plans"]) == 3

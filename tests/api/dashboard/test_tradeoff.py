@@ -1,7 +1,9 @@
-"""The chart of speed against accuracy: its points, its front, and what stands there before anything is measured."""
+"""The charts of speed against accuracy: points, front, free ones apart from those in scenes, and what stands there
+before anything is measured."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 
@@ -10,8 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from api.dashboard.figures.tradeoff import Measured, draw, pareto
+from api.dashboard.figures.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
+from service.model.charts import FILTERED, IN_SCENE
+from service.model.scene_spec import SceneSpec
 from service.pipeline.backends import Parts
+from service.store.study_records import publish
 
 
 def run(fidelity: str, speed: float, gsr: float, **fields: object) -> dict[str, object]:
@@ -47,6 +52,63 @@ def test_faster_is_further_right_and_better_is_higher() -> None:
 def test_of_penetration_less_is_better() -> None:
     drawn = draw(Measured.model_validate({"runs": RUNS}), axis="pd_mm")
     assert {point.fidelity for point in drawn.points if point.on_front} == {"draft", "standard"}
+
+
+def lifted(fidelity: str, count: int, *, way: str = IN_SCENE, **fields: object) -> dict[str, object]:
+    """A run in a scene: of 20 tries so many were lifted, in 4 s."""
+    known = {"method": "fast_graspd", "way": way, "hand": "allegro", "object": "mug", "end_seconds": 4.0}
+    shares = {"lift": count / 20, "lift_letter": count / 20, "lift_hard": count / 40, "robust": 0.9 if count else None}
+    return known | {"fidelity": fidelity, "lift_count": count, "valid_per_second": 99.0, **shares} | fields
+
+
+def scenes_of(kind: str, *runs: dict[str, object]) -> dict[str, object]:
+    return {"created": "2026-11-21T10:00:00.000Z", "scene": SceneSpec(kind=kind).model_dump(mode="json"), "runs": runs}
+
+
+def test_speeds_in_scenes_are_what_was_lifted_over_the_seconds_of_all_pairs() -> None:
+    runs = [lifted("draft", 16), lifted("draft", 0, object="block"), lifted("draft", 4, way=FILTERED)]
+    drawn = draw(Measured.model_validate(scenes_of("table", *runs)), axis="lift")
+    assert [(point.method, point.speed, point.accuracy) for point in drawn.points] == [
+        ("fast_graspd, filtered", 1.0, pytest.approx(20.0)), ("fast_graspd", 2.0, pytest.approx(40.0)),
+    ]  # fmt: skip
+    assert drawn.nothing == []
+
+
+def test_end_to_end_seconds_count_before_the_planners_own() -> None:
+    runs = [run("draft", 90.0, 0.6, kept=10, end_seconds=[2.0, 3.0]), run("fine", 95.0, 0.9, kept=0, end_seconds=[1.0])]
+    drawn = draw(Measured.model_validate({"runs": runs}), axis="gsr")
+    assert [(point.fidelity, point.speed) for point in drawn.points] == [("draft", 2.0)]
+    assert drawn.nothing == ["fast_graspd fine"]
+
+
+@pytest.mark.parametrize("shares", [(3, 3, 4), (20, 20, 20), (0, 1, 1)])
+def test_no_label_lies_on_another_or_leaves_the_chart(shares: tuple[int, ...]) -> None:
+    """Slow ones beside each other, and a fast one that makes the axis long."""
+    runs = [lifted(f"fidelity {n}", 19, end_seconds=400.0 + 40 * n, lift=s / 20) for n, s in enumerate(shares)]
+    drawn = draw(Measured.model_validate(scenes_of("table", lifted("fast", 9), *runs)), axis="lift")
+    boxes = [point.label_box(point.label_y - 4 - point.y, is_left=point.is_left) for point in drawn.points]
+    assert len(boxes) == 4
+    for one, other in itertools.combinations(boxes, 2):
+        assert one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+    for left, top, right, bottom in boxes:
+        assert left >= 0 and right <= WIDTH and top >= 0 and bottom <= HEIGHT
+
+
+def test_the_page_draws_free_charts_and_those_in_scenes_apart(http: TestClient, parts: Parts) -> None:
+    publish(parts.store, "charts", {"created": "2026-11-21T10:00:00.000Z", "runs": RUNS})
+    for kind in ("table", "bin"):
+        publish(parts.store, f"scene_charts/{kind}", scenes_of(kind, lifted("standard", 18), lifted("fine", 19)))
+    page = http.get("/chart", params={"lifts": "lift_hard"}).text
+    titles = ["Around free objects", "In a bin", "On a table"]
+    assert [page.index(title) for title in titles] == sorted(page.index(title) for title in titles)
+    assert page.count("lifted grasps per second</text>") == 2 and page.count("valid grasps per second</text>") == 1
+    assert page.count("Lifted at half the friction [%]</text>") == 2
+
+
+def test_a_chart_in_scenes_is_drawn_where_there_is_no_other(http: TestClient, parts: Parts) -> None:
+    publish(parts.store, "scene_charts/table", scenes_of("table", lifted("standard", 18)))
+    page = http.get("/chart", params={"lifts": "magic"}).text
+    assert "Around free objects" not in page and "Lifted, of all tries [%]</text>" in page
 
 
 def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, parts: Parts) -> None:

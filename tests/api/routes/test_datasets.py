@@ -14,7 +14,7 @@ from service.pipeline.datasets.rounds import DatasetRounds
 from service.store.records import read_record
 from service.store.study_records import publish
 from tests.api.factories import finish_all
-from tests.service.pipeline.test_fidelity_choice import CHART
+from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart
 
 WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
 
@@ -76,6 +76,21 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, parts:
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
     assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
+
+
+def test_with_auto_cells_in_scenes_are_chosen_by_the_chart_of_such_scenes(http: TestClient, parts: Parts) -> None:
+    wanted = WANTED | {"scene": "table", "views": 0, "fidelity": "auto", "target": "lift>=0.8"}
+    publish(parts.store, "charts", CHART)
+    answer = http.post("/v1/datasets", json=wanted)
+    assert answer.status_code == 422 and "graspd chart --scene table --publish" in answer.text
+    key = publish(parts.store, "scene_charts/table", scene_chart())
+    assert http.post("/v1/datasets", json=wanted).status_code == 202
+    cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
+    assert [(cell["hand"], cell["object"], cell["fidelity"], cell["choice"]["measured_on"]) for cell in cells] == [
+        ("allegro", "mug", "standard", "hand and object"), ("allegro", "block", "draft", "hand"),
+        ("barrett", "mug", "standard", "hand"), ("barrett", "block", "standard", "hand"),
+    ]  # fmt: skip
+    assert {cell["choice"]["chart"] for cell in cells} == {key}
 
 
 def test_cells_come_in_pages_with_a_link_to_the_next(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:

@@ -12,7 +12,9 @@ from api.client.client import events_of
 from service.model.diversity import GraspType
 from service.model.planning import plan
 from service.pipeline.backends import Parts
+from service.store.study_records import publish
 from tests.api.factories import add_job, fail, finish, finish_all
+from tests.service.pipeline.test_fidelity_choice import scene_chart
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1}
 
@@ -35,6 +37,33 @@ def test_the_same_request_is_the_same_job(http: TestClient) -> None:
     first, second = (http.post("/v1/jobs", json=JOB).json()["id"] for _ in range(2))
     assert first == second
     assert len(http.get("/v1/jobs").json()["items"]) == 1
+
+
+def test_a_job_in_a_scene_with_auto_says_how_its_fidelity_was_chosen(http: TestClient, parts: Parts) -> None:
+    wanted = {**JOB, "views": 0, "scene": "table", "fidelity": "auto", "target": "lift>=0.8"}
+    refused = http.post("/v1/jobs", json=wanted)
+    assert refused.status_code == 422 and "graspd chart --scene table --publish" in refused.text
+    key = publish(parts.store, "scene_charts/table", scene_chart())
+    refused = http.post("/v1/jobs", json=wanted | {"target": "gsr>=0.6"})
+    assert refused.status_code == 422 and "lift, lift_letter, lift_hard, robust" in refused.text
+    answer = http.post("/v1/jobs", json=wanted)
+    assert answer.status_code == 202
+    choice = {"target": "lift>=0.8", "chart": key, "measured_on": "hand and object", "reached": 0.85}
+    for job in (answer.json(), http.get(answer.headers["location"]).json()):
+        assert (job["fidelity"], job["request"]["target"], job["choice"]) == ("standard", "", choice)
+    page = http.get(f"/jobs/{answer.json()['id']}").text
+    assert "Fidelity standard, chosen for lift&gt;=0.8, reached 0.85 with the same hand and object" in page
+
+
+def test_a_job_that_is_there_by_its_fidelity_tells_who_asks_with_a_target_how_it_was_chosen(
+    http: TestClient, parts: Parts
+) -> None:
+    publish(parts.store, "scene_charts/table", scene_chart())
+    wanted = {**JOB, "views": 0, "scene": "table"}
+    named = http.post("/v1/jobs", json=wanted | {"fidelity": "fine"}).json()
+    chosen = http.post("/v1/jobs", json=wanted | {"fidelity": "auto", "target": "lift>=0.9"}).json()
+    assert (named["id"], named["choice"]) == (chosen["id"], None)
+    assert chosen["choice"]["reached"] == 0.95
 
 
 def test_a_job_that_is_done_is_found_again_with_200(http: TestClient, parts: Parts) -> None:

@@ -20,19 +20,26 @@ from service.index.tables import metadata
 from service.index.views import Stats
 from service.model.errors import IndexUnavailable, InputError
 from service.store.store import open_store
+from tests.servers import PostgresServer
+from tests.service.conftest import DATABASES
 
 _CONFIG = Config()
 _CONFIG.set_main_option("script_location", str(MIGRATIONS))
 REVISIONS = [script.revision for script in ScriptDirectory.from_config(_CONFIG).walk_revisions()][::-1]
 
 
-@pytest.fixture
-def url(index_url: str) -> str:
-    """URL of an index with some data, of each kind in turn."""
-    index = Index(index_url)
+@pytest.fixture(params=DATABASES)
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of an index with some data that came to be by the migrations, of each kind in turn."""
+    if request.param == "postgres":
+        server: PostgresServer = request.getfixturevalue("postgres_server")
+        made = server.database()
+    else:
+        made = f"sqlite:///{tmp_path / 'index.sqlite'}"
+    index = Index(made)
     fill(index, open_store("memory://"), grasps=600, jobs=20)
     index.close()
-    return index_url
+    return made
 
 
 @pytest.fixture

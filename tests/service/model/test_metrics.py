@@ -12,7 +12,7 @@ import pytest
 from benchmarks.large_index import fill
 from service.index.index import Index
 from service.model.metrics import GRASP_METRICS
-from service.store.shards import SCHEMAS
+from service.store.columns import SCHEMAS
 from service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_metric import MEANING, NAME, TITLE

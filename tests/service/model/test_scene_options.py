@@ -47,7 +47,7 @@ def test_a_job_without_a_scene_keeps_its_id_its_record_and_its_message() -> None
 
 def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
     made = describe(
-        "d", [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)], JobOptions(), lambda one: one
+        "d", [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)], JobOptions(), lambda one: (one, None)
     )
     options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
     assert made.digest == digest_json({"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": options})

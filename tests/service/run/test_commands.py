@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from pydantic import BaseModel, Field
 from typer.testing import CliRunner
 
 from service.cli import load_settings, reporting_errors
-from service.model.errors import InputError, StoreUnavailable
+from service.model.errors import InputError, StoreUnavailable, UnavailableError
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.run.commands import app
@@ -137,6 +138,31 @@ def test_up_on_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) ->
     shown = runner.invoke(app, ["up", "--port", "0", "--data-dir", str(tmp_path / "file" / "data")])
     assert shown.exit_code == 1
     assert shown.stderr.splitlines()[-1].endswith("file/data cannot be made: Not a directory")
+
+
+def test_a_worker_that_never_gets_ready_is_named_with_its_log(tmp_path: Path) -> None:
+    broken = (sys.executable, "-c", "raise SystemExit(3)")
+    with (
+        Supervisor(Settings(data_dir=tmp_path, port=0), workers=1, api=False, worker_command=broken) as supervisor,
+        pytest.raises(UnavailableError, match=rf"worker-0 ended \d times before getting ready; see {tmp_path}/logs"),
+    ):
+        supervisor.wait_ready()
+
+
+def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.run.supervisor._TOLD_EVERY_S", 0.0)
+    idle, stop, told = (sys.executable, "-c", "import signal; signal.pause()"), threading.Event(), []
+
+    def say(line: str) -> None:
+        told.append(line)
+        if "waiting for workers;" in line:
+            stop.set()
+
+    with Supervisor(Settings(data_dir=tmp_path, port=0), workers=1, api=False, worker_command=idle) as supervisor:
+        assert not supervisor.wait_ready(say=say, stop=stop)
+    assert str(tmp_path / "logs") in told[-1]
 
 
 def test_the_keeper_ends_well_on_sigterm(tmp_path: Path) -> None:

@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from service.model.charts import FILTERED, IN_SCENE
+from service.model.scene_spec import SceneSpec
+from service.pipeline.fidelity_choice import cheapest
+from service.store.store import open_store
+from service.store.study_records import latest
 from worker.commands.chart import app
+from worker.hands.load import hand_from_path
+from worker.objects.prepare import object_from_path
 from worker.quality.intervals import wilson
+from worker.run import Run
+from worker.studies.chart import scenes
+from worker.studies.chart.chart import Thing
 from worker.studies.chart.scene_report import markdown
-from worker.studies.chart.scenes import FILTERED, IN_SCENE, figures, summed
+from worker.studies.chart.scenes import figures, summed
+from worker.studies.chart.settings import settings_of
 
+TABLE = SceneSpec(kind="table", faces="all")
 ARGUMENTS = ("--scene", "table", "--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett")
 
 
@@ -77,10 +91,65 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(
     assert again["runs"] == found["runs"]
 
 
-def test_a_free_chart_s_options_are_refused_with_a_scene(tmp_path: Path) -> None:
-    for option in ("--publish", "--sweep"):
-        done = CliRunner().invoke(app, [*ARGUMENTS, "--objects", "block", option])
-        assert done.exit_code == 2 and "leave out --scene" in done.output
+def test_a_sweep_is_refused_with_a_scene() -> None:
+    done = CliRunner().invoke(app, [*ARGUMENTS, "--objects", "block", "--sweep"])
+    assert done.exit_code == 2 and "leave out --scene" in done.output
+
+
+def test_a_chart_measured_earlier_is_published_apart_from_free_ones_and_drawn(
+    made: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    found, folder = made
+    arguments = ["--from", str(folder / "chart.json"), "--publish", "--data-dir", str(tmp_path), "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    store = open_store((tmp_path / "store").as_uri())
+    stored = latest(store, "scene_charts/table")
+    assert stored is not None and stored["runs"] == found["runs"]
+    assert latest(store, "charts") is None
+    assert (tmp_path / "chart.json").read_bytes() == (folder / "chart.json").read_bytes()
+    assert (tmp_path / "chart.md").read_text() == (folder / "chart.md").read_text()
+    # What it promises is what a job in such a scene is given.
+    draft = next(run for run in found["runs"] if run["way"] == IN_SCENE)
+    chosen = cheapest(stored, f"lift>={draft['lift']}", method="fast_graspd", hand="barrett", object_="block")
+    assert chosen == ("draft", "hand and object", draft["lift"])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [("{}", "is no chart.json"), ("no json", "is no chart.json"), ('{"created": "c", "runs": []}', "has no summary")],
+)
+def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: str, words: str) -> None:
+    file = tmp_path / "chart.json"
+    file.write_text(content)
+    done = CliRunner().invoke(app, ["--from", str(file)])
+    assert done.exit_code == 2 and words in " ".join(done.output.split())
+
+
+def test_seconds_are_those_of_the_clock_of_the_settings_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that goes 7 s at each look; on a GPU one of the seconds that pass."""
+    asked: list[str] = []
+
+    def clock(device: str) -> Callable[[], float]:
+        asked.append(device)
+        return count(0.0, 7.0).__next__
+
+    class Verdict:
+        def __init__(self, *_: object) -> None: ...
+
+        def counts(self, models: int) -> dict[str, Any]:
+            return {"clear_count": 2, "lift_count": 2, "lift_letter_count": 2, "lift_hard_count": 1, "robust_sum": 2.0}
+
+    monkeypatch.setattr(scenes, "clock_of", clock)
+    monkeypatch.setattr(scenes, "_planned", lambda *_, **__: None)
+    monkeypatch.setattr(scenes, "Judged", Verdict)
+    (setting,) = settings_of(
+        ["fast_graspd"], ["draft"], batches=[2], peer_batch=2, options=[], quick=True, run=Run("cuda:0", 1)
+    )
+    place = scenes.Place(Thing("block", lambda error: object_from_path("block", face_error_m=error)), TABLE)
+    row = scenes._tried(setting, FILTERED, hand_from_path("barrett"), place, 1)
+    assert asked == ["cuda:0"]
+    assert (row["seconds"], row["end_seconds"], row["valid_per_second"]) == (7.0, 14.0, pytest.approx(2 / 7, rel=1e-4))
 
 
 def run_of(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:

@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from worker.studies.chart.figure import SPEED, draw_hands, draw_scenes
+from service.model.charts import FILTERED, IN_SCENE
+from worker.studies.chart.figure import SPEED, draw_hands, draw_scenes, one_of_several
 from worker.studies.chart.report import first, share
-from worker.studies.chart.scenes import ACCURACIES, FILTERED, IN_SCENE
+from worker.studies.chart.scenes import ACCURACIES
 
 Row = Mapping[str, Any]
 
@@ -32,13 +33,18 @@ def write(chart: Row, folder: Path) -> list[Path]:
         writer = csv.DictWriter(stream, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(chart["runs"])
-    draw_scenes([named(row) for row in chart["summary"]], files[3:])
+    draw_scenes([named(row) for row in chart["summary"]], files[3:], second=second_of(chart))
     files.append(folder / "chart.hands.png")
     by_hand = {hand: [named(row) for row in rows] for hand, rows in chart["by_hand"].items()}
-    words = ("share of all tries that is lifted", "lifted grasps per CPU second, end to end")
-    draw_hands(by_hand, files[-1:], key="lift", speed=SPEED, words=words)
+    words = ("share of all tries that is lifted", f"lifted grasps per {second_of(chart)}, end to end")
+    draw_hands(by_hand, files[-1:], key="lift", speed=SPEED, words=words, label=one_of_several)
     files[2].write_text(markdown(chart) + "\n")
     return files
+
+
+def second_of(chart: Row) -> str:
+    """What a second of it is called: on a CPU one of all cores together, on a GPU one that passes."""
+    return "CPU second" if str(chart["device"]).startswith("cpu") else "second"
 
 
 def named(row: Row) -> dict[str, Any]:
@@ -48,11 +54,11 @@ def named(row: Row) -> dict[str, Any]:
 
 def markdown(chart: Row) -> str:
     """What was run, all pairs together, each pair."""
-    parts = [_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"])]
+    parts = [_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], second_of(chart))]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Lifted over speed](chart.hands.png)"]
-        parts += [f"### {hand}\n\n{_summary(rows)}" for hand, rows in chart["by_hand"].items()]
-    parts += ["## Each hand and object", _runs(chart["runs"])]
+        parts += [f"### {hand}\n\n{_summary(rows, second_of(chart))}" for hand, rows in chart["by_hand"].items()]
+    parts += ["## Each hand and object", _runs(chart["runs"], second_of(chart))]
     if refused := [run for run in chart["runs"] if run["note"]]:
         lines = [
             f"- {run['method']} {run['fidelity']}, {run['hand']}, {run['object']}: {run['note']}" for run in refused
@@ -65,6 +71,7 @@ def _head(chart: Row) -> str:
     hands, objects = (", ".join(dict.fromkeys(run[name] for run in chart["runs"])) for name in ("hand", "object"))
     command = f"    {chart['command']}\n\n" if chart.get("command") else ""
     remark = f" {chart['remark']}" if chart.get("remark") else ""
+    seconds = "CPU seconds, all cores together" if second_of(chart) == "CPU second" else "seconds that pass"
     return (
         f"# In the scene, or filtered\n\n{command}{chart['device']}, graspd {chart['versions']['graspd']}, "
         f"{chart['created']}. Scene: {chart['scene']['kind']}, faces {chart['scene']['faces']}. Hands: {hands}. "
@@ -77,16 +84,17 @@ def _head(chart: Row) -> str:
         "*half friction*: lifted at that too; shares of all tries\n"
         f"- *robust*: share of {chart['models']} models around the nominal one in which a lifted grasp is lifted, on "
         "average\n"
-        "- speed: lifted grasps over CPU seconds, all cores together, end to end: planner, postures, way, lift, and "
+        f"- speed: lifted grasps over {seconds}, end to end: planner, postures, way, lift, and "
         "the metrics of what is lifted; *planner's*: over those of planner and postures\n"
         "- bars: 95 % (Wilson); hollow: none was lifted, the most that there can be"
     )
 
 
-def _summary(rows: Sequence[Row]) -> str:
+def _summary(rows: Sequence[Row], second: str) -> str:
     lines = [
         "| way | method | fidelity | tries | clear | lifted | letter | half friction | robust | "
-        "lifted per CPU second | planner's | first, CPU s | pairs with one | × over filtered |",
+        f"lifted per {second} | planner's | first, {second.removesuffix('econd')} | pairs with one | "
+        "× over filtered |",
         "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for row in rows:
@@ -108,10 +116,10 @@ def _bold(row: Row, key: str) -> str:
     return f"**{share(row[key])}**" if key in row["front"] else share(row[key])
 
 
-def _runs(runs: Sequence[Row]) -> str:
+def _runs(runs: Sequence[Row], second: str) -> str:
     lines = [
         "| hand | object | way | method | fidelity | tries | clear | lifted | letter | half friction | robust | "
-        "lifted per CPU second |",
+        f"lifted per {second} |",
         "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
     ]
     lines += [

@@ -2,15 +2,14 @@
 
 A setting of a method that plans in scenes is run both ways, others only the second. Grasp i is tried in scene i of the
 object's stable faces in turn, whichever way it was planned, and judged alike: clear on its way, lifted, lifted by the
-letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds of all cores
-together, which do not follow what else the machine does: of planner and postures alone, and end to end, with way,
-referee and the metrics of what is lifted.
+letter, at half the friction, and in models around the nominal one. Speed is lifted grasps over seconds, on a CPU those
+of all cores together, which do not follow what else the machine does: of planner and postures alone, and end to end,
+with way, referee and the metrics of what is lifted.
 """
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.charts import FILTERED, IN_SCENE
 from service.model.clock import timestamp
 from service.model.digests import digest_json
 from service.model.errors import InputError
@@ -42,12 +42,11 @@ from worker.studies.bench import device_name
 from worker.studies.chart.chart import TRUE_ERROR_M, Thing
 from worker.studies.chart.statistics import first_valid, pareto, plain
 from worker.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
+from worker.studies.clock import clock_of
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
 
-IN_SCENE: Final = "in the scene"
-FILTERED: Final = "free, filtered"
 #: Shares of all tries, by their column.
 SHARES: Final = ("clear", "lift", "lift_letter", "lift_hard")
 #: Accuracies that have a front.
@@ -133,8 +132,9 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: Place, models: int
         return said | _tried(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
     terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
-    # What is found follows from the code of planners too: another revision begins anew.
-    file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize']])}.json"
+    # What is found follows from the code of planners too: another revision begins anew, and so does another device.
+    device = [] if setting.run.device == "cpu" else [setting.run.device]
+    file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize'], *device])}.json"
     if not file.is_file():
         work.mkdir(parents=True, exist_ok=True)
         partial = file.with_suffix(".tmp")
@@ -152,21 +152,22 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: Place, models: in
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
     row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
     note, few = "", min(setting.run.cores, setting.batch)
+    clock = clock_of(setting.run.device)
     try:
         trial = lift_trial(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
         _planned(setting, hand, obj, _first(placed), trial, warm=True)
-        began = time.process_time()
+        began = clock()
         grasps = _planned(setting, hand, obj, placed, trial)
-        row["seconds"] = time.process_time() - began
+        row["seconds"] = clock() - began
         judged = Judged(hand, place, grasps, placed)
-        row["end_seconds"] = time.process_time() - began
+        row["end_seconds"] = clock() - began
         each = row["end_seconds"] / setting.batch
         row["first_seconds"] = each * few
         if each < _SHORT_S:
-            began = time.process_time()
+            began = clock()
             start = placed.take(slice(0, few))
             Judged(hand, place, _planned(setting, hand, obj, start, trial), start)
-            row["first_seconds"] = time.process_time() - began
+            row["first_seconds"] = clock() - began
         row |= judged.counts(models)
     except InputError as error:
         # A scene that leaves no way in, or a pair that the method refuses.

@@ -9,10 +9,12 @@ import pytest
 
 from service.index.rebuild import rebuild
 from service.model import digests, names
+from service.model.charts import IN_SCENE
 from service.model.dataset_records import DatasetRecord, request_of
 from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError
 from service.model.records import JobRecord
+from service.model.scene_spec import SceneSpec
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
@@ -20,7 +22,7 @@ from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.fidelity_choice import Resolver
 from service.store.datasets import load_dataset
 from service.store.records import read_record
-from service.store.study_records import publish
+from service.store.study_records import charts_of, publish
 from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
 
 ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
@@ -145,3 +147,26 @@ def test_a_record_from_before_has_neither_and_is_read(parts: Parts) -> None:
 def test_auto_and_target_go_together(changes: dict[str, str]) -> None:
     with pytest.raises(ValueError, match="target"):
         wanted(**changes)
+
+
+def test_each_cell_of_a_dataset_in_scenes_says_how_its_fidelity_was_chosen(either: Parts) -> None:
+    def run(fidelity: str, speed: float, lift: float, hand: str, object_: str) -> dict[str, Any]:
+        return {"way": IN_SCENE, "method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_,
+                "end_to_end_per_second": speed, "lift": lift}  # fmt: skip
+
+    runs = [run("draft", 20, 0.8, "gripper", "ball"), run("standard", 15, 0.95, "gripper", "ball")]
+    runs += [run("draft", 20, 0.92, "gripper", "cube"), run("standard", 15, 0.99, "gripper", "cube")]
+    place = SceneSpec(kind="table")
+    created = {"created": "2026-11-21T10:00:00.000Z", "scene": place.model_dump(mode="json")}
+    key = publish(either.store, charts_of(place), created | {"runs": runs})
+    actions.create(either, wanted(fidelity="auto", target="lift>=0.9", scene="table"))
+    rebuild(either.index, either.store)
+    cells = either.index.datasets.cells("grasps").items
+    assert [cell.fidelity for cell in cells] == ["standard", "draft", "standard", "standard"]
+    assert [(c.choice.measured_on, c.choice.reached, c.choice.chart) for c in cells if c.choice] == [
+        ("hand and object", 0.95, key), ("hand and object", 0.92, key), ("all", 0.97, key), ("all", 0.97, key),
+    ]  # fmt: skip
+    plan_all(either)
+    jobs = [read_record(JobRecord, either.store, names.job_record(job)) for job in jobs_of(either, "grasps")]
+    assert [job.choice for job in jobs] == [cell.choice for cell in cells]
+    assert len(load_dataset(either.store, "grasps").choices) == 3
