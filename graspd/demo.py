@@ -45,8 +45,6 @@ class Results:
         }
 
 
-#: A first start on a cold machine compiles Warp kernels before the worker answers.
-_READY_S: Final = 120.0
 _SHOWN_GRASPS: Final = 12
 #: Rays per pixel of a small picture; twice as many cost twice the time and are hard to tell apart.
 _SAMPLES: Final = 8
@@ -77,7 +75,7 @@ def demo(
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
     with Supervisor(settings, workers=1) as service:
         with console.status("starting Redis, API, keeper and a worker"):
-            service.wait_ready(_READY_S)
+            service.wait_ready(say=lambda line: console.print(line, markup=False, soft_wrap=True))
         console.print(f"the service runs at {service.api_url} until the job is done")
         with Client(service.api_url) as client:
             job, top, files = run(client, request, out, console)

@@ -17,7 +17,7 @@ def until(met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S, log
     end = time.monotonic() + seconds
     while not met():
         assert time.monotonic() < end, f"after {seconds:g} s still not: {what}\n{logs()}"
-        time.sleep(0.02)
+        time.sleep(0.05)
 
 
 def until_a_worker_is_idle(address: str) -> None:

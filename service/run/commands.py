@@ -21,7 +21,6 @@ app = typer.Typer(no_args_is_help=True)
 index_app = typer.Typer(no_args_is_help=True, help="Rebuild the index from the store, or export its tables.")
 app.add_typer(index_app, name="index")
 
-_READY_S = 60.0
 DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Folder of everything graspd keeps; GRASPD_DATA_DIR.")]
 
 
@@ -59,12 +58,12 @@ def up(
     supervisor = Supervisor(settings, workers=workers, joining=others)
     supervisor.start()
     try:
-        supervisor.wait_ready(_READY_S)
-        where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
-        console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
-        if json:
-            emit({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
-        stop.wait()
+        if supervisor.wait_ready(say=lambda line: console.print(line, markup=False, soft_wrap=True), stop=stop):
+            where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
+            console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
+            if json:
+                emit({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
+            stop.wait()
         console.print("stopping ...")
     finally:
         supervisor.stop()

@@ -10,7 +10,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Final, Self
 
@@ -31,6 +31,13 @@ from service.store.store import open_store
 log = logging.getLogger(__name__)
 _WATCH_S: Final = 0.1
 _PROBE_S: Final = 0.1
+#: Longest wait for a service to be ready: kernels compile at their first use, on a machine with much else to do [s].
+READY_S: Final = 1800.0
+_TOLD_EVERY_S: Final = 15.0
+#: A process that was started again so often will not get ready.
+_ENDS: Final = 5
+#: How long a Redis that is not of this machine's `graspd up` may be silent at the start [s].
+_REDIS_S: Final = 60.0
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
 
 
@@ -108,18 +115,49 @@ class Supervisor:
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
         self._thread.start()
 
-    def wait_ready(self, timeout: float) -> None:
-        """Until Redis, keeper, a worker and the API answer; UnavailableError names what did not, and its log."""
-        deadline = time.monotonic() + timeout
+    def wait_ready(
+        self,
+        timeout: float = READY_S,
+        *,
+        say: Callable[[str], object] | None = None,
+        stop: threading.Event | None = None,
+    ) -> bool:
+        """Until Redis, keeper, a worker and the API answer; False: `stop` was set before.
+
+        A busy machine takes as long as it takes: what ends the wait early is a process that ends again and again, or a
+        Redis of somebody else that does not answer.
+
+        Args:
+            timeout: longest wait where nothing else ends it [s].
+            say: told every 15 s what is waited for.
+            stop: ends the wait.
+
+        Raises:
+            UnavailableError: it names what did not answer, and the logs.
+        """
+        began = told = time.monotonic()
+        starts, logs = self._starts(), self.settings.data_dir / "logs"
         queue = open_queue(self.settings, patience=0)
         try:
             while missing := self._missing(queue):
-                if time.monotonic() > deadline or self._stopping.is_set():
-                    logs = self.settings.data_dir / "logs"
-                    raise UnavailableError(f"not ready after {timeout:g} s: {', '.join(missing)}; see {logs}")
+                if stop is not None and stop.is_set():
+                    return False
+                if "redis" in missing:  # the others may end for want of it
+                    starts = {**self._starts(), "redis": starts.get("redis", 0)}
+                now = time.monotonic()
+                patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
+                again = [name for name, count in self._starts().items() if count - starts.get(name, 0) >= _ENDS]
+                if again:
+                    raise UnavailableError(f"{', '.join(again)} ended {_ENDS} times before getting ready; see {logs}")
+                if now - began > patience or self._stopping.is_set():
+                    raise UnavailableError(f"not ready after {now - began:.0f} s: {', '.join(missing)}; see {logs}")
+                if say is not None and now - told >= _TOLD_EVERY_S:
+                    told = now
+                    say(f"not ready after {now - began:.0f} s, waiting for {', '.join(missing)}; logs in {logs}")
                 time.sleep(_PROBE_S)
         finally:
             queue.close()
+        return True
 
     def stop(self) -> None:
         """Stop all children, the workers first and Redis last. Idempotent."""
@@ -128,6 +166,9 @@ class Supervisor:
             self._thread.join()
             self._thread = None
         self._release()
+
+    def _starts(self) -> dict[str, int]:
+        return {child.name: child.starts for child in list(self._children)}
 
     def _missing(self, queue: Presence) -> list[str]:
         missing = []

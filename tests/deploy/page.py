@@ -1,4 +1,4 @@
-"""docs/operations.md as commands: the blocks marked as tried, and every line that calls graspd."""
+"""docs/operations.md and docs/install.md as commands: the blocks marked as tried, and every line that calls graspd."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final
 
 from tests.conftest import REPOSITORY
 
-TEXT: Final = (REPOSITORY / "docs" / "operations.md").read_text()
+TEXT: Final = "\n".join((REPOSITORY / "docs" / page).read_text() for page in ("install.md", "operations.md"))
 _TRIED: Final = re.compile(r"<!-- tried: ([\w-]+) -->\n```sh\n(.*?)```", re.DOTALL)
 
 

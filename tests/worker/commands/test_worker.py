@@ -23,3 +23,10 @@ def test_a_worker_ends_at_once_without_taking_its_engine_apart() -> None:
     """Warp and its kernels take two seconds of computing for that: too long for a busy machine to wait for."""
     done = subprocess.run([sys.executable, "-c", _ENDING], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (3, "what waited was sent\n"), done.stderr
+
+
+def test_a_worker_is_there_before_its_engine_is() -> None:
+    """It says that it lives, and what it checks, before Warp, MuJoCo and the kernels are imported."""
+    code = "import sys, worker.commands.worker, worker.process.main; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"warp", "mujoco", "scipy", "trimesh", "newton"} & set(done.stdout.split())
