@@ -63,7 +63,7 @@ def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[P
         wanted = Settings(data_dir=Path(folder), port=0, device="cpu", log_level="WARNING", **settings)
         fakes = (sys.executable, "-m", "tests.fakes")
         with Supervisor(wanted, workers=workers, api=False, worker_command=fakes) as supervisor:
-            supervisor.wait_ready(120)
+            supervisor.wait_ready()
             parts = Parts.open(supervisor.settings)
             add_assets(parts)
             yield parts
@@ -138,7 +138,7 @@ def api(data_dir: Path, url: str | None) -> None:
         log_level="WARNING", **({"index_url": url} if url else {}),
     )  # fmt: skip
     with Supervisor(settings, workers=0) as supervisor:
-        supervisor.wait_ready(120)
+        supervisor.wait_ready()
         with httpx.Client(base_url=supervisor.api_url, timeout=60, trust_env=False) as http:
             _requests(http, supervisor.pids["api"])
 

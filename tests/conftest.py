@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,9 +20,17 @@ settings.register_profile(
 )
 settings.load_profile("graspd")
 
+#: The processes of tests share the cores: a second thread of a small matrix product only waits, and computes to do so.
+#: NumPy, which is not imported yet, reads it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# What is imported while tests are collected is no garbage.
+gc.disable()
+
 
 def pytest_collection_finish() -> None:
     """What was made so far, thousands of tests, stays until the end: Python's collector need not look at it again."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 

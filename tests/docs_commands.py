@@ -2,7 +2,8 @@
 
 usage: python -m tests.docs_commands [PAGE ...] [--list]        (make docs-commands; some hours of two cores for all)
 
-Each page gets a folder and a service of its own; its lines run in their order, as they are printed. What is not run is
+Each page gets a folder and a service of its own, with the files that a reader would have (`tests/docs_files.py`); its
+lines run in their order, as they are printed, and what is shown below one is held against what came. What is not run is
 told with its reason. Ends with 1 if a line failed.
 """
 
@@ -15,34 +16,45 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import graspd.cli
+from tests.docs_files import files_for
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
-PAGES: Final = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md")))
+DOCS: Final = REPOSITORY / "docs"
+PAGES: Final = (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "exchange").glob("*.md")))
 LIMIT_S: Final = 3600.0
-_FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+#: Where a page says that the service is; each run has a port of its own.
+_PRINTED_URL: Final = "http://127.0.0.1:8000"
+_FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
 _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)
-_FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:graspd|python|make) ")
+_TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
+_OURS: Final = {"graspd", "api", "service", "worker", "benchmarks", "examples", "tests"}
+#: What an indented block of commands begins with; any other is a file or a formula.
+_FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|cp|curl|docker|kubectl) ")
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
 #: What a line has that is not run here, and why. A line with none of it is run.
 NOT_RUN: Final = (
+    (r"^(docker|kubectl|sbatch|apptainer|ray|osmo|sky|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|--grasps 3200",
+     "needs Docker, or a cluster"),
     (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "stands for a family of commands"),
-    (r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY)\b",
-     "has a place that the reader fills in"),
-    (r"huggingface|lerobot", "needs graspd[parquet]"),
-    (r"cuda|--join|on_gpu|gpu-check", "needs a GPU, or its tools"),
-    (r"^make ", "the verbs of the repository: what they do is tested by itself"),
-    (r"graspd (up|api|keeper|worker|view)\b", "does not end"),
-    (r"graspd (keys|projects|webhooks|tags)\b", "tests/api has services that they ask"),
-    (r"million|kitchen|pilot|train-|--grasps 1000|large_index|\bycb\b", "takes hours"),
+    (r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
+     r"PASSWORD)\b|--joint-map", "has a place that the reader fills in"),
+    (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),
+    (r"^pip |\bjq\b|benchmarks\.gallery", "needs packages or programs from elsewhere"),
+    (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU, or its tools"),
+    (r"^make |^\. \.venv", "the repository's own verbs and environment, which are tested and used without this"),
+    (r"graspd (up|api|keeper|worker|view)\b(?!.*--check)", "does not end"),
+    (r"graspd (keys|projects|webhooks)\b", "with the first key every other line needs one; tests/api runs them"),
+    (r"datasets (cancel|retry|delete)", "the dataset that stands in has ended, and is read below; tests/api runs them"),
+    (r"--grasps 1000|kitchen\.toml --yes|my-objects --yes$", "takes hours; a small dataset of that name stands for it"),
 )  # fmt: skip
 
 
@@ -54,18 +66,24 @@ class Line:
     text: str
     refused: bool = False
     """The page shows an error after it, or its comment says *refused*."""
+    shown: str = ""
+    """What the page shows as its output."""
+    tried: bool = False
+    """It is in a block that tests/deploy runs."""
 
     @property
     def reason(self) -> str:
         """Why it is not run; empty where it is."""
+        if self.tried:
+            return "tests/deploy/test_operations.py runs it"
         return next((why for what, why in NOT_RUN if re.search(what, self.text)), "")
 
     def fault(self) -> str:
         """A command, option, module or verb of it that is not known; empty where all are."""
         for program, *words in _commands(self.text):
-            if program == "graspd":
+            if program.rpartition("/")[2] == "graspd":
                 found = _graspd_fault(words)
-            elif program == "python" and words[:1] == ["-m"]:
+            elif program == "python" and words[:1] == ["-m"] and words[1].partition(".")[0] in _OURS:
                 found = "" if find_spec(words[1]) else f"no module {words[1]}"
             elif program == "make":
                 verbs = {word for word in words if "=" not in word and not word.startswith("-")}
@@ -77,24 +95,43 @@ class Line:
                 return found
         return ""
 
+    def misses(self, came: str) -> str:
+        """A line shown that did not come, empty if all did: numbers, names and states may differ, messages may not.
+        Of all words shown half at least came, and of those of each line a quarter."""
+        words = set(_words(came))
+        shares = {
+            line: [word in words for word in wanted] for line in self.shown.splitlines() if (wanted := _words(line))
+        }
+        least = min(shares, key=lambda line: sum(shares[line]) / len(shares[line]), default="")
+        found = [one for share in shares.values() for one in share]
+        strange = sum(found) * 2 < len(found) or sum(shares.get(least, [])) * 4 < len(shares.get(least, []))
+        return least if strange else ""
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[a-z]{3,}", text.lower())
+
 
 def lines_of(page: Path) -> Iterator[Line]:
     """The commands of a page, from its `sh` blocks and from indented blocks that begin with one."""
     text = page.read_text()
-    fenced = [*_FENCED.findall(text), ("", "")]
+    blocks = []
+    fenced = list(_FENCED.finditer(text))
+    for at, block in enumerate(fenced):
+        if block[1] in {"sh", "bash"}:
+            after = fenced[at + 1] if at + 1 < len(fenced) else None
+            follows = after is not None and not after[1] and not text[block.end() : after.start()].strip()
+            shown = after[2] if after is not None and follows else ""
+            blocks.append((block[2], shown, bool(_TRIED.search(text[: block.start()]))))
     indented = (re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in _INDENTED.findall(_FENCED.sub("", text)))
-    blocks = [
-        (body, after.startswith("graspd: "))
-        for (language, body), (_, after) in pairwise(fenced)
-        if language in {"sh", "bash"}
-    ]
-    for block, refused in [*blocks, *((block, False) for block in indented if _FIRST.match(block))]:
+    blocks += [(block, "", False) for block in indented if _FIRST.match(block)]
+    for block, shown, tried in blocks:
         whole = [line.partition(" #") for line in block.replace("\\\n", " ").splitlines()]
         told = [(re.sub(r"\s+", " ", line).strip(), comment.strip()) for line, _, comment in whole]
-        commands = [(line, comment) for line, comment in told if _FIRST.match(line + " ")]
+        commands = [(line, comment) for line, comment in told if line]
         for at, (line, comment) in enumerate(commands, 1):
-            ends_so = refused and at == len(commands)
-            yield Line(page.name, line, ends_so or comment.startswith("refused"))
+            last = shown if at == len(commands) else ""
+            yield Line(page.name, line, last.startswith("graspd: ") or comment.startswith("refused"), last, tried)
 
 
 def _commands(text: str) -> Iterator[list[str]]:
@@ -148,64 +185,58 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
     return command, words
 
 
-def stand_ins(folder: Path) -> None:
-    """What the pages call the reader's own: a hand; meshes in metres, in millimetres, open, overlapping; shards."""
-    import trimesh
-
-    from tests.worker.hands.my_hand import write_my_hand
-
-    write_my_hand(folder)
-    (folder / "examples").symlink_to(REPOSITORY / "examples")
-    for name in ("mug", "bottle", "block"):
-        files = (REPOSITORY / "service" / "builtin" / "objects" / name).rglob("*")
-        mesh = trimesh.load(next(file for file in files if file.suffix in {".stl", ".obj", ".ply"}), force="mesh")
-        mesh.export(folder / f"{name}.stl")
-    (folder / "my_mug.stl").write_bytes((folder / "mug.stl").read_bytes())
-    mesh.export(folder / "koala.obj")
-    mesh.copy().apply_scale(1000).export(folder / "banana.stl")
-    box = trimesh.creation.box((0.06, 0.06, 0.06))
-    trimesh.util.concatenate([box, box.copy().apply_translation((0.03, 0, 0))]).export(folder / "overlap.stl")
-    box.update_faces(box.face_normals[:, 2] < 0.5)
-    box.export(folder / "bowl.stl")
-    program = (sys.executable, "-m", "graspd")
-    few = ("-n", "8", "--hand", "allegro", "--object", "mug", "--fidelity", "draft")
-    for words in (
-        ("demo", "--out", "demo-out", "--scenes", "1", "--views", "1", *few),
-        ("synth", *few, "-o", "grasps.h5"),
-    ):
-        subprocess.run([*program, *words], cwd=folder, check=True, capture_output=True)
-    (folder / "shards").symlink_to("demo-out/shards")
-    (folder / "views.h5").symlink_to("demo-out/shards/views-0000.h5")
-
-
-def run_page(page: Path) -> list[str]:
+def run_page(page: Path, leave: str = "", keep: Path | None = None) -> list[str]:
     """Run the lines of a page; returns what failed."""
     from service.run.supervisor import Supervisor
     from service.settings import Settings
 
     failed = []
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "here"
+    record = keep / f"{page.stem}.txt" if keep is not None else Path(os.devnull)
+    record.parent.mkdir(parents=True, exist_ok=True)
+    with record.open("w"), tempfile.TemporaryDirectory() as scratch:
+        folder, data = Path(scratch) / "here", Path(scratch) / "data"
         folder.mkdir()
-        stand_ins(folder)
         kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
         kept["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
-        with Supervisor(Settings(data_dir=Path(scratch) / "data", port=0), workers=1) as supervisor:
-            supervisor.wait_ready(600)
-            kept |= {"GRASPD_API_URL": supervisor.api_url, "GRASPD_DATA_DIR": str(Path(scratch) / "data")}
+        (folder / ".curlrc").write_text("fail-with-body\nsilent\n")
+        with Supervisor(Settings(data_dir=data, port=0), workers=1) as supervisor:
+            supervisor.wait_ready(say=say)
+            kept |= {"GRASPD_API_URL": supervisor.api_url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
+            kept |= {"API": supervisor.api_url, "GRASPD_API_KEY": "none"}
+            files_for(page, folder, data, kept)
             for line in lines_of(page):
-                if line.reason:
-                    say(f"  -    {line.text}   ({line.reason})")
+                why = line.reason or ("--leave" if leave and re.search(leave, line.text) else "")
+                if why:
+                    say(f"  -    {line.text}   ({why})")
                     continue
-                done = subprocess.run(
-                    line.text, shell=True, cwd=folder, env=kept, capture_output=True, text=True, check=False,
-                    timeout=LIMIT_S,
-                )  # fmt: skip
-                wrong = bool(done.returncode) != line.refused
-                say(f"  {'FAIL' if wrong else 'ok  '} {line.text}")
+                started = time.monotonic()
+                code, came = run_line(line.text.replace(_PRINTED_URL, supervisor.api_url), folder, kept)
+                with record.open("a") as file:
+                    file.write(f"$ {line.text}\n{came}\n")
+                missed = line.misses(came)
+                wrong = bool(code) != line.refused or bool(missed)
+                say(f"  {'FAIL' if wrong else 'ok  '} {line.text}   ({time.monotonic() - started:.0f} s)")
                 if wrong:
-                    failed.append(f"{page.name}: {line.text}\n{(done.stderr or done.stdout)[-600:]}")
+                    told = f"shown, and did not come: {missed}\n" if missed else ""
+                    failed.append(f"{page.name}: {line.text}\n{told}{came[-600:]}")
     return failed
+
+
+def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
+    """Exit code and output of a line typed at a terminal where every question is answered with yes."""
+    terminal, stdin = os.openpty()
+    try:
+        os.write(terminal, b"y\n")
+        done = subprocess.run(
+            text, shell=True, cwd=folder, env=dict(environment), stdin=stdin, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, check=False, timeout=LIMIT_S,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return 124, f"not ended after {LIMIT_S:.0f} s"
+    finally:
+        os.close(terminal)
+        os.close(stdin)
+    return done.returncode, done.stdout
 
 
 def say(text: str) -> None:
@@ -217,17 +248,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", help="names of pages; default: all")
     parser.add_argument("--list", action="store_true", help="only say what would be run, and why something is not")
+    parser.add_argument("--leave", default="", metavar="PATTERN", help="leave out lines that match, too")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="what came, a file for each page")
     given = parser.parse_args(arguments)
     failed = []
     for page in PAGES:
         if (given.pages and page.name not in given.pages) or not (lines := list(lines_of(page))):
             continue
         say(page.name)
-        if given.list:
+        if given.list or all(line.reason for line in lines):
             for line in lines:
                 say(f"  {'-  ' if line.reason else 'run'} {line.text}" + (f"   ({line.reason})" if line.reason else ""))
-        elif any(not line.reason for line in lines):
-            failed += run_page(page)
+        else:
+            failed += run_page(page, given.leave, given.keep)
     say("\n".join(failed) or "all that was run ended well")
     return int(bool(failed))
 

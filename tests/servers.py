@@ -26,7 +26,7 @@ from typing import IO, Any, Final, Self
 
 import obstore
 from obstore.store import S3Store
-from sqlalchemy import create_engine, text
+from sqlalchemy import create_engine, make_url, text
 
 _START_S: Final = 60.0
 _STOP_S: Final = 10.0
@@ -200,11 +200,12 @@ class PostgresServer(Server):
         return f"postgresql+psycopg://graspd:{self._password}@127.0.0.1:{self.port}/{database}"
 
     def database(self) -> str:
-        """URL of an empty place: a schema of its own, which costs far fewer files than a database of its own."""
+        """URL of an empty place: a schema of its own, which costs far fewer files than a database of its own. Its
+        sessions bear the name of the schema."""
         self._databases += 1
         name = f"test_{self._databases}"
         self._ask(f"CREATE SCHEMA {name}")
-        return f"{self.url()}?options=-csearch_path%3D{name}"
+        return f"{self.url()}?options=-csearch_path%3D{name}&application_name={name}"
 
     def _ask(self, statement: str = "SELECT 1") -> None:
         engine = create_engine(self.url(), isolation_level="AUTOCOMMIT")
@@ -226,6 +227,11 @@ class PostgresServer(Server):
         )
         if done.returncode:
             raise MissingServer(f"PostgreSQL cannot make a database here: {(done.stderr or done.stdout)[-500:]}")
+
+
+def schema_of(url: str) -> str:
+    """Name of the schema that `PostgresServer.database` made."""
+    return str(make_url(url).query["application_name"])
 
 
 def _postgres_programs() -> Path:

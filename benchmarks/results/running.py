@@ -29,7 +29,6 @@ from service.settings import Settings
 
 _PACKAGES: Final = ("graspd", "numpy", "warp-lang", "mujoco", "newton")
 _TEXTS: Final = {".json", ".md", ".csv", ".svg"}
-_READY_S: Final = 600.0
 _PLACE: Final = re.compile(r"\b(DATA|SOURCES|BEFORE|WORK|OUT)\b")
 _PROGRAMS: Final = {"graspd": (sys.executable, "-m", "graspd"), "python": (sys.executable,)}
 
@@ -139,7 +138,7 @@ class Runner:
             return
         settings = Settings(data_dir=self.work / "services" / study.name, port=0)
         with Supervisor(settings, workers=available_cores()) as supervisor:
-            supervisor.wait_ready(_READY_S)
+            supervisor.wait_ready()
             yield environment | {"GRASPD_API_URL": supervisor.api_url, "GRASPD_DATA_DIR": str(settings.data_dir)}
 
     def _has(self, name: str) -> bool:

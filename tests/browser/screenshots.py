@@ -2,9 +2,9 @@
 
 usage: python -m tests.browser.screenshots [--data-dir DIR] [--out docs/images]
 
-Starts the service, gives it work (some minutes on two cores), measures a quick chart, and photographs each page at the
-width of a laptop or a phone, light or dark. With --data-dir the service and its work are kept, and the next call takes
-pictures of what is there.
+Starts the service, gives it work (some minutes on two cores), publishes the charts of the docs, and photographs each
+page at the width of a laptop or a phone, light or dark. With --data-dir the service and its work are kept, and the
+next call takes pictures of what is there.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from service.settings import Settings
 from tests.browser.conftest import ARGUMENTS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
+CHARTS: Final = [REPOSITORY / "docs" / "results" / one / "chart.json" for one in ("", "scenes-chart")]
 MAPS: Final = REPOSITORY / "docs" / "results" / "stability" / "stability.json"
-READY_S: Final = 120.0
 WORK_S: Final = 3600.0
 SHOWN_MS: Final = 60_000
 LAPTOP: Final = (1440, 900)
@@ -43,10 +43,6 @@ DATASET: Final[dict[str, Any]] = {
     "fidelity": "draft",
 }  # fmt: skip
 LONG: Final[dict[str, Any]] = {"hand": "shadow", "object": "mug", "grasps": 640, "fidelity": "draft"}
-CHART: Final = (
-    "--methods", "fast_graspd,autograsp,graspd2022", "--hands", "barrett", "--objects", "mug,block", "--batch", "16",
-    "--repeats", "1",
-)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as scratch:
         wanted = Settings(data_dir=given.data_dir or Path(scratch), port=0)
         with Supervisor(wanted, workers=1) as supervisor:
-            supervisor.wait_ready(READY_S)
+            supervisor.wait_ready()
             with httpx.Client(base_url=supervisor.api_url, trust_env=False, timeout=60) as client:
                 places = work(client, supervisor)
                 given.out.mkdir(parents=True, exist_ok=True)
@@ -82,8 +78,9 @@ def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
     until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "succeeded", "the job with views")
     folder = str(supervisor.settings.data_dir)
     if "card pad trade" not in client.get("/chart").text:
-        command = [sys.executable, "-m", "graspd", "chart", *CHART, "--publish", "--data-dir", folder]
-        subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
+        for chart in CHARTS:
+            command = [sys.executable, "-m", "graspd", "chart", "--from", str(chart), "--publish", "--data-dir", folder]
+            subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
     if "reach-title" not in client.get("/stability").text:
         command = [sys.executable, "-m", "graspd", "stability", "--from", str(MAPS), "--publish", "--data-dir", folder]
         subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
@@ -118,7 +115,7 @@ def photograph(address: str, places: dict[str, str], folder: Path, only: set[str
         ("grasp-dark", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", (1440, 1000), "dark", False),
         ("hand", "/hands/allegro", ".viewer[data-state=ready]", (1440, 1000), "light", False),
         ("workers", "/workers", ".worker", LAPTOP, "light", False),
-        ("chart", "/chart", ".trade circle", LAPTOP, "light", False),
+        ("chart", "/chart", ".trade circle", LAPTOP, "light", True),
         ("stability", "/stability", ".failure", (1440, 1180), "light", False),
         ("submit", "/submit", "[data-thing=object] figure[data-state=ready]", (1440, 1100), "light", False),
         ("phone-home", "/", "#jobs tbody tr", PHONE, "light", False),

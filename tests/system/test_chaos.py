@@ -219,7 +219,7 @@ def test_no_process_outlives_a_killed_supervisor_and_the_next_one_starts(tmp_pat
 @pytest.mark.parametrize(
     ("batches", "kills"),
     [
-        pytest.param(200, 8, marks=pytest.mark.timeout(600)),
+        pytest.param(80, 6, marks=pytest.mark.timeout(600)),
         pytest.param(2000, 60, marks=[pytest.mark.slow, pytest.mark.timeout(1800)]),
     ],
 )
@@ -232,7 +232,7 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
         url = request.getfixturevalue("postgres_server").database()
         places = {"store_url": request.getfixturevalue("s3_url"), "index_url": url}
     system = start(
-        workers=2, api=True, environment={"FAKE_SECONDS": "0.02"}, lease_s=2.0, task_attempts=20, retry_backoff_s=0.1,
+        workers=2, api=True, environment={"FAKE_SECONDS": "0.05"}, lease_s=2.0, task_attempts=20, retry_backoff_s=0.1,
         **places,
     )  # fmt: skip
     rng = random.Random(0)
