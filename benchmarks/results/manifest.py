@@ -19,6 +19,12 @@ DOCS: Final = REPOSITORY / "docs"
 MANIFEST, INDEX = "results/MANIFEST.json", "results/README.md"
 _REVISIONS: Final = re.compile(r"^STAGE_REVISIONS[^=]*= (\{[^}]*\})", re.MULTILINE)
 
+#: Revisions that make, of the objects in the studies, what the one before made, bit for bit, by stage and revision;
+#: but for studies of the smallest and largest objects.
+#: Synthesize 19 differs where an object is too small or too wide for the hand's pads: tests/front/test_same_figures.py.
+SAME: Final = {("synthesize", 19): 18}
+EXTREMES: Final = frozenset({"stability"})
+
 Manifest = dict[str, dict[str, Any]]
 
 
@@ -75,8 +81,13 @@ def staleness(study: Study, record: Mapping[str, Any] | None) -> str:
     made = record["stage_revisions"]
     if study.stages and made is None:
         return "of an unknown revision"
-    older = [f"{stage} {made.get(stage)}" for stage in study.stages if made.get(stage) != STAGE_REVISIONS[stage]]
+    older = [f"{stage} {made.get(stage)}" for stage in study.stages if not _holds(study, stage, made.get(stage))]
     return f"of {', '.join(older)}" if older else ""
+
+
+def _holds(study: Study, stage: str, made: int | None) -> bool:
+    now = STAGE_REVISIONS[stage]
+    return made == now or (SAME.get((stage, now)) == made and study.name not in EXTREMES)
 
 
 def entered(study: Study, docs: Path) -> dict[str, Any]:

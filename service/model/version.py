@@ -17,4 +17,4 @@ SCHEMA_OF_FIELD: Final[dict[str, int]] = {}
 SCHEMA_OF_PACKS: Final = 3
 
 #: Revision of each stage's algorithm. Part of the digest of a result, so results of two revisions never collide.
-STAGE_REVISIONS: Final = {"synthesize": 18, "scene": 2, "render": 3}
+STAGE_REVISIONS: Final = {"synthesize": 19, "scene": 2, "render": 3}

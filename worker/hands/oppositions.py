@@ -76,6 +76,10 @@ class Oppositions:
         """The greatest width [m]; 0 for a hand that cannot oppose its fingers."""
         return float(self.width[-1]) if len(self) else 0.0
 
+    def none(self) -> Oppositions:
+        """None of them."""
+        return Oppositions(self.q[:0], self.axis[:0], self.middle[:0], self.width[:0])
+
 
 _known: LRUCache[str, Oppositions] = LRUCache(16)
 _lock = threading.Lock()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
+import graspd
 from service.model.domain import FIDELITIES
 from service.model.transforms import quat_rotate
 from tests.worker.simulation.rigs import object_of
@@ -15,7 +18,7 @@ from worker.hands.pads import fingertip_pad
 from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.reaching import Reaching
 from worker.planners.fast_graspd.selection import posture_of
-from worker.planners.fast_graspd.starts import RETREATS, clear_starts, start_generator
+from worker.planners.fast_graspd.starts import CLEAR, RETREATS, clear_starts, start_generator
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
 
@@ -88,3 +91,23 @@ def test_what_is_too_wide_all_over_is_looked_at_only() -> None:
     looking, _ = starts_of(wide, 2, 2)
     alone = [start_generator(3, 0, i, k) for i in range(2) for k in range(2)]
     np.testing.assert_array_equal(looking.pivot, clear_starts(wide, alone)[0].pivot)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("side", [0.01, 0.2])
+def test_cubes_too_small_or_too_wide_for_pads_are_held_by_other_parts(side: float, tmp_path: Path) -> None:
+    file = tmp_path / "cube.stl"
+    trimesh.creation.box((side,) * 3).export(file)
+    grasps = graspd.synthesize("allegro", file, count=64, want="raw", seed=23)
+    # Measured: .41 and .55 of other seeds; the share of 64 is off by .06.
+    assert grasps.is_valid.mean() > 1 / 4
+
+
+@pytest.mark.parametrize("side", [0.01, 0.2])
+def test_all_starts_reach_around_what_pads_cannot_hold(side: float) -> None:
+    model = model_of((side, side, side))
+    reaching = Reaching.of(model)
+    assert reaching is not None
+    assert reaching.only
+    _, depth = starts_of(model, 16, 2)
+    assert (depth <= CLEAR).mean() > 0.9

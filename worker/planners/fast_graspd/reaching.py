@@ -20,6 +20,7 @@ from service.model.transforms import IDENTITY_POSE, quat_from_matrix, quat_rotat
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
+from worker.hands.spans import Size, spans_of
 from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
@@ -38,6 +39,8 @@ FAR: Final = 0.05
 #: Balls in the hand, and their radius [m]: they touch its surface from within; where a link is thinner they stand out.
 BALLS: Final = 96
 BALL_M: Final = 0.005
+#: An object is small if all its pairs of places are nearer to each other than this [m], and than the hand's pads come.
+SMALL_M: Final = 0.017
 #: The grid's distances are off by this [m].
 SLACK_M: Final = 0.001
 
@@ -48,20 +51,25 @@ class Reaching:
 
     model: Model
     grips: Any
+    only: bool
+    """Whether a palm that looks at a random place has little to hope for beside it: the object is too small or too wide
+    for the hand's pads."""
 
     @classmethod
     def of(cls, model: Model) -> Reaching | None:
         """None where the hand opposes no fingers, or where the object is too wide for it all over."""
         hand, obj = model.hand.model, model.obj.model
-        known, pairs = oppositions_of(hand), crossings_of(obj)
-        fits = pairs.width + 2 * ROOM_M[0] <= known.widest
-        if not fits.any():
+        width = crossings_of(obj).width
+        size = size_to_pads(hand, width)
+        known = _postures(hand, width, size)
+        if not len(known):
             return None
         key = (hand.content, obj.content, model.device)
         with _lock:
             if key not in _known:
-                _known[key] = _grips(hand, obj, known, model.device)
-            return cls(model, _known[key])
+                # What is too small or too wide is held where its room was found, and nowhere nearer to the palm.
+                _known[key] = _grips(hand, obj, known, model.device, deep=0.0 if size else 1.0)
+            return cls(model, _known[key], size is not None)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
         """Hands (n,) of the first draws from the numbers `first` (n,) on that are clear by their balls, and the numbers
@@ -85,7 +93,23 @@ _known: LRUCache[tuple[str, str, str], Any] = LRUCache(8)
 _lock = threading.Lock()
 
 
-def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str) -> Any:
+def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
+    """What an object whose pairs of places have the widths (P,) is to the hand's pads, if they hold none of them."""
+    known = oppositions_of(hand)
+    if not len(known) or not len(width):
+        return None
+    if width.max() < min(SMALL_M, known.width[0]):
+        return "small"
+    return "wide" if width.min() + 2 * ROOM_M[0] > known.widest else None
+
+
+def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
+    """The postures for pairs of places of the widths (P,): none if none holds one."""
+    known = oppositions_of(hand) if size is None else spans_of(hand, size)
+    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else known.none()
+
+
+def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str, *, deep: float) -> Any:
     pairs, out = crossings_of(obj), kernels.Grips()
     kept = np.flatnonzero(pairs.width + 2 * ROOM_M[0] <= known.widest)
     middle = pairs.middle[kept] - obj.centre_of_mass
@@ -104,6 +128,7 @@ def _grips(hand: HandModel, obj: ObjectModel, known: Oppositions, device: str) -
         out.opened = wp.array(known.width, dtype=wp.float32)
         out.balls = wp.array(balls, dtype=wp.vec3)
         out.radius = BALL_M - SLACK_M
+        out.deep = deep
         out.palm = wp.vec3(*hand.palm.approach)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
         out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)

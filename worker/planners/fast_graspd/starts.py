@@ -1,5 +1,6 @@
 """Approach sampling: where the hands start. Of the starts of a grasp every second one has the palm look at a random
-point of the surface, from a little way off, the others reach across the object between opposed fingers (`reaching`);
+point of the surface, from a little way off, the others reach across the object between opposed fingers (`reaching`), as
+all do where it is too small or too wide for the pads;
 jaws of a gripper stand around two opposite places (`jaw_starts`).
 
 A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
@@ -188,7 +189,8 @@ def no_place(model: Model) -> InputError:
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
     """A start of each generator, the least deep of its draws, and how deep it is (n,) [m]; most are clear.
 
-    Of the `each` starts of a grasp every second one, the first not among them, reaches across the object where it can.
+    Of the `each` starts of a grasp every second one, the first not among them, reaches across the object where it can;
+    all of them where the object is too small or too wide for the hand's pads.
     """
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
@@ -197,8 +199,9 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
     pair = _Pair.of(hand, obj)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
-    if jaws is None:
-        _reach(model, generators, np.flatnonzero(np.arange(count) % each % 2 == 1), probe, best, deepest)
+    if jaws is None and each > 1 and (reaching := Reaching.of(model)) is not None:
+        rows = np.arange(count)
+        _reach(reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest)
     open_ = np.flatnonzero(deepest > CLEAR)
     for _ in range(DRAWS):
         if not len(open_):
@@ -221,13 +224,10 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 
 
 def _reach(
-    model: Model, generators: list[np.random.Generator], rows: NDArray[np.intp], probe: Probe, best: HandState,
+    reaching: Reaching, generators: list[np.random.Generator], rows: NDArray[np.intp], probe: Probe, best: HandState,
     deepest: Floats,
 ) -> None:  # fmt: skip
     """Put into `best` and `deepest` those of the starts `rows` that reach across the object and are clear."""
-    reaching = Reaching.of(model) if len(rows) else None
-    if reaching is None:
-        return
     seeds = np.array([generators[i].integers(2**31) for i in rows], np.int32)
     first = np.zeros(len(rows), np.int32)
     left = np.arange(len(rows))

@@ -28,6 +28,7 @@ class Grips:
     opened: wp.array(dtype=wp.float32)  # (K,) width between the pads, ascending
     balls: wp.array2d(dtype=wp.vec3)  # (K, S) centres of balls in the hand
     radius: wp.float32
+    deep: wp.float32  # how much nearer than with their pads hands may hold, as a share of the way to the palm
     palm: wp.vec3  # unit, where the palm looks
     noise: wp.array(dtype=wp.float32)  # (D,) standard deviation of dofs
     lower: wp.array(dtype=wp.float32)
@@ -100,7 +101,7 @@ def drawn(
     away = -wp.quat_rotate(out.rotation, grips.palm)
     reach = grips.between[out.posture]
     # From holding with the fingertips to the palm against the object.
-    ahead = wp.max(wp.dot(reach, grips.palm), 0.0) * deep
+    ahead = wp.max(wp.dot(reach, grips.palm), 0.0) * deep * grips.deep
     pivot = grips.middle[pair] - wp.quat_rotate(out.rotation, reach) - ahead * away
     for r in range(retreats.shape[0]):
         out.pivot = pivot + retreats[r] * away

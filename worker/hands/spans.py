@@ -1,0 +1,209 @@
+"""Postures in which any two parts of a hand look at each other, at widths that pads do not oppose: for what is smaller
+than the least gap between pads, or wider than the widest.
+
+A thing of 10 mm is held between the sides of two fingers, or a finger and the palm; one as wide as the hand spans, by
+tips that press with their sides. Both are pairs of points of the hand's surface whose normals look along the line
+between them, with room for a cube of that width; they are found by sampling and random steps.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from cachetools import LRUCache
+from numpy.typing import NDArray
+
+from service.model import transforms
+from service.model.transforms import IDENTITY_POSE, quat_rotate
+from worker.hands import jacobian, kinematics, oppositions, primitives, surface
+from worker.hands.jacobian import generalized_forces
+from worker.hands.kinematics import body_poses
+from worker.hands.model import Floats, HandModel, SurfacePoints
+from worker.hands.oppositions import Oppositions, oppositions_of
+from worker.hands.surface import sample_surface
+from worker.objects.kept_arrays import arrays_kept_or_made
+
+Ints = NDArray[np.intp]
+Size = Literal["small", "wide"]
+
+#: Gaps between the parts that hold what is small [m], and how much wider than the widest opposition of pads others are.
+SMALL_M: Final = (0.006, 0.042)
+WIDER: Final = 1.06
+#: Points of the surface.
+POINTS: Final = {"small": 256, "wide": 640}
+#: Postures that are wanted, from so many times as many, and random steps that make them better.
+POSTURES: Final = 120
+CROWD: Final = 8
+CLIMBS: Final = 80
+#: How well both surfaces face along the line between them (cosine); a fall short of it weighs like a difference of
+#: width of so much [m], and so does a part of the hand that stands so deep in the cube between them.
+FACING: Final = {"small": 0.9, "wide": 0.8}
+TURNED_M: Final = 0.2
+DEEP: Final = 2.0
+#: How far the hand must be able to close on what it holds, by joints whose axes are so far from it at least [m].
+CLOSES_M: Final = 0.04
+LEVER_M: Final = 0.02
+#: Radius within which flat parts cover the tangent plane [m], and what it weighs if they do not [m].
+FLAT_M: Final = 0.006
+ROUND_M: Final = 0.003
+_DENSE: Final = 4000
+#: A posture that costs more is none [m].
+GOOD_M: Final = 0.006
+#: What is wide may reach this far towards the fingertips beyond the places that hold it [m].
+BEYOND_M: Final = 0.012
+#: Pairs of a posture that are looked at closely, and postures that are compared at once.
+CLOSELY: Final = 8
+AT_ONCE: Final = 16
+
+
+def spans_of(hand: HandModel, size: Size) -> Oppositions:
+    """Postures for small or wide things, from memory or this machine's cache where they are known."""
+    key = (hand.content, size)
+    with _lock:
+        if key not in _known:
+            code = (sys.modules[__name__], oppositions, jacobian, kinematics, primitives, surface, transforms)
+            made = arrays_kept_or_made("spans", key, code, lambda: vars(_spans(hand, size)))
+            _known[key] = Oppositions(**made)
+        return _known[key]
+
+
+_known: LRUCache[tuple[str, str], Oppositions] = LRUCache(16)
+_lock = threading.Lock()
+
+
+def _spans(hand: HandModel, size: Size) -> Oppositions:
+    widest = oppositions_of(hand).widest
+    least, most = SMALL_M if size == "small" else (widest, WIDER * widest)
+    rng, look = np.random.default_rng(0), _Look(hand, size)
+    wanted = np.linspace(least, most, POSTURES)
+    q = rng.uniform(hand.lower, hand.upper, (CROWD * POSTURES, hand.dofs))
+    found = look.at(q, np.repeat(wanted, CROWD))
+    best = found.cost.reshape(POSTURES, CROWD).argmin(axis=1) + CROWD * np.arange(POSTURES)
+    q, found = q[best], look.at(q[best], wanted)
+    for step in np.geomspace(0.3, 0.03, CLIMBS):
+        noise = rng.standard_normal(q.shape) * (rng.random(q.shape) < 0.5)
+        tried = np.clip(q + step * hand.span * noise, hand.lower, hand.upper)
+        new = look.at(tried, wanted)
+        better = new.cost < found.cost
+        q[better] = tried[better]
+        found.take(better, new)
+    good = np.flatnonzero(found.cost < GOOD_M)
+    good = good[np.argsort(found.width[good], kind="stable")]
+    return Oppositions(q[good], found.axis[good], found.middle[good], found.width[good])
+
+
+@dataclass
+class _Found:
+    """The best pairs of N postures: as `Oppositions` has them, and what they lack [m]."""
+
+    axis: Floats
+    middle: Floats
+    width: Floats
+    cost: Floats
+
+    def take(self, rows: NDArray[np.bool_], other: _Found) -> None:
+        """Exchange these rows for another's."""
+        for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
+            mine[rows] = its[rows]
+
+
+class _Look:
+    """What pairs of surface points of postures hold, and how well."""
+
+    def __init__(self, hand: HandModel, size: Size) -> None:
+        self.hand, self.facing = hand, FACING[size]
+        self.points = sample_surface(hand, POINTS[size])
+        body = self.points.body
+        holds = np.ones(len(body), bool) if size == "small" else np.isin(body, hand.fingertips)
+        self.holding = np.flatnonzero(holds)
+        one, other = np.triu_indices(len(self.holding), k=1)
+        apart = body[self.holding[one]] != body[self.holding[other]]
+        self.one, self.other = one[apart], other[apart]
+        flat = _flatness(hand, self.points)[self.holding] if size == "small" else np.ones(len(self.holding))
+        self.round = ROUND_M * (1 - np.minimum(flat[self.one], flat[self.other]))
+
+    def at(self, q: Floats, wanted: Floats) -> _Found:
+        """The best pair of each posture (n, D) for the widths `wanted` (n,)."""
+        rows = np.array_split(np.arange(len(q)), 1 + len(q) // AT_ONCE)
+        parts = [self._at(q[some], wanted[some]) for some in rows]
+        return _Found(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _at(self, q: Floats, wanted: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        hand, points = self.hand, self.points
+        bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
+        pose = bodies[:, points.body]
+        place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
+        normal = quat_rotate(pose[..., 3:], points.normal)[:, self.holding]
+        held = place[:, self.holding]
+        way = held[:, self.other] - held[:, self.one]
+        width = np.sqrt(np.einsum("npi,npi->np", way, way))
+        ahead = np.einsum("npi,npi->np", way, normal[:, self.one])
+        back = -np.einsum("npi,npi->np", way, normal[:, self.other])
+        facing = np.minimum(ahead, back) / np.maximum(width, 1e-9)
+        cost = TURNED_M * np.maximum(0.0, self.facing - facing) + np.abs(width - wanted[:, None]) + self.round
+        close = np.argpartition(cost, CLOSELY, axis=1)[:, :CLOSELY]
+        row = np.arange(len(q))[:, None]
+        cost, width = cost[row, close], width[row, close]
+        axis = way[row, close] / width[..., None]
+        ends = held[row, self.one[close]], held[row, self.other[close]]
+        cost += DEEP * self._stands_in(place, axis, *ends, width)
+        parts = self.holding[self.one[close]], self.holding[self.other[close]]
+        cost += np.maximum(0.0, CLOSES_M - self._closes(q, bodies, axis, parts, ends))
+        best = cost.argmin(axis=1)
+        row = np.arange(len(q))
+        middle = 0.5 * (ends[0] + ends[1])
+        return axis[row, best], middle[row, best], width[row, best], cost[row, best]
+
+    def _closes(
+        self, q: Floats, bodies: Floats, axis: Floats, parts: tuple[Ints, Ints], ends: tuple[Floats, Floats]
+    ) -> Floats:
+        """(n, K) how much nearer to each other two points can come, as far as their first motion tells [m]."""
+        hand, rate = self.hand, np.zeros((*axis.shape[:2], self.hand.dofs))
+        for part, end, sign in zip(parts, ends, (-1.0, 1.0), strict=True):
+            moves = generalized_forces(hand, bodies, self.points.body[part], end, axis[:, :, None])[:, :, 0]
+            rate += sign * moves
+        room = np.where(rate < 0, (hand.upper - q)[:, None], (q - hand.lower)[:, None])
+        nearer: Floats = np.where(np.abs(rate) > LEVER_M, np.abs(rate) * room, 0.0).sum(axis=2)
+        return nearer
+
+    def _stands_in(self, place: Floats, axis: Floats, one: Floats, other: Floats, width: Floats) -> Floats:
+        """(n, K) how deep the hand stands in cubes between two of its points [m]."""
+        ahead = self.hand.palm.approach
+        up = ahead - np.einsum("nki,i->nk", axis, ahead)[..., None] * axis
+        length = np.linalg.norm(up, axis=2, keepdims=True)
+        up = np.where(length > 0.1, up / np.maximum(length, 0.1), _any_across(axis))
+        half = 0.5 * width
+        start = np.minimum(np.einsum("nki,nki->nk", one, up), np.einsum("nki,nki->nk", other, up))
+        start = start - np.minimum(half, BEYOND_M)
+        off = place[:, None] - 0.5 * (one + other)[:, :, None]
+        along = half[..., None] - np.abs(np.einsum("nksi,nki->nks", off, axis))
+        aside = half[..., None] - np.abs(np.einsum("nksi,nki->nks", off, np.cross(axis, up)))
+        above = np.einsum("nsi,nki->nks", place, up) - start[..., None]
+        inside = np.minimum(np.minimum(along, aside), np.minimum(above, width[..., None] - above))
+        deepest: Floats = np.maximum(inside, 0.0).max(axis=2)
+        return deepest
+
+
+def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
+    """(N,) share of a small disc around each point, on its tangent plane, that its body covers."""
+    dense = sample_surface(hand, _DENSE)
+    flat = np.zeros(len(points))
+    for body in np.unique(points.body):
+        mine, its = points.body == body, dense.body == body
+        off = dense.position[its][None] - points.position[mine][:, None]
+        height = np.einsum("npi,ni->np", off, points.normal[mine])
+        near = (np.linalg.norm(off, axis=2) < FLAT_M) & (np.abs(height) < 0.1 * FLAT_M)
+        flat[mine] = near @ dense.area[its]
+    return np.minimum(1.0, flat / (np.pi * FLAT_M**2))
+
+
+def _any_across(axis: Floats) -> Floats:
+    """(..., 3) unit vectors across others."""
+    helper = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
+    across = np.cross(axis, helper)
+    unit: Floats = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    return unit
