@@ -23,7 +23,7 @@ _REVISIONS: Final = re.compile(r"^STAGE_REVISIONS[^=]*= (\{[^}]*\})", re.MULTILI
 #: but for studies of the smallest and largest objects.
 #: Synthesize 19 differs where an object is too small or too wide for the hand's pads: tests/front/test_same_figures.py.
 SAME: Final = {("synthesize", 19): 18}
-EXTREMES: Final = frozenset({"stability"})
+EXTREMES: Final = frozenset({"stability", "scenes-stability"})
 
 Manifest = dict[str, dict[str, Any]]
 

@@ -14,9 +14,9 @@ from worker.planners.fast_graspd.reaching import size_to_pads
 HANDS = ("allegro/allegro_hand_right.urdf", "barrett_bh280/bh280.urdf", "shadow/shadow_hand_right.urdf")
 
 
-@pytest.mark.parametrize("file", HANDS)
+@pytest.mark.parametrize("file", [*HANDS, "allegro", "barrett", "shadow"])
 def test_pads_of_the_hands_hold_the_objects_of_the_docs(file: str, shared_data: Path) -> None:
-    hand = hand_from_path(shared_data / "hands" / file)
+    hand = hand_from_path(shared_data / "hands" / file if "/" in file else file)
     meshes = sorted((shared_data / "objects").glob("*/clean.stl"))
     assert len(meshes) >= 14
     sizes = {mesh.parent.name: size_to_pads(hand, crossings_of(object_from_path(mesh)).width) for mesh in meshes}

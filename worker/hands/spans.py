@@ -75,6 +75,11 @@ _known: LRUCache[tuple[str, str], Oppositions] = LRUCache(16)
 _lock = threading.Lock()
 
 
+def widest_span(hand: HandModel) -> float:
+    """No posture of `spans_of` is for a wider thing [m]; told without looking for one."""
+    return WIDER * oppositions_of(hand).widest + GOOD_M
+
+
 def _spans(hand: HandModel, size: Size) -> Oppositions:
     widest = oppositions_of(hand).widest
     least, most = SMALL_M if size == "small" else (widest, WIDER * widest)

@@ -20,7 +20,7 @@ from service.model.transforms import IDENTITY_POSE, quat_from_matrix, quat_rotat
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
 from worker.hands.oppositions import Oppositions, oppositions_of
-from worker.hands.spans import Size, spans_of
+from worker.hands.spans import Size, spans_of, widest_span
 from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import ALIKE_M, BESIDE_M, NOISE, ROOM_M, crossings_of, frames
@@ -105,6 +105,8 @@ def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
 
 def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
     """The postures for pairs of places of the widths (P,): none if none holds one."""
+    if size == "wide" and width.min() + 2 * ROOM_M[0] > widest_span(hand):
+        return oppositions_of(hand).none()
     known = oppositions_of(hand) if size is None else spans_of(hand, size)
     return known if (width + 2 * ROOM_M[0] <= known.widest).any() else known.none()
 
