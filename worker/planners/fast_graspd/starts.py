@@ -1,7 +1,7 @@
 """Approach sampling: where the hands start. Of the starts of a grasp every second one has the palm look at a random
 point of the surface, from a little way off, the others reach across the object between opposed fingers (`reaching`), as
-all do where it is too small or too wide for the pads;
-jaws of a gripper stand around two opposite places (`jaw_starts`).
+all do where it is too small or too wide for the pads; jaws of a gripper stand around two opposite places
+(`jaw_starts`).
 
 A start is taken only if nothing touches: hands that start inside a thin wall never leave it.
 """
