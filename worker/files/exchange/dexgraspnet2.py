@@ -10,7 +10,9 @@ Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN a scene and VVVV a
         cam0_wrt_table.npy          (4, 4) camera of view 0 in the table's frame
     dex_grasps_new/scene_NNNN/HAND/OBJECT.npz
         `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera of view 0; `point` (N, 3): of the object's
-        surface, nearest to the palm, in the same frame; and each joint by its name (N,)
+        surface, at which the grasp points, in the same frame; and each joint by its name (N,)
+    dex_graspness_new/scene_NNNN/realsense/VVVV.npy
+        (P, 1) f4 graspness of the P points that its loader makes of the view, in the order of the pixels
 
 Its loader takes pixel (u, v) for the place u, v; ours has pixel centres at +0.5. The intrinsics say so.
 """
@@ -25,7 +27,6 @@ from typing import Any, Final
 
 import numpy as np
 import scipy.io
-import trimesh
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
@@ -33,6 +34,7 @@ from service.model.transforms import apply, compose, invert, pose_from_matrix, p
 from service.readers import DepthNoise, Pictures
 from service.readers.cloud_views import CloudView
 from worker.files.exchange.archives import load_npz
+from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
 from worker.files.exchange.imported import Imported, completed, joints_by_name, plain_name, verdicts
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
 from worker.files.exchange.objects import scaled_object
@@ -95,11 +97,15 @@ def write(
         raise InputError("no picture shows a scene with grasps; put views beside the grasps: graspd render")
     done = Written({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
     numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}
+    samples: dict[str, Floats] = {}
     for some in scenes:
         lot = known[some[0].base]
         name = f"scene_{next(numbers[lot.name in out]):04}"
-        _write_scene(some[:VIEWS], pictures, top / "scenes" / name / CAMERA, noise)
-        _write_grasps(some[0], lot, top / "dex_grasps_new" / name / plain_name(lot.hand.name))
+        if lot.id not in samples:
+            samples[lot.id] = surface_samples(lot.obj)
+        graspness = SceneGraspness.of(lot.hand, lot.grasps.grasp.take(some[0].rows), samples[lot.id])
+        _write_scene(some[:VIEWS], pictures, top, name, noise, graspness)
+        _write_grasps(some[0], lot, top / "dex_grasps_new" / name / plain_name(lot.hand.name), graspness)
         done.counts["grasps"] += len(some[0].rows)
         done.counts["views"] += min(len(some), VIEWS)
     if not out:
@@ -117,33 +123,43 @@ def _numbers(held: bool, scenes: list[list[Look]], known: dict[str, Lot], out: f
     return islice(room, count)
 
 
-def _write_scene(some: list[Look], pictures: Pictures, path: Path, noise: DepthNoise | None) -> None:
-    for part in ("depth_gt", "label_gt", "meta"):
-        (path / part).mkdir(parents=True)
-    first = invert(pose_from_matrix(some[0].extrinsics))
+def _write_scene(
+    some: list[Look], pictures: Pictures, top: Path, name: str, noise: DepthNoise | None, graspness: SceneGraspness
+) -> None:
+    path, values = top / "scenes" / name / CAMERA, top / "dex_graspness_new" / name / CAMERA
+    kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))
+    for folder, _ in kinds:
+        folder.mkdir(parents=True)
+    first = pose_to_matrix(invert(pose_from_matrix(some[0].extrinsics)))
     poses = [pose_to_matrix(compose(pose_from_matrix(some[0].extrinsics), _camera(look))) for look in some]
-    np.save(path / "cam0_wrt_table.npy", pose_to_matrix(first))
+    np.save(path / "cam0_wrt_table.npy", first)
     np.save(path / "camera_poses.npy", np.array([poses[view % len(some)] for view in range(VIEWS)]))
     for view, look in enumerate(some):
         sample = pictures[look.index]
         steps = CloudView.of(sample, noise, np.random.default_rng(look.index)).seen * FACTOR
         steps = np.where(steps < np.iinfo(np.uint16).max + 0.5, np.rint(steps), 0)
         export_png(path / "depth_gt" / f"{view:04}.png", steps.astype(np.uint16))
-        labels = np.maximum(np.asarray(sample["image/segmentation"], int) - (OBJECT - 1), 0)
-        export_png(path / "label_gt" / f"{view:04}.png", labels.astype(np.uint8))
+        labels = np.maximum(np.asarray(sample["image/segmentation"], int) - (OBJECT - 1), 0).astype(np.uint8)
+        export_png(path / "label_gt" / f"{view:04}.png", labels)
         intrinsics = np.asarray(sample["camera/intrinsics"], float) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        pose = np.asarray(sample["object/pose"])
         meta = {
             "intrinsic_matrix": intrinsics, "factor_depth": np.array([[FACTOR]]), "cls_indexes": np.array([[1]]),
-            "poses": pose_to_matrix(np.asarray(sample["object/pose"]))[:3, :, None],
+            "poses": pose_to_matrix(pose)[:3, :, None],
         }  # fmt: skip
         scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
+        if labels.any():  # its loader passes over a view of nothing, which has no workspace
+            found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
+            np.save(values / f"{view:04}.npy", found)
     # It draws among 256 views: the rest are the same files again.
     for view in range(len(some), VIEWS):
-        for part, suffix in (("depth_gt", "png"), ("label_gt", "png"), ("meta", "mat")):
-            _again(path / part / f"{view % len(some):04}.{suffix}", path / part / f"{view:04}.{suffix}")
+        for folder, suffix in kinds:
+            _again(folder / f"{view % len(some):04}.{suffix}", folder / f"{view:04}.{suffix}")
 
 
 def _again(file: Path, copy: Path) -> None:
+    if not file.exists():
+        return
     try:
         copy.hardlink_to(file)
     except OSError:
@@ -155,7 +171,7 @@ def _camera(look: Look) -> Floats:
     return invert(pose_from_matrix(look.extrinsics))
 
 
-def _write_grasps(look: Look, lot: Lot, folder: Path) -> None:
+def _write_grasps(look: Look, lot: Lot, folder: Path, graspness: SceneGraspness) -> None:
     names = lot.hand.joint_names
     if taken := set(names) & {*_PLACE, *_OURS, *_NUMPYS}:
         raise InputError(f"{lot.hand.name} has a joint {sorted(taken)[0]!r}, which is a key of DexGraspNet 2.0's files")
@@ -163,9 +179,7 @@ def _write_grasps(look: Look, lot: Lot, folder: Path) -> None:
     some = {name: getattr(lot.grasps, name).take(look.rows) for name in ("pregrasp", "grasp", "squeeze")}
     placed = {name: compose(in_camera, part.hand_pose) for name, part in some.items()}
     matrices = pose_to_matrix(placed["grasp"])
-    mesh = trimesh.Trimesh(lot.obj.vertices, lot.obj.faces, process=False)
-    palms = apply(some["grasp"].hand_pose, lot.hand.palm.centre)
-    point = apply(in_camera, trimesh.proximity.closest_point(mesh, palms)[0])
+    point = apply(in_camera, graspness.samples[graspness.pointed])
     arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
     arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
     # Its loader takes these along and does not look at them: what brings the grasps back as they were.

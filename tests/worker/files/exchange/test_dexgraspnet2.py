@@ -9,20 +9,24 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import scipy.io
 import trimesh
 
 from service.model.errors import InputError
 from service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
 from service.readers import Pictures, open_shards
-from service.store.shards import Shard
+from service.store.shards import Shard, read_shard, write_shard
 from tests.worker.files.exchange.conftest import run
-from tests.worker.files.exchange.dexgraspnet2_loader import sample, some_views
+from tests.worker.files.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
 from worker.files.exchange import archives, dexgraspnet2
 from worker.files.exchange.archives import load_npz
+from worker.files.exchange.dexgraspnet2_graspness import surface_samples
 from worker.files.exchange.lots import Look
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel
+from worker.hands.pads import fingertip_pad
 from worker.objects.model import ObjectModel
+from worker.rendering.annotate import TABLE
 
 TRAIN, VAL = range(90), range(90, 100)
 #: Poses go through matrices in float64 and there and back between frames [m].
@@ -106,6 +110,87 @@ def test_a_grasp_points_at_the_object(root: Path, block: ObjectModel) -> None:
         turn = trimesh.transformations.quaternion_matrix(place[3:])[:3, :3]
         points = (np.load(file)["point"] - place[:3]) @ turn
         assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < ROUNDING_M
+
+
+def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
+    """Points of the object's frame in the camera of a view."""
+    meta = scipy.io.loadmat(root / "data" / "scenes" / scene / "realsense" / "meta" / f"{view:04}.mat")
+    pose = meta["poses"][:, :, 0]
+    return np.asarray(points @ pose[:, :3].T + pose[:, 3])
+
+
+def test_a_grasp_points_where_its_script_says(
+    root: Path, split: range, hand: HandModel, stored: Shard, block: ObjectModel
+) -> None:
+    surface, names = surface_samples(block), list(hand.joint_names)
+    pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
+    (scene, view), *_ = some_views(root, split, 1, seed=6)
+    found = sample(root, scene, view, "barrett", names)
+    rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
+    for number, row in enumerate(rows):
+        pose = stored["grasp/hand_pose"][row].astype(float)
+        bodies = body_poses(hand, pose[None], stored["grasp/joint_positions"][row][None])[0]
+        # A Barrett's thumb is its third finger.
+        first, second, thumb = (apply(bodies[tip], pad) for tip, pad in zip(hand.fingertips, pads, strict=True))
+        best = pointed(apply(pose, hand.palm.centre), ((first + second) / 2 + thumb) / 2, surface)
+        np.testing.assert_allclose(found.point[number], placed(root, scene, view, surface)[best], atol=ROUNDING_M)
+    assert len(rows)
+
+
+def test_graspness_is_that_of_its_script(root: Path, split: range, hand: HandModel, block: ObjectModel) -> None:
+    surface = surface_samples(block)
+    for scene, view in some_views(root, split, 3, seed=7):
+        found = sample(root, scene, view, "barrett", list(hand.joint_names))
+        assert found.has_graspness
+        there = placed(root, scene, view, surface)
+        mine = np.flatnonzero(found.seg == 1)
+        for number in mine[:: max(1, len(mine) // 40)]:
+            value = graspness_at(found.point_clouds[number], there, found.point)
+            np.testing.assert_allclose(found.graspness[number], np.log(value + 1e-3), rtol=1e-5)
+        np.testing.assert_allclose(found.graspness[found.seg != 1], np.log(1e-3), rtol=1e-6)
+        assert found.graspness.max() > np.log(0.5)
+
+
+def test_graspness_lies_as_its_loader_expects_it(root: Path) -> None:
+    scenes = sorted((root / "data" / "scenes").iterdir())
+    for scene in scenes:
+        folder = root / "data" / "dex_graspness_new" / scene.name / "realsense"
+        assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(256)]
+        values = np.load(folder / "0001.npy")
+        assert values.dtype == np.float32 and values.ndim == 2 and values.shape[1] == 1
+        assert np.isfinite(values).all() and values.min() >= 0
+        np.testing.assert_array_equal(np.load(folder / "0255.npy"), values)
+    assert sorted(file.name for file in (root / "data" / "dex_graspness_new").iterdir()) == [s.name for s in scenes]
+
+
+def test_graspness_belongs_to_the_cloud_that_a_depth_camera_tells(
+    on_tables: Path, hand: HandModel, tmp_path: Path
+) -> None:
+    run("export", on_tables, "--format", "dexgraspnet2", "--noise", "stereo", "-o", tmp_path)
+    for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
+        found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
+        assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
+
+
+def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+    views = read_shard(on_tables / "block-views.h5", kind="views")
+    labels = np.array(views["image/segmentation"])
+    labels[::2] = np.minimum(labels[::2], TABLE)
+    shards = tmp_path / "shards"
+    shards.mkdir()
+    (shards / "block.h5").write_bytes((on_tables / "block.h5").read_bytes())
+    arrays = {**views.arrays, "image/segmentation": labels}
+    (shards / "views.h5").write_bytes(write_shard("views", arrays, views.attributes))
+    run("export", shards, "--format", "dexgraspnet2", "-o", tmp_path / "out")
+    for folder in (tmp_path / "out" / "data" / "dex_graspness_new").glob("*/realsense"):
+        assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(1, 256, 2)]
+        assert sample(tmp_path / "out", folder.parent.name, 3, "barrett", list(hand.joint_names)).has_graspness
+
+
+def test_a_file_of_graspness_holds_no_grasps(root: Path) -> None:
+    (file, *_) = sorted((root / "data" / "dex_graspness_new").rglob("0000.npy"))
+    with pytest.raises(InputError, match="read safely"):
+        dexgraspnet2.read(file, hand="barrett", obj="block")
 
 
 def test_grasps_come_back_as_they_were(root: Path, stored: Shard) -> None:
