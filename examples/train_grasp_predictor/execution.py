@@ -71,7 +71,7 @@ def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
     hands = _raised(first, CLEAR_M - room)
     lowest = np.minimum(obstacle_room(hand, Posture(hands.hand_pose, hands.joints), [table()]),
                         _room_on_the_way(hand, hands, opened))  # fmt: skip
-    clear = (lowest >= 0.5 * CLEAR_M) & (_gap(hand, hands, opened, sight) >= SEEN_M)
+    clear = (lowest >= 0.5 * CLEAR_M) & _passes(hand, hands, opened, sight)
     return Ready(hands, opened, at_grasp < 0.0, clear)
 
 
@@ -129,13 +129,14 @@ def _room_on_the_way(hand: HandModel, hands: Proposals, opened: Floats) -> Float
     return np.asarray(obstacle_room(hand, coming, [table()]).reshape(n, steps).min(axis=1))
 
 
-def _gap(hand: HandModel, hands: Proposals, opened: Floats, sight: Sight) -> Floats:
-    """(N,) least distance of the coming hand's surface from the points that were seen [m]."""
+def _passes(hand: HandModel, hands: Proposals, opened: Floats, sight: Sight) -> NDArray[np.bool_]:
+    """(N,) whether the coming hand's surface keeps `SEEN_M` from the points that were seen."""
     path = way_in(hands)
     n, steps = path.shape[:2]
     points = hand_points(hand, path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
-    distance, _ = cKDTree(sight.points).query(points.reshape(-1, 3))
-    return np.asarray(distance).reshape(n, -1).min(axis=1)
+    # Farther away it does not matter how far: a search without a bound takes ten times as long.
+    distance, _ = cKDTree(sight.points).query(points.reshape(-1, 3), distance_upper_bound=SEEN_M)
+    return np.asarray(np.isinf(distance).reshape(n, -1).all(axis=1))
 
 
 def hand_points(hand: HandModel, pose: Floats, joints: Floats) -> Floats:
