@@ -102,7 +102,7 @@ def check_exposure(host: str, keys: KeyFile) -> None:
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
     """Innermost first: limits on bodies, who asks and how often, foreign web pages, request ids around everything."""
-    uploads = frozenset({"/v1/hands", "/v1/objects", "/submit"})
+    uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
     app.add_middleware(Turnstile, keys=keys, proxy=proxy, settings=settings, rates=rates)
     allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None

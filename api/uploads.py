@@ -1,4 +1,5 @@
-"""What a stranger uploads as a hand or an object: one file or a ZIP of a folder, turned into the files of an asset."""
+"""What a stranger uploads as a hand, an object or a network: one file, or but for a network a ZIP of a folder, turned
+into the files of an asset."""
 
 from __future__ import annotations
 
@@ -14,10 +15,13 @@ from service.model.errors import InputError, LimitError
 from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from service.store.descriptions import json_object
 from service.store.hand_main import SUFFIXES, hand_name, main_of
+from service.store.network_check import NETWORK_FILE
+from service.store.network_file import check_size
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: SUFFIXES,
     AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off"),
+    AssetKind.NETWORK: (".npz",),
 }
 _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 
@@ -30,7 +34,7 @@ def files_of_upload(
     Those of a ZIP are read from it when they are asked for.
 
     Args:
-        kind: hand or object.
+        kind: hand, object or network.
         filename: as the user called it.
         data: its bytes, or the open file that holds them.
         limit_bytes: largest upload [bytes].
@@ -50,10 +54,10 @@ def files_of_upload(
         raise LimitError(f"{leaf} is larger than {limit_bytes} bytes; simplify it or raise the limit")
     if not leaf or not size:
         raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
-    if PurePosixPath(leaf).suffix.lower() == ".zip":
-        files: MutableMapping[str, bytes] = ZipFiles(
-            file, limit_bytes=limit_bytes * UNPACK_FACTOR
-        ).without_common_folder()
+    if kind is AssetKind.NETWORK:
+        files: MutableMapping[str, bytes] = {NETWORK_FILE: _network(leaf, file, size)}
+    elif PurePosixPath(leaf).suffix.lower() == ".zip":
+        files = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR).without_common_folder()
     else:
         files = {check_path(leaf): file.read()}
     stated = "asset.json" in files
@@ -73,6 +77,14 @@ def name_of_upload(filename: str) -> str:
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
     return _NAME.sub("-", stem).strip("-._")[:64] or "unnamed"
+
+
+def _network(leaf: str, file: IO[bytes], size: int) -> bytes:
+    """The bytes of a file that may be a network's: it is a ZIP itself, and none of other files."""
+    if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[AssetKind.NETWORK]:
+        raise InputError(f"{leaf} is no network; upload its .npz file as it is")
+    check_size(size, leaf)
+    return file.read()
 
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:

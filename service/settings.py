@@ -99,7 +99,9 @@ class Settings(BaseSettings):
         0, ge=0, description="resident memory after which it does so [MiB]; 0: half of the machine's"
     )
     retry_backoff_s: float = Field(2.0, ge=0, description="wait before the second attempt; doubles with each [s]")
-    max_upload_bytes: int = Field(64 * 2**20, gt=0, description="largest hand or object taken over HTTP [bytes]")
+    max_upload_bytes: int = Field(
+        64 * 2**20, gt=0, description="largest hand, object or network taken over HTTP [bytes]"
+    )
     queue_window: int = Field(
         1000, ge=1, description="tasks kept waiting in a lane, or two a worker; the rest waits in the index"
     )

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.store.network_file import ProposalNetwork, numbers, weight_shapes
+from service.store.network_check import NETWORK_FILE
+from service.store.network_file import ProposalNetwork, numbers, to_bytes, weight_shapes
 
 DIGEST = "0" * 32
 
@@ -25,3 +26,8 @@ def random_network(
     mean = rng.normal(0, 0.1, count).astype(np.float32)
     std = rng.uniform(0.05, 0.2, count).astype(np.float32)
     return ProposalNetwork(hand, digest, tuple(joint_names), weights, mean, std, points, steps, about="drawn by chance")
+
+
+def network_files(network: ProposalNetwork) -> dict[str, bytes]:
+    """The files of a network as the service keeps them."""
+    return {"asset.json": f'{{"file": "{NETWORK_FILE}"}}'.encode(), NETWORK_FILE: to_bytes(network)}

@@ -1,4 +1,4 @@
-"""Hands and objects: uploaded under a name, taken away again."""
+"""Hands, objects and networks: uploaded under a name, taken away again."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from service.store import library
 from service.store.assets import ZipFiles, asset_json
 from service.store.descriptions import MAX_BYTES, json_object
 from service.store.hand_corrections import HandCorrections, HandFacts, corrected, facts_of
+from service.store.network_check import network_report
 
 log = logging.getLogger(__name__)
 _MAX_NAME: Final = 64
@@ -30,7 +31,8 @@ _NAMES_TRIED: Final = 100
 
 
 class Assets:
-    """Hands and objects within the caller's reach; what takes one away asks whose it is. A `name` may be a digest."""
+    """Hands, objects and networks within the caller's reach; what takes one away asks whose it is. A `name` may be a
+    digest."""
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
@@ -63,7 +65,8 @@ class Assets:
         self_test: bool = False,
         shared: bool = False,
     ) -> AssetView:
-        """Keep an uploaded hand or object; the keeper queues its check, which ends with grasps if `self_test` says so.
+        """Keep what was uploaded. The keeper queues the check of a hand or an object, which ends with grasps if
+        `self_test` says so; a network is checked here.
 
         Args:
             shared: whether every project may use it.
@@ -71,7 +74,9 @@ class Assets:
         Raises:
             ConflictError: the name stands for other content, or the content has another name or belongs to another
                 project.
+            InputError: no network.
         """
+        found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = reach().project
         digest = self._mark(kind, name, files, "" if shared else project)
         self._refuse_hidden(kind, digest)
@@ -79,6 +84,9 @@ class Assets:
         index, store = self._parts.index, self._parts.store
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
+        if found is not None:
+            # Before the record: from then on it counts, and no worker is asked about it.
+            store.put(names.asset_check(kind, asset.digest), json.dumps(found).encode())
         # Of two uploads at once that want one name, the later one must see the earlier one's record.
         with index.database.writing() as connection:
             self._refuse_taken(kind, name, asset.digest)
@@ -139,7 +147,7 @@ class Assets:
         raise ConflictError(f"there are many hands named {stem}-...; choose a name")
 
     def delete(self, kind: AssetKind, name: str) -> None:
-        """Take a hand or object away that nothing needs.
+        """Take a hand, object or network away that nothing needs.
 
         Raises:
             NotYours: another key uploaded it.

@@ -1,4 +1,4 @@
-"""`/v1/hands` and `/v1/objects`: what can be grasped, and with what."""
+"""`/v1/hands`, `/v1/objects` and `/v1/networks`: what can be grasped, with what, and what proposes grasps."""
 
 from __future__ import annotations
 
@@ -30,6 +30,15 @@ _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 
+_ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
+#: What the document says of an upload.
+_ADDED: Final = {
+    AssetKind.HAND: _ZIPPED,
+    AssetKind.OBJECT: _ZIPPED,
+    AssetKind.NETWORK: "Upload a proposal network: an `.npz` of the schema `graspd/proposals@1`.",
+}
+
+
 @cache
 def asset_router(kind: AssetKind) -> APIRouter:
     """The routes of one kind of asset."""
@@ -50,6 +59,69 @@ def asset_router(kind: AssetKind) -> APIRouter:
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
         """One of them, with what the check found."""
         return assets.one(kind, name)
+
+    if kind is not AssetKind.NETWORK:
+        _add_model_routes(router, kind)
+
+    @router.post(
+        "",
+        status_code=201 if kind is AssetKind.NETWORK else 202,
+        dependencies=[Depends(may_submit)],
+        responses=responses(400, 401, 403, 409, 413, 422, 503),
+        name=f"add_{kind}",
+        description=_ADDED[kind],
+    )
+    async def add_asset(
+        file: UploadFile,
+        response: Response,
+        request: Request,
+        assets: AssetsOf,
+        name: Annotated[Name | None, Form()] = None,
+        options: Annotated[
+            str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
+        ] = "",
+        self_test: Annotated[
+            bool,
+            Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker"),
+        ] = False,
+        shared: Annotated[bool, Form(description="whether every project may use it, not only that of the key")] = False,
+    ) -> AssetView:
+        limit = request.app.state.settings.max_upload_bytes
+        uploads: Turns = request.app.state.uploads
+        if self_test and kind is not AssetKind.HAND:
+            raise InputError("self_test: only a hand can be tried")
+        asset = await uploads.run(
+            store_upload,
+            assets,
+            kind,
+            file,
+            name,
+            limit_bytes=limit,
+            options=options,
+            self_test=self_test,
+            shared=shared,
+        )
+        response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
+        if asset.verdict is None:
+            response.headers["Retry-After"] = "1"
+        return asset
+
+    @router.delete(
+        "/{name}",
+        status_code=204,
+        dependencies=[Depends(may_submit)],
+        responses=responses(401, 403, 404, 409, 503),
+        name=f"delete_{kind}",
+    )
+    def delete_asset(name: str, assets: AssetsOf) -> None:
+        """Take it away; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
+        assets.delete(kind, name)
+
+    return router
+
+
+def _add_model_routes(router: APIRouter, kind: AssetKind) -> None:
+    """What viewers show of a hand or an object; a network has no shape."""
 
     @router.head("/{name}/model", dependencies=[Depends(may_read)], include_in_schema=False)
     @router.get(
@@ -80,61 +152,6 @@ def asset_router(kind: AssetKind) -> APIRouter:
         if request.method == "HEAD":
             return Response(media_type=_GLB, headers=headers | {"Content-Length": str(len(data))})
         return Response(data, media_type=_GLB, headers=headers)
-
-    @router.post(
-        "",
-        status_code=202,
-        dependencies=[Depends(may_submit)],
-        responses=responses(400, 401, 403, 409, 413, 422, 503),
-        name=f"add_{kind}",
-    )
-    async def add_asset(
-        file: UploadFile,
-        response: Response,
-        request: Request,
-        assets: AssetsOf,
-        name: Annotated[Name | None, Form()] = None,
-        options: Annotated[
-            str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
-        ] = "",
-        self_test: Annotated[
-            bool,
-            Form(description="of a hand: its check ends with 64 grasps of plain objects, some minutes of a worker"),
-        ] = False,
-        shared: Annotated[bool, Form(description="whether every project may use it, not only that of the key")] = False,
-    ) -> AssetView:
-        """Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."""
-        limit = request.app.state.settings.max_upload_bytes
-        uploads: Turns = request.app.state.uploads
-        if self_test and kind is not AssetKind.HAND:
-            raise InputError("self_test: only a hand can be tried")
-        asset = await uploads.run(
-            store_upload,
-            assets,
-            kind,
-            file,
-            name,
-            limit_bytes=limit,
-            options=options,
-            self_test=self_test,
-            shared=shared,
-        )
-        response.headers["Location"] = f"/v1/{kind.value}s/{asset.name}"
-        response.headers["Retry-After"] = "1"
-        return asset
-
-    @router.delete(
-        "/{name}",
-        status_code=204,
-        dependencies=[Depends(may_submit)],
-        responses=responses(401, 403, 404, 409, 503),
-        name=f"delete_{kind}",
-    )
-    def delete_asset(name: str, assets: AssetsOf) -> None:
-        """Take it away; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
-        assets.delete(kind, name)
-
-    return router
 
 
 def store_upload(

@@ -28,6 +28,7 @@ datasets: Final = Table(
     # Number of events for which its end was told; -1: it was not.
     Column("told", Integer, nullable=False, server_default="-1"),
     Column("neighbours", String(300), nullable=False, server_default=""),
+    Column("network_digest", String(32), nullable=False, server_default=""),
     Index("datasets_newest", "created", "name"),
 )
 

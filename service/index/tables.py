@@ -49,6 +49,7 @@ jobs: Final = Table(
     # Digests of its neighbours, with a space between; a list would need a table.
     Column("neighbours", String(300), nullable=False, server_default=""),
     Column("choice", JSON(none_as_null=True)),
+    Column("network_digest", String(32), nullable=False, server_default=""),
     Index("jobs_beside", "neighbours"),
     Index("jobs_newest", "created", "id"),
     Index("jobs_by_state", "state", "created", "id"),

@@ -5,6 +5,7 @@ Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: positio
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Sequence
 from enum import StrEnum
@@ -13,11 +14,13 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from service.model.diversity import MIN_DISTANCE_M
+from service.model.labels import DIGEST
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
 from service.model.labels import Word as Word
 from service.model.projects import Project
 from service.model.robust import MODELS, MOST_MODELS
+from service.model.scene_kinds import has_table
 from service.model.scene_options import (
     BesideOption,
     NamedNeighbour,
@@ -52,7 +55,7 @@ class State(StrEnum):
 
 
 class Stage(StrEnum):
-    """What a task does. `ingest` checks an uploaded hand or object; the others make shards."""
+    """What a task does. `ingest` checks what was uploaded; the others make shards."""
 
     INGEST = "ingest"
     SYNTHESIZE = "synthesize"
@@ -61,10 +64,11 @@ class Stage(StrEnum):
 
 
 class AssetKind(StrEnum):
-    """The two kinds of things a user brings."""
+    """The kinds of things a user brings. A network proposes grasps of one hand (`service.store.network_file`)."""
 
     HAND = "hand"
     OBJECT = "object"
+    NETWORK = "network"
 
 
 class Model(BaseModel):
@@ -140,8 +144,8 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
 
 #: Methods of graspd's own that know no scene; what those of other packages know, a worker tells.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
-#: Methods that need a file which the service does not keep: they run where the file is.
-LOCAL_METHODS: Final = ("learned",)
+#: Methods that set out from what a network proposes for a thing on a table: their option `network` names it.
+NETWORK_METHODS: Final = ("learned",)
 #: Scenes of a batch that is planned in scenes, where the request does not say how many.
 SCENES: Final = 4
 
@@ -285,9 +289,16 @@ class JobOptions(Model):
         return self
 
     @model_validator(mode="after")
-    def _made_where_its_files_are(self) -> Self:
-        if self.SUBMITTED and self.method in LOCAL_METHODS:
-            raise ValueError(f"method {self.method} needs a file of this machine: use graspd synth, services have none")
+    def _proposed_on_a_table(self) -> Self:
+        if not self.SUBMITTED or self.method not in NETWORK_METHODS:
+            return self
+        if not self.network:
+            raise ValueError(f"method {self.method} needs the option network: the name of one that the service keeps")
+        if not has_table(self.place):
+            raise ValueError(
+                f"method {self.method} proposes grasps of things on a table: choose scene table or bin, or a document "
+                "with a level half-space"
+            )
         return self
 
     @model_validator(mode="after")
@@ -334,6 +345,11 @@ class JobOptions(Model):
         if isinstance(self.scene, SceneDocument):
             changed["scene"] = self.scene.model_copy(update={"neighbours": tuple(found[:first])})
         return self.model_copy(update=changed)
+
+    @property
+    def network(self) -> str:
+        """Name or digest of the network that its method sets out from; empty: it takes none."""
+        return str(self.options.get("network", "")) if self.method in NETWORK_METHODS else ""
 
     @property
     def in_scene(self) -> bool:
@@ -387,18 +403,21 @@ class JobRequest(JobOptions):
 
 
 def check_known(options: JobOptions) -> None:
-    """Raises ValueError where a neighbour lacks the digest of its files: a name may stand for another object later."""
+    """Raises ValueError where a neighbour or the network is not said by the digest of its files: a name may stand for
+    other files later."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
+    if options.network and not re.fullmatch(DIGEST, options.network):
+        raise ValueError("the network of a stored job is said by the digest of its files")
 
 
 class Asset(Model):
-    """A hand or an object as the service keeps it: immutable bytes under the digest of their content."""
+    """A hand, an object or a network as the service keeps it: immutable bytes under the digest of their content."""
 
     kind: AssetKind
     name: Name
     digest: Digest
-    filename: str = Field(description="file inside the archive that describes the asset: the URDF or the mesh")
+    filename: str = Field(description="file inside the archive that describes the asset: URDF, mesh or network")
     files: tuple[str, ...] = Field(description="all files of the archive, relative paths")
     size_bytes: int
     created: str = Field(description="RFC 3339, UTC")
@@ -448,13 +467,13 @@ class TaskMessage(Model):
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     @model_validator(mode="after")
-    def _knows_its_neighbours(self) -> Self:
+    def _knows_its_files(self) -> Self:
         check_known(self.request)
         return self
 
 
 class IngestMessage(Model):
-    """A task that checks an uploaded hand or object in a child process."""
+    """A task that checks an uploaded hand, object or network in a child process."""
 
     schema_: int = Field(alias="schema")
     newest_schema: int = Field(0, ge=0)

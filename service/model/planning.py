@@ -23,7 +23,7 @@ from service.model.domain import (
     TaskMessage,
 )
 from service.model.records import JobRecord
-from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, SCHEMA_OF_PACKS, TASK_SCHEMA
+from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, SCHEMA_OF_NETWORKS, SCHEMA_OF_PACKS, TASK_SCHEMA
 
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
@@ -125,13 +125,14 @@ def message_of(
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = SCHEMA_OF_FIELD) -> int:
-    """The oldest schema in which a request can be said: that of the newest field that it uses.
+    """The oldest schema in which a request can be said: that of the newest that it uses.
 
     Args:
         since: fields by the schema that first had them.
     """
     fields = JobRequest.model_fields
-    used = (schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default())
+    used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
+    used += [SCHEMA_OF_NETWORKS] if request.network else []
     return max(used, default=OLDEST_TASK_SCHEMA)
 
 
@@ -141,7 +142,7 @@ def backoff(first_s: float, failures: int) -> float:
 
 
 def ingest_id(kind: AssetKind, digest: str) -> str:
-    """Address of the task that checks an uploaded hand or object."""
+    """Address of the task that checks what was uploaded."""
     return digest_json({"ingest": kind, "digest": digest})
 
 

@@ -61,15 +61,16 @@ class JobRecord(Record):
         return data
 
     @model_validator(mode="after")
-    def _knows_its_neighbours(self) -> Self:
+    def _knows_its_files(self) -> Self:
         check_known(self.request)
         return self
 
     @property
     def assets(self) -> tuple[tuple[AssetKind, str], ...]:
         """Kind and digest of all that it is made of."""
-        beside = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
-        return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *beside)
+        further = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
+        further += [(AssetKind.NETWORK, network)] if (network := self.request.network) else []
+        return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *further)
 
 
 class JobEvent(Record):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from service.model.scene_spec import Box, HalfSpace, SceneSpec
@@ -13,6 +14,8 @@ WALL: Final = 0.02
 #: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
 SHELF_SIZE: Final = (0.80, 0.35)
 SHELF_HEIGHT: Final = 0.35
+#: A half-space whose normal is so upright (cosine) is a table.
+UPRIGHT: Final = 1 - 1e-6
 
 
 def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
@@ -24,6 +27,12 @@ def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
     if spec.kind == "table":
         return (HalfSpace(),)
     return _bin() if spec.kind == "bin" else _shelf()
+
+
+def has_table(spec: SceneSpec) -> bool:
+    """Whether a scene has a level half-space."""
+    flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
+    return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
 
 
 def _box(x: float, y: float, z: float, size: tuple[float, float, float]) -> Box:

@@ -1,4 +1,4 @@
-"""What a user takes away: hands, objects, jobs, datasets. A record of the deletion is the fact; the rest follows.
+"""What a user takes away: assets, jobs, datasets. A record of the deletion is the fact; the rest follows.
 
 `deletions/{what}/{id}.json` is written while nobody else writes the index, in the same step as the rows go. From then
 on the thing is gone: a rebuild leaves it out, and nothing of that id is taken in. The keeper
@@ -21,7 +21,7 @@ from service.store.store import Store
 
 
 def delete_asset(parts: Parts, kind: AssetKind, name: str, *, owner: str = "", reach: Reach = EVERYTHING) -> None:
-    """Take a hand or object away.
+    """Take a hand, object or network away.
 
     Args:
         owner: id of the API key that deletes it.

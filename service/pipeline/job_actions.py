@@ -24,7 +24,7 @@ from service.pipeline.backends import Parts
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.routes import Routes
 from service.pipeline.scene_check import check_scene
-from service.pipeline.usable import usable, with_neighbours
+from service.pipeline.usable import usable, with_neighbours, with_network
 from service.queue.port import Event, EventKind
 from service.store.deletions import refuse_pending
 from service.store.records import add_job_event, job_events, put_record, read_record
@@ -56,18 +56,19 @@ def prepare(
 
     Args:
         owner: id of the API key that submits it.
-        reach: which hands and objects it may name, and the project that it belongs to.
+        reach: which hands, objects and networks it may name, and the project that it belongs to.
 
     Raises:
-        NotFoundError: unknown hand, object or neighbour.
-        InputError: one of them was refused when it was checked; no chart tells which fidelity meets the target;
-            the object or a neighbour stands in a support of its scene (SceneError).
+        NotFoundError: unknown hand, object, neighbour or network.
+        InputError: one of them was refused when it was checked; the network is of another hand; no chart tells which
+            fidelity meets the target; the object or a neighbour stands in a support of its scene (SceneError).
         ConflictError: the check of one of them is still running.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: a part is away.
     """
     hand = usable(parts, AssetKind.HAND, request.hand, reach)
     obj = usable(parts, AssetKind.OBJECT, request.object, reach)
     request, beside = with_neighbours(parts, request, reach)
+    request = with_network(parts, request, [hand], reach)
     check_scene(request, obj, beside)
     parts.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
@@ -90,13 +91,13 @@ def enter(parts: Parts, record: JobRecord, *, keeps_assets: bool = False) -> tup
     """Keep a planned job and queue its first tasks.
 
     Args:
-        keeps_assets: a dataset keeps hand, object and neighbours from being deleted meanwhile.
+        keeps_assets: a dataset keeps hand, object, neighbours and network from being deleted meanwhile.
 
     Returns:
         the job, and whether it is new.
 
     Raises:
-        NotFoundError: the hand, the object or a neighbour was deleted meanwhile.
+        NotFoundError: the hand, the object, a neighbour or the network was deleted meanwhile.
         ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)

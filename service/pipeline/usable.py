@@ -1,4 +1,4 @@
-"""Which hands and objects jobs may use: those of the request, and the neighbours in its scenes."""
+"""Which hands, objects and networks jobs may use: those of the request, and the neighbours in its scenes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from service.index.views import AssetView
+from service.model.dataset_records import Member
 from service.model.domain import AssetKind, JobOptions
 from service.model.errors import ConflictError, InputError
 from service.model.projects import EVERYTHING, Reach
@@ -15,7 +16,7 @@ Options = TypeVar("Options", bound=JobOptions)
 
 
 def usable(parts: Parts, kind: AssetKind, name: str, reach: Reach = EVERYTHING) -> AssetView:
-    """A hand or object by name or digest that jobs may use.
+    """A hand, object or network by name or digest that jobs may use.
 
     Raises:
         NotFoundError: there is none within reach.
@@ -47,3 +48,26 @@ def with_neighbours(parts: Parts, options: Options, reach: Reach = EVERYTHING) -
         for one, asset in zip(options.beside, beside, strict=True)
     ]
     return options.with_beside(found), beside
+
+
+def with_network(
+    parts: Parts, options: Options, hands: Sequence[AssetView | Member], reach: Reach = EVERYTHING
+) -> Options:
+    """Options that say by its digest which network they set out from; as they are where their method takes none.
+
+    Args:
+        hands: whose grasps are wanted.
+
+    Raises:
+        what `usable` raises; InputError where it proposes grasps of another hand.
+    """
+    if not options.network:
+        return options
+    network = usable(parts, AssetKind.NETWORK, options.network, reach)
+    own = str(network.facts.get("hand_digest", ""))
+    if other := next((hand for hand in hands if hand.digest != own), None):
+        raise InputError(
+            f"network {network.name!r} proposes grasps of {network.facts.get('hand')} ({own[:12]}), not of "
+            f"{other.name} ({other.digest[:12]})"
+        )
+    return options.model_copy(update={"options": {**options.options, "network": network.digest}})

@@ -35,7 +35,7 @@ def verdict_line(asset: Mapping[str, Any]) -> str:
 
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
     """Lines of a label and what it holds; a fact that is not there is left out."""
-    pairs = _hand(facts) if kind is AssetKind.HAND else _object(facts)
+    pairs = {AssetKind.HAND: _hand, AssetKind.OBJECT: _object, AssetKind.NETWORK: _network}[kind](facts)
     return [f"{label:<18} {text}" for label, text in pairs]
 
 
@@ -43,6 +43,11 @@ def self_test_line(facts: Mapping[str, Any]) -> str:
     """What a hand's self-test says: `ready: 91 % hold`, or what is suspicious; empty: it was not tried."""
     tried = facts.get("self_test")
     return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
+
+
+def hand_line(facts: Mapping[str, Any]) -> str:
+    """Whose grasps a network proposes: name and digest of the hand."""
+    return f"{facts.get('hand', '')} ({str(facts.get('hand_digest', ''))[:12]})"
 
 
 def _hand(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -89,6 +94,19 @@ def _object(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "volume_m3" in facts:
         mass = facts.get("mass_kg")
         lines.append(("volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg" if mass else "")))
+    return lines
+
+
+def _network(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    lines: list[tuple[str, str]] = []
+    if "hand_digest" in facts:
+        lines.append(("hand", f"{facts.get('hand', '')} {facts['hand_digest']}, {facts.get('joints', 0)} joints"))
+    if "points" in facts:
+        lines.append(("cloud", f"{facts['points']} points, {facts.get('steps', 0)} steps of the flow"))
+    if "file_digest" in facts:
+        lines.append(("file digest", str(facts["file_digest"])))
+    if facts.get("about"):
+        lines.append(("about", str(facts["about"])))
     return lines
 
 

@@ -13,7 +13,7 @@ from service.model.records import JobRecord, Record
 from service.store.store import Store
 
 _DIGITS: Final = re.compile(r"\D")
-What = Literal["hand", "object", "job", "dataset"]
+What = Literal["hand", "object", "network", "job", "dataset"]
 
 
 class Deletion(Record):

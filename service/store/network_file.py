@@ -159,7 +159,7 @@ def read_file(path: Path) -> bytes:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"the network {path} cannot be read: {error.strerror}") from None
-    _check_size(data, str(path))
+    check_size(len(data), str(path))
     return data
 
 
@@ -174,7 +174,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
         LimitError: more than `MAX_BYTES`, packed or unpacked.
         InputError: not a file of this schema, whole and finite.
     """
-    _check_size(data, what)
+    check_size(len(data), what)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             meta = _read_meta(archive, what)
@@ -197,8 +197,9 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
     )  # fmt: skip
 
 
-def _check_size(data: bytes, what: str) -> None:
-    if len(data) > MAX_BYTES:
+def check_size(size: int, what: str) -> None:
+    """LimitError for more bytes than any network has."""
+    if size > MAX_BYTES:
         raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
 
 

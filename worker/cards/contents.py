@@ -94,9 +94,9 @@ def contents_of_folder(folder: Path, name: str | None = None) -> Contents:
     shards = open_shards(folder)
     listed = folder / "snapshot.json"
     taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None
-    found = {kind: _digests(shards, kind) for kind in AssetKind}
     hands, objects = (
-        {known: _builtin(kind, known, digest) for known, digest in sorted(found[kind].items())} for kind in AssetKind
+        {known: _builtin(kind, known, digest) for known, digest in sorted(_digests(shards, kind).items())}
+        for kind in (AssetKind.HAND, AssetKind.OBJECT)
     )
     known_as = name or (taken.dataset if taken else folder.resolve().name)
     return Contents(known_as, shards, hands, objects, taken, root=folder)

@@ -1,4 +1,5 @@
-"""Hands and objects of the tasks, loaded from the store once and kept while the worker goes on with the same pair."""
+"""Hands, objects and networks of the tasks, loaded from the store once and kept while the worker goes on with the same
+pair."""
 
 from __future__ import annotations
 
@@ -14,11 +15,14 @@ from service.model.domain import AssetKind, TaskMessage
 from service.model.errors import MeshError
 from service.store.attributes import Attribute
 from service.store.library import load_asset_files
+from service.store.network_check import network_bytes
+from service.store.network_file import ProposalNetwork, from_bytes
 from service.store.store import Store
 from worker.files.of_shard import NEIGHBOUR_FACE_ERROR_M
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
+from worker.planners.learned.known import keep
 from worker.stages.models import SHOWN_ERROR_M, publish_model
 from worker.stages.pieces import pieces_of
 from worker.stages.prepared import prepared_object
@@ -73,6 +77,22 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
         return obj
 
     return _cached((store.url, "neighbour", name, digest), load)
+
+
+def keep_network(store: Store, message: TaskMessage) -> None:
+    """Have this process know the network that a task's method asks for, if it takes one, by the digest in its options.
+
+    Raises:
+        NotFoundError, InputError: it is not in the store, or not what its digest says.
+    """
+    if not (digest := message.request.network):
+        return
+
+    def load() -> ProposalNetwork:
+        files = load_asset_files(store, AssetKind.NETWORK, digest)
+        return from_bytes(network_bytes(files, f"network {digest[:12]}"), f"network {digest[:12]}")
+
+    keep(digest, _cached((store.url, AssetKind.NETWORK, digest), load))
 
 
 def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:

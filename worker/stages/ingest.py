@@ -1,4 +1,4 @@
-"""Checks an uploaded hand or object in a child process: hostile files may take the child down, not the worker."""
+"""Checks an upload in a child process: hostile files may take the child down, not the worker."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from service.model import names
 from service.model.domain import AssetKind, IngestMessage
 from service.store.assets import pack, unpack
 from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
+from service.store.network_check import check_network
 from worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest meshes that are taken need about a tenth of it.
@@ -145,12 +146,15 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
         from worker.hands.check import check_hand
 
         found = check_hand(files, name)
+    elif AssetKind(kind) is AssetKind.NETWORK:
+        # The front door checks networks; this one's finding was lost or damaged.
+        found = check_network(files, name)
     else:
         from worker.objects.check import check_object
 
         found = check_object(files, name)
     Path(target).write_text(json.dumps(found))
-    if found["verdict"] != "refuse" and time.process_time() < _MODEL_CPU_S:
+    if found["verdict"] != "refuse" and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
         from worker.stages.models import model_of
 
         # The finding stands whatever becomes of its picture.

@@ -18,7 +18,7 @@ from worker.planners import planner
 from worker.scenes.beside import neighbour_of
 from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Scenes
-from worker.stages.assets import beside_attributes, hand_of, neighbours_of, object_of
+from worker.stages.assets import beside_attributes, hand_of, keep_network, neighbours_of, object_of
 from worker.stages.context import TaskContext
 from worker.stages.inputs import input_of
 from worker.stages.output import Output
@@ -35,6 +35,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         SceneError: no hand can reach into the scenes, a job's first batch finds no grasp, or its method knows none.
     """
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
+    keep_network(context.store, message)
     columns = _scene_columns(message, context)
     scenes = _scenes(message, columns, context) if columns else None
     context.check()

@@ -38,6 +38,7 @@ class DatasetChanges:
             "applied": 0,
             "planned": False,
             "neighbours": beside(record.options),
+            "network_digest": record.options.network,
         }
         cells = [
             {

@@ -22,13 +22,14 @@ class Removals:
     database: Database
 
     def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
-        """What needs a hand or object, in a few words; empty if nothing does."""
+        """What needs a hand, object or network, in a few words; empty if nothing does."""
         kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
         if job := within.scalar(select(jobs.c.id).where(jobs.c[column] == digest).limit(1)):
             return f"job {job}"
-        cell = select(dataset_cells.c.dataset).where(dataset_cells.c[column] == digest).limit(1)
-        if dataset := within.scalar(cell):
+        # The cells of a dataset share its network.
+        name = datasets.c.name if kind is AssetKind.NETWORK else dataset_cells.c.dataset
+        if dataset := within.scalar(select(name).where(name.table.c[column] == digest).limit(1)):
             return f"dataset {dataset!r}"
         if kind is AssetKind.OBJECT:
             if user := _user_of_neighbour(digest, within):
@@ -78,7 +79,7 @@ class Removals:
         return set(ids) - known
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
-        """A hand or object."""
+        """A hand, object or network."""
         with self.database.writing(within) as connection:
             connection.execute(delete(assets).where(assets.c.kind == kind.value, assets.c.digest == digest))
 

@@ -39,6 +39,7 @@ def job_row(record: JobRecord) -> Row:
         "reason": None,
         "neighbours": beside(record.request),
         "choice": record.choice and record.choice.model_dump(),
+        "network_digest": record.request.network,
     }
 
 
@@ -146,7 +147,7 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
 
 
 def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
-    """A hand or object. What comes with graspd needs no check."""
+    """A hand, object or network. What comes with graspd needs no check."""
     found = check or ({"verdict": "accept"} if asset.builtin else {})
     return {
         "kind": asset.kind.value,

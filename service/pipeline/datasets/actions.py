@@ -18,7 +18,7 @@ from service.model.scene_options import NamedNeighbour, SceneDocument
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver
-from service.pipeline.usable import usable, with_neighbours
+from service.pipeline.usable import usable, with_neighbours, with_network
 from service.store.datasets import add_dataset_event, dataset_events, load_dataset, load_snapshot
 from service.store.deletions import refuse_pending
 from service.store.records import put_record, read_record
@@ -31,20 +31,22 @@ def create(
 
     Args:
         owner: id of the API key that submits it; its jobs get the same.
-        reach: which hands and objects it may name, and the project that it and its jobs belong to.
+        reach: which hands, objects and networks it may name, and the project that it and its jobs belong to.
 
     Returns:
         the dataset, and whether it is new. A failed or cancelled one is returned as it is: `retry` starts it again.
 
     Raises:
-        NotFoundError: unknown hand, object, neighbour or set.
-        InputError: a hand or object was refused when it was checked; no chart tells which fidelity meets the target.
+        NotFoundError: unknown hand, object, neighbour, network or set.
+        InputError: one of them was refused when it was checked; the network is of another hand; no chart tells which
+            fidelity meets the target.
         ConflictError: a check is still running, or the name stands for another dataset.
         LimitError: more than `MAX_CELLS` cells.
         QueueUnavailable, StoreUnavailable, IndexUnavailable: nothing was recorded.
     """
     hands, objects = members(parts, request, reach)
     shared, beside = with_neighbours(parts, request.shared, reach)
+    shared = with_network(parts, shared, hands, reach)
     parts.queue.ping()
     key = names.dataset_record(request.name)
     new = False
@@ -66,6 +68,7 @@ def create(
         wanted = [(AssetKind.HAND, one.digest) for one in hands]
         wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
         wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
+        wanted += [(AssetKind.NETWORK, shared.network)] if shared.network else []
         with parts.index.database.writing() as connection:
             if not parts.store.exists(key):
                 raise ConflictError(f"dataset {record.name!r} was deleted just now; create it again")

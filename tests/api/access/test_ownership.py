@@ -18,8 +18,10 @@ from service.model.records import JobRecord
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.settings import Settings
+from service.store.network_file import to_bytes
 from service.store.records import read_record
 from tests.api.factories import add_job, fail
+from tests.networks import random_network
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 MATRIX = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
@@ -222,6 +224,16 @@ def test_an_object_is_deleted_by_its_key_or_an_admin(
     client.post("/v1/objects", files={"file": ("box.stl", b"solid")}, headers=people["ann"])
     assert client.delete("/v1/objects/box", headers=people[who]).status_code == status
     assert client.delete("/v1/objects/mug", headers=people[who]).status_code == 409, "it comes with graspd"
+
+
+@pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("eve", 403), ("root", 204)])
+def test_a_network_is_deleted_by_its_key_or_an_admin(
+    client: TestClient, people: dict[str, Headers], who: str, status: int
+) -> None:
+    file = {"file": ("net.npz", to_bytes(random_network()))}
+    assert client.post("/v1/networks", files=file, headers=people["eve"]).status_code == 403, "a reader adds none"
+    client.post("/v1/networks", files=file, headers=people["ann"])
+    assert client.delete("/v1/networks/net", headers=people[who]).status_code == status
 
 
 @pytest.mark.parametrize(("who", "status"), [("ann", 204), ("bob", 403), ("root", 204)])

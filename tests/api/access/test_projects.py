@@ -29,10 +29,12 @@ from service.model.records import JobRecord
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.settings import Settings
+from service.store.network_file import to_bytes
 from service.store.records import read_record
 from service.store.store import open_store
 from tests.api.factories import add_worker, fail, finish_all
 from tests.memory_queue import MemoryQueue
+from tests.networks import random_network
 
 Headers = dict[str, str]
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32, "scenes": 1, "views": 1, "seed": 77}
@@ -85,6 +87,11 @@ class World:
             added = self.post(f"/v1/{kind}", ann, data={"name": name}, files={"file": file})
             assert added.status_code == 202, added.text
             self.said[f"{kind}_digest"] = added.json()["digest"]
+        digest = self.client.get("/v1/hands/allegro", headers=ann).json()["digest"]
+        file = ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))
+        added = self.post("/v1/networks", ann, data={"name": "red-secret-net"}, files={"file": file})
+        assert added.status_code == 201, added.text
+        self.said["networks_digest"] = added.json()["digest"]
         self.post("/v1/object-sets", ann, json={"name": "red-secret-set", "objects": ["red-secret-ball", "mug"]})
         matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
         self.post("/v1/datasets", ann, json=matrix | {"scenes": 1, "views": 1, "seed": 77})
@@ -106,7 +113,7 @@ class World:
     @property
     def secrets(self) -> list[str]:
         """What none but the project and an admin may read."""
-        named = [f"red-secret-{what}" for what in ("hand", "ball", "data", "set", "tag")]
+        named = [f"red-secret-{what}" for what in ("hand", "ball", "net", "data", "set", "tag")]
         return [*named, "red-secret broke", *self.said.values()]
 
 
@@ -129,6 +136,7 @@ _VALUES = {
 _NAMES = {
     "hands": ("red-secret-hand", "hands_digest"),
     "objects": ("red-secret-ball", "objects_digest"),
+    "networks": ("red-secret-net", "networks_digest"),
     "datasets": ("red-secret-data",),
     "object-sets": ("red-secret-set",),
     "tags": ("red-secret-tag",),
@@ -169,12 +177,16 @@ def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
         return [{}, {"params": {"job": world.said["job_id"]}}] if is_list else [{}]
     options = {"grasps": "32", "fidelity": "draft"}
     cells = [world.said["job_id"], world.said["waiting"], "allegro|mug", "allegro|red-secret-ball"]
+    pairs = ({"hand": "allegro", "object": "mug"}, {"name": "mine", "hands": ["allegro"], "objects": ["mug"]})
+    learned = {"scene": "table", "method": "learned"}
+    nets = [{"options": {"network": one}} for one in ("red-secret-net", world.said["networks_digest"])]
     documents = [
         {},
         {"json": {}},
         {"json": {"hand": "red-secret-hand", "object": "red-secret-ball"}},
         {"json": {"hand": "allegro", "object": "mug", "neighbours": ["red-secret-ball"], "scene": "table"}},
         {"json": {"name": "mine", "hands": ["red-secret-hand"], "objects": ["red-secret-ball"]}},
+        *({"json": pair | learned | net} for pair in pairs for net in nets),
         {"json": {"hands": ["allegro"], "objects": [], "sets": ["red-secret-set"], "name": "mine"}},
         {"json": {"name": "mine", "objects": ["red-secret-ball"]}},
         {"json": {"name": "mine", "grasps": [{"shard_id": world.said["shard_id"], "row": 0}]}},
@@ -296,6 +308,22 @@ def test_the_same_file_of_two_projects_is_two_objects(world: World) -> None:
     assert found["digest"] == own["digest"]
     assert world.client.delete("/v1/objects/red-secret-ball", headers=world.people["bob"]).status_code == 204
     assert world.client.get("/v1/objects/red-secret-ball", headers=world.people["ann"]).status_code == 200
+
+
+def test_the_same_network_of_two_projects_is_two_networks(world: World) -> None:
+    digest = world.client.get("/v1/hands/allegro", headers=world.people["bob"]).json()["digest"]
+    file = {"file": ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))}
+    job = {"hand": "allegro", "object": "mug", "scene": "table", "method": "learned"}
+    job |= {"options": {"network": "red-secret-net"}}
+    assert world.post("/v1/jobs", world.people["bob"], json=job).status_code == 404
+    own = world.post("/v1/networks", world.people["bob"], data={"name": "red-secret-net"}, files=file).json()
+    assert own["digest"] != world.said["networks_digest"] and own["project"] == "blue"
+    made = world.post("/v1/jobs", world.people["bob"], json=job).json()
+    assert made["request"]["options"]["network"] == own["digest"]
+    world.post(f"/v1/jobs/{made['id']}/cancel", world.people["bob"])
+    assert world.client.delete(f"/v1/jobs/{made['id']}", headers=world.people["bob"]).status_code == 204
+    assert world.client.delete("/v1/networks/red-secret-net", headers=world.people["bob"]).status_code == 204
+    assert world.client.get("/v1/networks/red-secret-net", headers=world.people["ann"]).status_code == 200
 
 
 def test_what_is_shared_is_used_by_every_project_and_deleted_by_its_own(world: World) -> None:

@@ -1,4 +1,5 @@
-"""Networks of this process by the digest of their file: an option of a method names one without naming a file."""
+"""Networks of this process by a digest: an option of a method names one without naming a file. A file's digest is its
+own, that of the service is of the asset."""
 
 from __future__ import annotations
 
@@ -23,10 +24,15 @@ def keep_file(path: Path) -> str:
         InputError: no network.
     """
     data = read_file(path)
-    network, digest = from_bytes(data, str(path)), digest_bytes(data)
+    digest = digest_bytes(data)
+    keep(digest, from_bytes(data, str(path)))
+    return digest
+
+
+def keep(digest: str, network: ProposalNetwork) -> None:
+    """Know a network by a digest from now on; of many the last ones used are."""
     with _lock:
         _known[digest] = network
-    return digest
 
 
 def kept(digest: str) -> ProposalNetwork:

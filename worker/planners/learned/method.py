@@ -23,7 +23,7 @@ from worker.run import Run
 class LearnedOptions(Options):
     """Which network, and how far it is followed."""
 
-    network: Digest = Field(description="digest of the network's file; on the command line the file")
+    network: Digest = Field(description="digest of the network; on the command line its file, in a job its name")
     starts: int = Field(4, ge=1, le=32, description="proposals of each grasp that set out")
 
 

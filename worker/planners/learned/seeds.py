@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.domain import Fidelity
 from service.model.errors import SceneError
+from service.model.scene_kinds import UPRIGHT
 from service.model.transforms import compose, invert, quat_conjugate, quat_rotate
 from worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from worker.planners.fast_graspd.starts import CLEAR, Probe
@@ -30,8 +31,6 @@ RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
 PROPOSALS: Final = 32
 #: A palm that is farther from the object's bounding ball is no start [m].
 FAR_M: Final = 0.15
-#: A support whose normal is so upright (cosine) is a table.
-UPRIGHT: Final = 1 - 1e-6
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,142 @@
+"""Networks over HTTP: checked as they come, listed, named by jobs, taken away."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from api.uploads import files_of_upload
+from service.model import names
+from service.model.domain import AssetKind
+from service.model.errors import LimitError
+from service.model.records import JobRecord
+from service.pipeline.backends import Parts
+from service.store import network_file
+from service.store.library import load_asset_files
+from service.store.network_check import NETWORK_FILE
+from service.store.network_file import to_bytes
+from service.store.records import read_record
+from tests.networks import random_network
+from tests.service.store.test_network_file import HOSTILE
+
+JOB = {"hand": "barrett", "object": "mug", "scene": "table", "method": "learned", "options": {"network": "net"}}
+
+
+def of_hand(http: TestClient, hand: str = "barrett", seed: int = 0) -> bytes:
+    """The file of a network of a hand of the service."""
+    return to_bytes(random_network(hand=hand, digest=http.get(f"/v1/hands/{hand}").json()["digest"], seed=seed))
+
+
+def upload(http: TestClient, data: bytes, filename: str = "net.npz", **said: str) -> Any:
+    return http.post("/v1/networks", files={"file": (filename, data)}, data=said)
+
+
+def test_an_upload_can_be_used_at_once_and_says_whose_grasps_it_proposes(http: TestClient, parts: Parts) -> None:
+    data = of_hand(http)
+    answer = upload(http, data)
+    assert answer.status_code == 201, answer.text
+    shown = http.get(answer.headers["location"]).json()
+    assert (shown["name"], shown["verdict"], shown["kind"]) == ("net", "accept", "network")
+    barrett = http.get("/v1/hands/barrett").json()["digest"]
+    assert (shown["facts"]["hand"], shown["facts"]["hand_digest"]) == ("barrett", barrett)
+    assert shown["facts"]["about"] == "drawn by chance" and shown["created"] and shown["size_bytes"] > len(data)
+    assert load_asset_files(parts.store, AssetKind.NETWORK, shown["digest"])[NETWORK_FILE] == data
+    assert [one["name"] for one in http.get("/v1/networks").json()["items"]] == ["net"]
+    assert list(parts.index.feed.ready_checks(now=1e12, limit=9)) == [], "no worker is asked"
+
+
+def test_the_same_file_is_the_same_network_whatever_it_was_called(http: TestClient) -> None:
+    data = of_hand(http)
+    first, second = (upload(http, data, filename, name="net").json() for filename in ("a.npz", "b.npz"))
+    assert first["digest"] == second["digest"]
+    assert upload(http, data, name="other").status_code == 409
+    assert upload(http, of_hand(http, seed=1)).status_code == 409, "the name stands for another one"
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_what_is_no_network_is_refused_in_a_line_and_not_kept(http: TestClient, parts: Parts, what: str) -> None:
+    with np.load(io.BytesIO(to_bytes(random_network()))) as stored:
+        data = HOSTILE[what][0]({name: stored[name] for name in stored.files})
+    answer = upload(http, data)
+    assert answer.status_code == 422 and "\n" not in answer.json()["detail"], answer.text
+    assert http.get("/v1/networks").json()["items"] == []
+    assert list(parts.store.list(f"{names.ASSETS}/network")) == []
+
+
+@pytest.mark.parametrize(
+    ("filename", "said", "status", "words"),
+    [
+        ("net.zip", {}, 422, "net.zip is no network"),
+        ("net.pkl", {}, 422, "net.pkl is no network"),
+        ("net.npz", {"options": '{"units": "mm"}'}, 422, "a network has no 'units'"),
+        ("net.npz", {"options": '{"file": "../up.npz"}'}, 422, "not among its files"),
+        ("net.npz", {"self_test": "true"}, 422, "only a hand can be tried"),
+        ("net.npz", {"name": "../up"}, 422, "name"),
+    ],
+)
+def test_an_upload_that_says_what_no_network_has_is_refused(
+    http: TestClient, filename: str, said: dict[str, str], status: int, words: str
+) -> None:
+    answer = upload(http, of_hand(http), filename, **said)
+    assert answer.status_code == status and words in answer.text
+
+
+def test_a_file_larger_than_any_network_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_file, "MAX_BYTES", 10)
+    file = io.BytesIO(b"x" * 11)
+    with pytest.raises(LimitError, match="no proposal network needs as much"):
+        files_of_upload(AssetKind.NETWORK, "net.npz", file, limit_bytes=100)
+    assert file.tell() == 0
+
+
+def test_a_network_has_no_model_to_show(http: TestClient) -> None:
+    upload(http, of_hand(http))
+    assert http.get("/v1/networks/net/model").status_code == 404
+
+
+def test_a_job_names_a_network_and_keeps_its_digest(http: TestClient, parts: Parts) -> None:
+    digest = upload(http, of_hand(http)).json()["digest"]
+    answer = http.post("/v1/jobs", json=JOB)
+    assert answer.status_code == 202, answer.text
+    record = read_record(JobRecord, parts.store, names.job_record(answer.json()["id"]))
+    assert record.request.network == digest
+    refused = http.delete("/v1/networks/net")
+    assert refused.status_code == 409 and record.id in refused.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "words"),
+    [
+        ({"hand": "allegro"}, 422, "proposes grasps of barrett"),
+        ({"scene": "free"}, 422, "things on a table"),
+        ({"scene": "shelf"}, 422, "things on a table"),
+        ({"scene": {"supports": [{"kind": "box", "size": [1, 1, 0.1]}]}}, 422, "things on a table"),
+        ({"scene": {"supports": [{"kind": "half_space", "normal": [0, 0.1, 1]}]}}, 422, "things on a table"),
+        ({"options": {}}, 422, "needs the option network"),
+        ({"options": {"network": "none"}}, 404, "there is no network 'none'; there are: net"),
+        ({"options": {"network": "/etc/passwd"}}, 404, "there is no network"),
+    ],
+)
+def test_a_job_that_the_network_does_not_fit_is_refused_in_a_line(
+    http: TestClient, changes: dict[str, Any], status: int, words: str
+) -> None:
+    upload(http, of_hand(http))
+    for path, body in (
+        ("/v1/jobs", JOB | changes),
+        ("/v1/datasets", {**{k: v for k, v in (JOB | changes).items() if k not in ("hand", "object")},
+                          "name": "d", "hands": [(JOB | changes)["hand"]], "objects": ["mug"]}),
+    ):  # fmt: skip
+        answer = http.post(path, json=body)
+        assert answer.status_code == status, answer.text
+        assert words in json.dumps(answer.json(), ensure_ascii=False) and "\n" not in answer.json()["detail"]
+
+
+def test_a_network_that_nothing_needs_is_deleted(http: TestClient) -> None:
+    upload(http, of_hand(http))
+    assert http.delete("/v1/networks/net").status_code == 204
+    assert http.get("/v1/networks/net").status_code == 404
