@@ -37,6 +37,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("logs", "api.client.commands", "Jobs", "Failed attempts of a job, with their reasons."),
     ("hands", "api.client.commands", "Jobs", "Check, add, list and show hands."),
     ("objects", "api.client.commands", "Jobs", "Check, add, list and show objects."),
+    ("networks", "api.client.commands", "Jobs", "Add, list and show networks that propose grasps of a hand."),
     (
         "datasets",
         "api.client.dataset_commands",

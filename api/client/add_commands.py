@@ -1,4 +1,5 @@
-"""`graspd hands add` and `graspd objects add`: upload one with what its files do not say, and wait for its check."""
+"""`graspd hands add`, `objects add` and `networks add`: upload one with what its files do not say, and wait for its
+check."""
 
 from __future__ import annotations
 
@@ -117,6 +118,20 @@ def add_object(
     else:
         add = partial(_add, AssetKind.OBJECT, file, name)
     add(options=options, shared=shared, wait=wait, url=url, json=json)
+
+
+@reporting_errors
+def add_network(
+    file: Annotated[Path, typer.Argument(help="An .npz of the schema graspd/proposals@1.")],
+    name: NameOption = None,
+    licence: LicenceOption = None,
+    source: SourceOption = None,
+    shared: SharedOption = False,
+    url: UrlOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Upload a network that proposes grasps of a hand: jobs with `--method learned` set out from them."""
+    _add(AssetKind.NETWORK, file, name, provenance(licence, source), shared=shared, wait=False, url=url, json=json)
 
 
 def _add(

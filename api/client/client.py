@@ -88,7 +88,7 @@ class Client:
         return Page[GraspView].model_validate_json(self.send("GET", "/v1/grasps", params=params).content)
 
     def assets(self, kind: AssetKind) -> Iterator[AssetView]:
-        """All hands or objects."""
+        """All hands, objects or networks."""
         cursor: str | None = None
         while True:
             answer = self.send("GET", f"/v1/{kind.value}s", params={"limit": 200, "cursor": cursor})

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from api.client import key_commands, project_commands, tag_commands, webhook_commands
-from api.client.add_commands import add_hand, add_object
+from api.client.add_commands import add_hand, add_network, add_object
 from api.client.client import Client
 from api.client.datasets import DatasetClient
 from api.client.job_options import pairs
@@ -21,10 +21,10 @@ from api.models import Job
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.diversity import MIN_DISTANCE_M
-from service.model.domain import AUDITS, AssetKind, State
+from service.model.domain import AUDITS, NETWORK_METHODS, AssetKind, State
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
-from service.store.asset_summary import self_test_line
+from service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -83,8 +83,11 @@ def submit(
     json: JsonFlag = False,
 ) -> None:
     """Submit a job: one hand on one object."""
+    options = pairs(option or [])
     with open_client(url) as client:
         as_object = partial(_uploaded, client, AssetKind.OBJECT)
+        if method in NETWORK_METHODS and "network" in options:
+            options["network"] = _uploaded(client, AssetKind.NETWORK, str(options["network"]))
         request = job_request(
             {
                 "hand": _uploaded(client, AssetKind.HAND, hand),
@@ -99,7 +102,7 @@ def submit(
                 "robust": robust,
                 "robust_models": robust_models,
                 "method": method,
-                "options": pairs(option or []),
+                "options": options,
                 "fidelity": fidelity,
                 "target": target,
                 "seed": seed,
@@ -207,8 +210,9 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
 
 
 def asset_commands(kind: AssetKind) -> typer.Typer:
-    """`graspd hands ...` or `graspd objects ...`."""
-    group = typer.Typer(no_args_is_help=True, help=f"Check, add, list, show and delete {kind.value}s.")
+    """`graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
+    verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
+    group = typer.Typer(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
     @group.command("list")
     @reporting_errors
@@ -219,12 +223,15 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         if json:
             emit({f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]})
             return
-        table = Table("name", "file", "size", "check", "digest", box=None, header_style="bold")
+        # Files of networks have one name.
+        second = "hand" if kind is AssetKind.NETWORK else "file"
+        table = Table("name", second, "size", "check", "digest", box=None, header_style="bold")
         for asset in assets:
             origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
             if says := self_test_line(asset.facts):
                 origin += f"; {says}"
-            table.add_row(asset.name, asset.filename, size(asset.size_bytes), origin, asset.digest[:12])
+            named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
+            table.add_row(asset.name, named, size(asset.size_bytes), origin, asset.digest[:12])
         Console().print(table)
 
     @group.command("show")
@@ -254,9 +261,10 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     return group
 
 
-hands_app, objects_app = asset_commands(AssetKind.HAND), asset_commands(AssetKind.OBJECT)
+hands_app, objects_app, networks_app = map(asset_commands, AssetKind)
 hands_app.command("add", epilog="graspd hands add my_hand.zip --palm base_link --approach 0,0,1")(add_hand)
 objects_app.command("add", epilog="graspd objects add banana.stl --units mm --density 950")(add_object)
+networks_app.command("add", epilog="graspd networks add barrett.npz")(add_network)
 
 
 @objects_app.command("sets", epilog="graspd objects sets")
@@ -278,6 +286,7 @@ def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
 
 app.add_typer(hands_app, name="hands")
 app.add_typer(objects_app, name="objects")
+app.add_typer(networks_app, name="networks")
 app.add_typer(key_commands.app, name="keys")
 app.add_typer(project_commands.app, name="projects")
 app.add_typer(webhook_commands.app, name="webhooks")
@@ -285,7 +294,7 @@ app.add_typer(tag_commands.app, name="tags")
 
 
 def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
-    """The name of a hand or object; a path that exists is uploaded and checked first."""
+    """The name of a hand, object or network; a path that exists is uploaded and checked first."""
     path = Path(value)
     is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
     if not is_file_name:

@@ -19,7 +19,7 @@ from api.routes.hand_corrections import CorrectionRequest
 from service.index.views import AssetView
 from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError, NotFoundError
-from service.store.asset_summary import self_test_line
+from service.store.asset_summary import hand_line, self_test_line
 from service.store.hand_corrections import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
@@ -35,7 +35,7 @@ router = APIRouter(prefix="/hands", include_in_schema=False)
 def hands_page(
     request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
 ) -> HTMLResponse:
-    """All hands, by name."""
+    """All hands, by name; and first of all the newest networks, which propose grasps of them."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor)
     # What an upload says of itself stands beside what a check found: of any type.
     numbers = {
@@ -44,9 +44,11 @@ def hands_page(
         ]
         for hand in page.items
     }
+    networks = [] if cursor else assets.page(AssetKind.NETWORK, limit=PAGE_SIZE).items
     return render(
         request, "hands.html", page="/hands", poll_s=2 * _CHECK_S, hands=page.items, numbers=numbers, next=page.next,
         self_tests={hand.digest: self_test_line(hand.facts) for hand in page.items},
+        networks=networks, network_hands={network.digest: hand_line(network.facts) for network in networks},
     )  # fmt: skip
 
 

@@ -23,8 +23,10 @@ from service.model.domain import AssetKind, JobRequest, State
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.library import load_asset_files
+from service.store.network_file import to_bytes
 from service.store.store import open_store
 from service.store.study_records import publish
+from tests.networks import random_network
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import PATIENCE_S
 
@@ -113,6 +115,32 @@ def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
 def test_an_object_can_be_added_from_a_file(graspd: Shell, tmp_path: Path) -> None:
     (tmp_path / "box.stl").write_bytes(STL)
     assert graspd.json("objects", "add", str(tmp_path / "box.stl"), "--no-wait")["name"] == "box"
+
+
+def test_a_network_is_added_named_by_a_job_and_deleted(graspd: Shell, tmp_path: Path) -> None:
+    digest = graspd.json("hands", "show", "barrett")["digest"]
+    for seed, name in enumerate(("net", "other")):
+        (tmp_path / f"{name}.npz").write_bytes(to_bytes(random_network(hand="barrett", digest=digest, seed=seed)))
+    made = graspd.json("networks", "add", str(tmp_path / "net.npz"), "--licence", "MIT")
+    assert (made["name"], made["verdict"]) == ("net", "accept")
+    listed = graspd("networks", "list").stdout
+    assert "net" in listed and f"barrett ({digest[:12]})" in listed
+    assert f"{digest}, 2 joints" in graspd("networks", "show", "net").stdout
+    pair = ("--hand", "barrett", "--object", "mug", "--scene", "table", "--method", "learned")
+    job = graspd.json("submit", *pair, "--option", "network=net", "--option", "starts=2")
+    assert graspd.json("submit", *pair, "--option", f"network={made['digest']}", "--option", "starts=2") == job
+    assert f"needed by job {job['job']}" in said(graspd("networks", "delete", "net"))
+    assert graspd.json("submit", *pair, "--option", f"network={tmp_path / 'other.npz'}")["job"] != job["job"]
+    assert {one["name"] for one in graspd.json("networks", "list")["networks"]} == {"net", "other"}
+    few = ("--hands", "barrett", "--objects", "mug", "--grasps", "64", "--yes")
+    rest = ("--scene", "table", "--method", "learned", "--option", "network=other")
+    assert (
+        graspd.json("datasets", "create", "proposed", *few, *rest)["dataset"]["options"]["options"]["network"]
+        != "other"
+    )
+    for command in ("cancel", "delete"):
+        assert graspd(command, job["job"]).returncode == 0
+    assert graspd("networks", "delete", "net").stdout == "network net is deleted\n"
 
 
 def test_the_licence_of_an_object_is_kept_with_its_files(graspd: Shell, tmp_path: Path) -> None:

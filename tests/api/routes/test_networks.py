@@ -140,3 +140,11 @@ def test_a_network_that_nothing_needs_is_deleted(http: TestClient) -> None:
     upload(http, of_hand(http))
     assert http.delete("/v1/networks/net").status_code == 204
     assert http.get("/v1/networks/net").status_code == 404
+
+
+def test_the_page_of_hands_shows_networks_once_there_are_any(http: TestClient) -> None:
+    assert "Networks" not in http.get("/hands").text
+    digest = upload(http, of_hand(http)).json()["digest"]
+    page = http.get("/hands").text
+    barrett = http.get("/v1/hands/barrett").json()["digest"]
+    assert digest[:12] in page and f"barrett ({barrett[:12]})" in page and "drawn by chance" in page
