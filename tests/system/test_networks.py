@@ -36,7 +36,7 @@ def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
     system = start(fakes=False, api=True)
     with httpx.Client(base_url=system.supervisor.api_url, trust_env=False, timeout=60) as http:
         system.until(lambda: http.get("/v1/objects/block").status_code == 200, "the built-in assets are published")
-        assert http.post("/v1/networks", files={"file": file.open("rb")}).status_code == 201
+        assert http.post("/v1/networks", files={"file": (file.name, file.read_bytes())}).status_code == 201
         wanted = {"hand": "barrett", "object": "block", **WANTED, "options": {"network": "net", "starts": 2}}
         answer = http.post("/v1/jobs", json=wanted)
         assert answer.status_code == 202, answer.text
