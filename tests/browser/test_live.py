@@ -148,6 +148,7 @@ def test_no_page_scrolls_sideways(page: Any, places: list[str]) -> None:
         page.goto(path)
         for width in (390, 768, 1440):
             page.set_viewport_size({"width": width, "height": 800})
+            page.wait_for_function("width => window.innerWidth === width", arg=width)
             assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), (path, width)
 
 
