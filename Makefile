@@ -50,7 +50,7 @@ docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m service.docs
 	$(BIN)/python -m benchmarks.results --pages
 
-docs-commands: $(STAMP) ## the commands that README and docs print, run as they are printed (hours; PAGE=name.md: one page)
+docs-commands: $(STAMP) ## the commands that README and docs print, run as printed (hours, resumable; PAGE=name.md: one page)
 	$(BIN)/python -m tests.docs_commands $(PAGE)
 
 results: $(STAMP) ## every figure and picture of the docs again, resumable (DATA=, SOURCES=, BEFORE=; QUICK=1: 20 minutes)

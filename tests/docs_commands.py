@@ -1,15 +1,19 @@
 """The commands that README and docs print: found, checked against the command line, and run.
 
-usage: python -m tests.docs_commands [PAGE ...] [--list]        (make docs-commands; some hours of two cores for all)
+usage: python -m tests.docs_commands [PAGE ...] [--list] [--again]    (make docs-commands; hours of two cores for all)
 
-Each page gets a folder and a service of its own, with the files that a reader would have (`tests/docs_files.py`); its
-lines run in their order, as they are printed, and what is shown below one is held against what came. What is not run is
-told with its reason. Ends with 1 if a line failed.
+Each page gets a folder with the files that a reader would have (`tests/docs_files.py`), and where a line asks one a
+service of its own; its lines run in their order, as they are printed, and what is shown below one is held against what
+came. What is not run is told with its reason. Ends with 1 if a line failed.
+
+A page that ended well is not run again until it, or a file of the sources, is another (`--again`: all the same).
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import re
 import shlex
@@ -18,6 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -31,8 +36,17 @@ REPOSITORY: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = REPOSITORY / "docs"
 PAGES: Final = (REPOSITORY / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "exchange").glob("*.md")))
 LIMIT_S: Final = 3600.0
+#: What came, a file for each page, and which pages ended well.
+KEPT: Final = REPOSITORY / "build" / "docs-commands"
 #: Where a page says that the service is; each run has a port of its own.
 _PRINTED_URL: Final = "http://127.0.0.1:8000"
+#: And where it is for a page of which no line asks one: nobody listens there.
+_NOBODY: Final = "http://127.0.0.1:9"
+#: What needs a service; one that is not started saves half a minute of a core.
+_ASKS: Final = re.compile(
+    r"graspd (submit|jobs|datasets|grasps|tags|index|store|doctor|keeper|worker|(objects|hands) (?!check))|"
+    r"http://|\$API|graspd-data"
+)
 _FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
 _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)
 _TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
@@ -42,8 +56,8 @@ _FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
 #: What a line has that is not run here, and why. A line with none of it is run.
 NOT_RUN: Final = (
-    (r"^(docker|kubectl|sbatch|apptainer|ray|osmo|sky|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|--grasps 3200",
-     "needs Docker, or a cluster"),
+    (r'^(\w+="[^"]*" )?(docker|kubectl|sbatch|apptainer|ray|osmo|sky|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|'
+     "--grasps 3200", "needs Docker, or a cluster"),
     (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "stands for a family of commands"),
     (r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
      r"PASSWORD)\b|--joint-map", "has a place that the reader fills in"),
@@ -185,13 +199,13 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
     return command, words
 
 
-def run_page(page: Path, leave: str = "", keep: Path | None = None) -> list[str]:
+def run_page(page: Path, leave: str, keep: Path) -> list[str]:
     """Run the lines of a page; returns what failed."""
     from service.run.supervisor import Supervisor
     from service.settings import Settings
 
     failed = []
-    record = keep / f"{page.stem}.txt" if keep is not None else Path(os.devnull)
+    record = keep / f"{page.stem}.txt"
     record.parent.mkdir(parents=True, exist_ok=True)
     with record.open("w"), tempfile.TemporaryDirectory() as scratch:
         folder, data = Path(scratch) / "here", Path(scratch) / "data"
@@ -199,10 +213,14 @@ def run_page(page: Path, leave: str = "", keep: Path | None = None) -> list[str]
         kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
         kept["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
         (folder / ".curlrc").write_text("fail-with-body\nsilent\n")
-        with Supervisor(Settings(data_dir=data, port=0), workers=1) as supervisor:
-            supervisor.wait_ready(say=say)
-            kept |= {"GRASPD_API_URL": supervisor.api_url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
-            kept |= {"API": supervisor.api_url, "GRASPD_API_KEY": "none"}
+        with ExitStack() as stack:
+            url = _NOBODY
+            if any(_ASKS.search(line.text) for line in lines_of(page) if not line.reason):
+                supervisor = stack.enter_context(Supervisor(Settings(data_dir=data, port=0), workers=1))
+                supervisor.wait_ready(say=say)
+                url = supervisor.api_url
+            kept |= {"GRASPD_API_URL": url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
+            kept |= {"API": url, "GRASPD_API_KEY": "none"}
             files_for(page, folder, data, kept)
             for line in lines_of(page):
                 why = line.reason or ("--leave" if leave and re.search(leave, line.text) else "")
@@ -210,7 +228,7 @@ def run_page(page: Path, leave: str = "", keep: Path | None = None) -> list[str]
                     say(f"  -    {line.text}   ({why})")
                     continue
                 started = time.monotonic()
-                code, came = run_line(line.text.replace(_PRINTED_URL, supervisor.api_url), folder, kept)
+                code, came = run_line(line.text.replace(_PRINTED_URL, url), folder, kept)
                 with record.open("a") as file:
                     file.write(f"$ {line.text}\n{came}\n")
                 missed = line.misses(came)
@@ -239,6 +257,18 @@ def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[i
     return done.returncode, done.stdout
 
 
+def state_of(page: Path) -> str:
+    """Digest of a page, and of the files that its lines run."""
+    whole = hashlib.sha256(page.read_bytes())
+    for room in sorted(_OURS - {"tests"}):
+        for file in sorted((REPOSITORY / room).rglob("*")):
+            if file.is_file() and "__pycache__" not in file.parts:
+                whole.update(file.read_bytes())
+    for file in (Path(__file__), Path(files_for.__code__.co_filename)):
+        whole.update(file.read_bytes())
+    return whole.hexdigest()
+
+
 def say(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
@@ -249,8 +279,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("pages", nargs="*", help="names of pages; default: all")
     parser.add_argument("--list", action="store_true", help="only say what would be run, and why something is not")
     parser.add_argument("--leave", default="", metavar="PATTERN", help="leave out lines that match, too")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="what came, a file for each page")
+    parser.add_argument("--keep", type=Path, default=KEPT, metavar="FOLDER", help="what came, a file for each page")
+    parser.add_argument("--again", action="store_true", help="also pages that ended well as they are now")
     given = parser.parse_args(arguments)
+    passed_file = given.keep / "passed.json"
+    passed = json.loads(passed_file.read_text()) if passed_file.is_file() else {}
     failed = []
     for page in PAGES:
         if (given.pages and page.name not in given.pages) or not (lines := list(lines_of(page))):
@@ -259,8 +292,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.list or all(line.reason for line in lines):
             for line in lines:
                 say(f"  {'-  ' if line.reason else 'run'} {line.text}" + (f"   ({line.reason})" if line.reason else ""))
+        elif not given.again and passed.get(page.name) == state_of(page):
+            say("  ended well, and nothing has changed since; --again runs it")
         else:
-            failed += run_page(page, given.leave, given.keep)
+            before, found = state_of(page), run_page(page, given.leave, given.keep)
+            failed += found
+            if not found and not given.leave:
+                given.keep.mkdir(parents=True, exist_ok=True)
+                passed_file.write_text(json.dumps(passed := passed | {page.name: before}, indent=1))
     say("\n".join(failed) or "all that was run ended well")
     return int(bool(failed))
 

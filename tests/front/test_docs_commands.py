@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import docs_commands
 from tests.docs_commands import NOT_RUN, PAGES, Line, lines_of
 
 ALL = [line for page in PAGES for line in lines_of(page)]
@@ -68,3 +69,25 @@ def test_only_an_error_directly_below_a_command_is_its_own(tmp_path: Path) -> No
     error, block = "```\ngraspd: there is none\n```\n", "```sh\ngraspd jobs\ngraspd tags list\n```\n"
     page.write_text(f"{block}\n{error}\n{block}\nText between.\n\n{error}")
     assert [line.refused for line in lines_of(page)] == [False, True, False, False]
+
+
+def test_a_page_that_ended_well_waits_for_a_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page, faults = tmp_path / "page.md", ["page.md: graspd jobs"]
+    ran: list[str] = []
+    page.write_text("```sh\ngraspd jobs\n```\n")
+
+    def run_page(page: Path, leave: str, keep: Path) -> list[str]:
+        ran.append(page.name)
+        return faults
+
+    monkeypatch.setattr(docs_commands, "PAGES", (page,))
+    monkeypatch.setattr(docs_commands, "run_page", run_page)
+    once = ["--keep", str(tmp_path / "kept")]
+    assert docs_commands.main(once) == 1
+    faults.clear()
+    assert [docs_commands.main(once) for _ in range(2)] == [0, 0]
+    assert len(ran) == 2, "failed once, ended well once"
+    assert docs_commands.main([*once, "--again"]) == 0
+    page.write_text("```sh\ngraspd jobs --json\n```\n")
+    assert docs_commands.main(once) == 0
+    assert len(ran) == 4
