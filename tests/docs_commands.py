@@ -204,6 +204,8 @@ def run_page(page: Path, leave: str, keep: Path) -> list[str]:
     from service.run.supervisor import Supervisor
     from service.settings import Settings
 
+    left = re.compile(leave or r"(?!)")
+    lines = [(line, line.reason or ("--leave" if left.search(line.text) else "")) for line in lines_of(page)]
     failed = []
     record = keep / f"{page.stem}.txt"
     record.parent.mkdir(parents=True, exist_ok=True)
@@ -215,15 +217,15 @@ def run_page(page: Path, leave: str, keep: Path) -> list[str]:
         (folder / ".curlrc").write_text("fail-with-body\nsilent\n")
         with ExitStack() as stack:
             url = _NOBODY
-            if any(_ASKS.search(line.text) for line in lines_of(page) if not line.reason):
+            # Lines that --leave leaves count as well: the page's files may be made by its service.
+            if any(_ASKS.search(line.text) for line, _ in lines if not line.reason):
                 supervisor = stack.enter_context(Supervisor(Settings(data_dir=data, port=0), workers=1))
                 supervisor.wait_ready(say=say)
                 url = supervisor.api_url
             kept |= {"GRASPD_API_URL": url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
             kept |= {"API": url, "GRASPD_API_KEY": "none"}
             files_for(page, folder, data, kept)
-            for line in lines_of(page):
-                why = line.reason or ("--leave" if leave and re.search(leave, line.text) else "")
+            for line, why in lines:
                 if why:
                     say(f"  -    {line.text}   ({why})")
                     continue
