@@ -40,7 +40,8 @@ def files_for(page: Path, folder: Path, data: Path, environment: Mapping[str, st
     text = page.read_text()
     _meshes(folder)
     _hands(folder)
-    (folder / "examples").symlink_to(REPOSITORY / "examples")
+    for name in ("benchmarks", "examples"):
+        (folder / name).symlink_to(REPOSITORY / name)
     (folder / "graspd-data").symlink_to(data)
     shutil.copytree(
         REPOSITORY / "docs" / "results", folder / "docs" / "results", ignore=shutil.ignore_patterns("*.png", "*.jpg")
