@@ -3,8 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# One more than the two cores that it is made for: many tests wait for a process, a page or a disk.
-JOBS ?= 3
+JOBS ?= 2
 
 .PHONY: clusters results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins audit clean
 help: ## this list
