@@ -294,14 +294,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.list or all(line.reason for line in lines):
             for line in lines:
                 say(f"  {'-  ' if line.reason else 'run'} {line.text}" + (f"   ({line.reason})" if line.reason else ""))
-        elif not given.again and passed.get(page.name) == state_of(page):
+            continue
+        # As it is now: what is edited while the page runs was not all run.
+        state = state_of(page)
+        if not given.again and passed.get(page.name) == state:
             say("  ended well, and nothing has changed since; --again runs it")
-        else:
-            before, found = state_of(page), run_page(page, given.leave, given.keep)
-            failed += found
-            if not found and not given.leave:
-                given.keep.mkdir(parents=True, exist_ok=True)
-                passed_file.write_text(json.dumps(passed := passed | {page.name: before}, indent=1))
+            continue
+        found = run_page(page, given.leave, given.keep)
+        failed += found
+        if not found and not given.leave:
+            given.keep.mkdir(parents=True, exist_ok=True)
+            passed_file.write_text(json.dumps(passed := passed | {page.name: state}, indent=1))
     say("\n".join(failed) or "all that was run ended well")
     return int(bool(failed))
 

@@ -10,6 +10,11 @@ from service.store.network_check import NETWORK_FILE
 from service.store.network_file import ProposalNetwork, numbers, to_bytes, weight_shapes
 
 DIGEST = "0" * 32
+#: A small job that sets out from a network, but for its options.
+LEARNED = {
+    "grasps": 3, "fidelity": "draft", "seed": 5, "audits": 0, "want": "raw", "scene": "table", "scenes": 2,
+    "method": "learned",
+}  # fmt: skip
 
 
 def random_network(

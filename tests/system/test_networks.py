@@ -13,18 +13,13 @@ from service.index.rebuild import differences
 from service.model.domain import JobOptions, State
 from service.store.network_file import to_bytes
 from service.store.shards import read_shard
-from tests.networks import random_network
+from tests.networks import LEARNED, random_network
 from tests.system.conftest import System
 from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.planners.registry import of_this_machine
 
 pytestmark = pytest.mark.chaos
-
-WANTED = {
-    "grasps": 3, "fidelity": "draft", "seed": 5, "audits": 0, "want": "raw", "scene": "table", "scenes": 2,
-    "method": "learned",
-}  # fmt: skip
 
 
 def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
@@ -37,7 +32,7 @@ def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
     with httpx.Client(base_url=system.supervisor.api_url, trust_env=False, timeout=60) as http:
         system.until(lambda: http.get("/v1/objects/block").status_code == 200, "the built-in assets are published")
         assert http.post("/v1/networks", files={"file": (file.name, file.read_bytes())}).status_code == 201
-        wanted = {"hand": "barrett", "object": "block", **WANTED, "options": {"network": "net", "starts": 2}}
+        wanted = {"hand": "barrett", "object": "block", **LEARNED, "options": {"network": "net", "starts": 2}}
         answer = http.post("/v1/jobs", json=wanted)
         assert answer.status_code == 202, answer.text
     (done,) = system.finish(answer.json()["id"])
@@ -45,7 +40,7 @@ def test_a_job_with_an_uploaded_network_gives_the_grasps_of_synth_with_the_file(
     (shard,) = system.parts.index.shards.page(job=done.id, kind="base").items
     made = read_shard(system.parts.store.get(shard.key))
     options = of_this_machine("learned", {"network": str(file), "starts": 2})
-    request = JobOptions(**WANTED, options=options)
+    request = JobOptions(**LEARNED, options=options)
     alone = synthesized("barrett", "block", request, place=request.place, scenes=2, device="cpu")
     for name in ("grasp/hand_pose", "grasp/joint_positions", "scene/object_pose", "quality/valid"):
         np.testing.assert_array_equal(made[name], alone.arrays[name], err_msg=name)

@@ -20,10 +20,11 @@ from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
+from service.pipeline.deletion import delete_asset
 from service.store.library import publish_asset
 from service.store.records import read_record
 from tests.fakes import make_shard, request
+from tests.service.pipeline.needed import needed_until_its_users_are_deleted
 
 FLOOR = {"kind": "half_space"}
 UPRIGHT = [1.0, 0, 0, 0]
@@ -80,17 +81,7 @@ def test_a_neighbour_is_needed_until_its_job_and_its_dataset_are_deleted(parts: 
     wanted = DatasetRequest(
         name="d", hands=("gripper",), objects=("ball",), grasps=32, scene="bin", neighbours=("cup",)
     )
-    actions.create(parts, wanted)
-    with pytest.raises(ConflictError, match=f"'cup' is needed by job {job.id}"):
-        delete_asset(parts, AssetKind.OBJECT, "cup")
-    job_actions.cancel(parts, job.id)
-    delete_job(parts, job.id)
-    with pytest.raises(ConflictError, match="needed by dataset 'd'"):
-        delete_asset(parts, AssetKind.OBJECT, "cup")
-    actions.cancel(parts, "d")
-    DatasetRounds(parts).advance()
-    delete_dataset(parts, "d")
-    delete_asset(parts, AssetKind.OBJECT, "cup")
+    needed_until_its_users_are_deleted(parts, AssetKind.OBJECT, "cup", job.id, wanted)
     with pytest.raises(NotFoundError, match="there is no object 'cup'"):
         submit(parts, neighbours=("cup",))
 

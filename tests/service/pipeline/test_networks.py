@@ -10,24 +10,25 @@ from pydantic import ValidationError
 
 from service.index.rebuild import differences
 from service.model import names
-from service.model.clock import timestamp
 from service.model.domain import AssetKind, Stage, TaskMessage
 from service.model.errors import ConflictError, InputError, NotFoundError
 from service.model.planning import message_of, plan
-from service.model.records import AttemptRecord, JobRecord
+from service.model.records import JobRecord
 from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
-from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
+from service.pipeline.deletion import delete_asset
 from service.pipeline.sweeper import Sweeper
 from service.store.library import publish_asset
 from service.store.network_check import check_network
-from service.store.records import put_record, read_record
+from service.store.records import read_record
+from tests.api.factories import fail
 from tests.fakes import request
 from tests.networks import network_files, random_network
+from tests.service.pipeline.needed import needed_until_its_users_are_deleted
 
 LEARNED = {"scene": "table", "method": "learned"}
 NAMED = {"options": {"network": "net"}}
@@ -47,16 +48,6 @@ def add(parts: Parts, name: str = "net", *, seed: int = 0, hand: str = "gripper"
 def submit(parts: Parts, **changes: Any) -> JobRecord:
     job, _ = job_actions.submit(parts, request(**{**LEARNED, **NAMED, **changes}))
     return read_record(JobRecord, parts.store, names.job_record(job.id))
-
-
-def fail(parts: Parts, job: JobRecord) -> None:
-    """Let a job fail in its first task."""
-    attempt = AttemptRecord(
-        task_id=next(plan(job)).id, job_id=job.id, stage=Stage.SCENE, number=1, kind="E", reason="it broke", worker="w",
-        ended=timestamp(), last=True,
-    )  # fmt: skip
-    put_record(parts.store, names.attempt(attempt.task_id, 1), attempt)
-    parts.index.write.add_attempt(attempt)
 
 
 def grasps_of(job: JobRecord) -> str:
@@ -81,7 +72,7 @@ def test_a_job_keeps_the_very_file_of_its_network(parts: Parts) -> None:
 def test_a_retried_job_sets_out_from_the_network_it_had(parts: Parts) -> None:
     net = add(parts)
     job = submit(parts)
-    fail(parts, job)
+    fail(parts, job, "it broke")
     add(parts, seed=1)
     queue: Any = parts.queue
     queue.finish(queue.take("w"))
@@ -93,17 +84,7 @@ def test_a_network_is_needed_until_its_job_and_its_dataset_are_deleted(parts: Pa
     add(parts)
     job = submit(parts)
     wanted = DatasetRequest(name="d", hands=("gripper",), objects=("ball",), grasps=64, **LEARNED, **NAMED)
-    actions.create(parts, wanted)
-    with pytest.raises(ConflictError, match=f"the network 'net' is needed by job {job.id}"):
-        delete_asset(parts, AssetKind.NETWORK, "net")
-    job_actions.cancel(parts, job.id)
-    delete_job(parts, job.id)
-    with pytest.raises(ConflictError, match="needed by dataset 'd'"):
-        delete_asset(parts, AssetKind.NETWORK, "net")
-    actions.cancel(parts, "d")
-    DatasetRounds(parts).advance()
-    delete_dataset(parts, "d")
-    delete_asset(parts, AssetKind.NETWORK, "net")
+    needed_until_its_users_are_deleted(parts, AssetKind.NETWORK, "net", job.id, wanted)
     with pytest.raises(NotFoundError, match="there is no network 'net'"):
         submit(parts)
     while Sweeper(parts).advance():

@@ -24,7 +24,7 @@ from service.store.library import load_check, publish_asset
 from service.store.manifests import load_shard
 from service.store.network_check import NETWORK_FILE, check_network
 from service.store.store import Store, open_store
-from tests.networks import network_files, random_network
+from tests.networks import LEARNED, network_files, random_network
 from worker.files.synthesis import synthesized
 from worker.hands.load import hand_from_path
 from worker.planners.learned import known
@@ -34,11 +34,6 @@ from worker.process.runner import Runner
 from worker.scenes.kinds import supports_of
 from worker.stages import assets, ingest, scene, synthesize
 from worker.stages.context import TaskContext
-
-WANTED = {
-    "grasps": 3, "fidelity": "draft", "seed": 5, "audits": 0, "want": "raw", "scene": "table", "scenes": 2,
-    "method": "learned",
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +60,7 @@ def network(store: Store, files: dict[str, bytes]) -> Iterator[Asset]:
 def job_of(store: Store, **options: Any) -> JobRecord:
     hand = publish_asset(store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
     obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
-    wanted = JobRequest(hand="barrett", object="block", **WANTED, options=options)
+    wanted = JobRequest(hand="barrett", object="block", **LEARNED, options=options)
     return JobRecord(
         id=job_id(wanted, hand.digest, obj.digest), request=wanted, hand_digest=hand.digest, object_digest=obj.digest,
         lane=Lane.BULK, created=timestamp(),
@@ -93,12 +88,12 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(
     (tmp_path / "net.npz").write_bytes(files[NETWORK_FILE])
     own = of_this_machine("learned", {"network": str(tmp_path / "net.npz"), "starts": 2})
     assert own["network"] == digest_bytes(files[NETWORK_FILE]) != network.digest
-    request = JobOptions(**WANTED, options=own)
+    request = JobOptions(**LEARNED, options=own)
     alone = synthesized("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
     assert set(made.arrays) == set(alone.arrays) and len(made["grasp/hand_pose"]) == 3
     for name, values in alone.arrays.items():
         np.testing.assert_array_equal(made[name], values, err_msg=name)
-    without = JobOptions(**{**WANTED, "method": "fast_graspd"})
+    without = JobOptions(**{**LEARNED, "method": "fast_graspd"})
     other = synthesized("barrett", "block", without, place=without.place, scenes=2, device="cpu", threads=2)
     assert (made["grasp/hand_pose"] != other.arrays["grasp/hand_pose"]).any(), "the network is followed"
 
