@@ -16,7 +16,8 @@ import typer
 from examples.train_grasp_predictor import sources
 from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, Proposer, Row, examined
 from examples.train_grasp_predictor.evaluator import learned
-from examples.train_grasp_predictor.practice import practised
+from examples.train_grasp_predictor.practice import STEPS as JUDGE_STEPS
+from examples.train_grasp_predictor.practice import Practice
 from examples.train_grasp_predictor.refinement import Refined, joined
 from examples.train_grasp_predictor.samples import Sight, Taught, sights
 from examples.train_grasp_predictor.sheet import page
@@ -42,8 +43,6 @@ PICTURES: Final = (16, 4)
 #: the unseen faces; and where an evaluator does, for each half.
 SPREAD: Final = 0.3
 SPREADS: Final = (0.3, 1.0)
-#: Training steps of an evaluator.
-JUDGE_STEPS: Final = 1500
 #: Noise of the depth camera that all are shown.
 NOISE: Final = "stereo"
 
@@ -187,7 +186,7 @@ def _proposers(
                 yield source, seed, told, _by(made, (SPREAD,))
                 continue
             by = _by(made, SPREADS)
-            tries = tries or practised(study.hand, study.models, given, study.seen, by, seed=seed)
+            tries = tries or Practice(study.hand, study.models, given, study.seen, by).tries(seed=seed)
             refined = Refined(study.hand, learned(study.hand, tries, steps=JUDGE_STEPS, seed=seed), by)
             told |= {"tries": len(tries)}
             whole: dict[str, Proposer] = {source: refined}

@@ -96,6 +96,17 @@ class Tries:
         )
         return cls(points, normals, torch.from_numpy(picture), Hands.of(hand, Proposals(*parts)), _tensor(lifted))
 
+    def and_those(self, others: Tries) -> Tries:
+        """These tries and others."""
+        hands = Hands(*(torch.cat([part, more]) for part, more in zip(
+            vars(self.hands).values(), vars(others.hands).values(), strict=True
+        )))  # fmt: skip
+        return Tries(
+            torch.cat([self.points, others.points]), torch.cat([self.normals, others.normals]),
+            torch.cat([self.picture, others.picture + len(self.points)]), hands,
+            torch.cat([self.lifted, others.lifted]),
+        )  # fmt: skip
+
     def __len__(self) -> int:
         return len(self.lifted)
 

@@ -169,6 +169,22 @@ def test_fingers_open_as_wide_as_the_table_has_room_for(hand: HandModel) -> None
     np.testing.assert_array_equal(high.hands.hand_pose[:, 2], 0.5)
 
 
+@pytest.mark.parametrize(("off", "clear"), [(0.5, False), (2.0, True)])
+def test_a_hand_is_clear_that_keeps_its_distance_from_what_was_seen_on_its_way(
+    hand: HandModel, off: float, clear: bool
+) -> None:
+    sight = block_of((0.06, 0.06, 0.12))
+    given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))
+    ready = execution.made_ready(hand, given, sight)
+    assert ready.clear.all()
+    coming = execution.way_in(ready.hands)[0]
+    swept = execution.hand_points(hand, coming, np.repeat(ready.opened, len(coming), axis=0)).reshape(-1, 3)
+    # The outermost point of the way, and a thing that a camera saw beside it.
+    side = swept[np.argmax(swept[:, 0])] + [off * execution.SEEN_M, 0.0, 0.0]
+    beside = replace(sight, points=np.vstack([sight.points, side]), normals=np.vstack([sight.normals, [1.0, 0, 0]]))
+    assert execution.made_ready(hand, given, beside).clear.all() == clear
+
+
 def test_where_a_hand_is_to_squeeze_raises_it_by_nothing(hand: HandModel) -> None:
     sight = block_of((0.06, 0.06, 0.12))
     given = across(hand, sight, 1, squeeze=SQUEEZE, rng=np.random.default_rng(0))

@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed; `pip instal
 
 from examples.train_grasp_predictor.evaluator import Evaluator, Hands, Tries, learned, scores  # noqa: E402
 from examples.train_grasp_predictor.network import Proposer  # noqa: E402
-from examples.train_grasp_predictor.practice import practised  # noqa: E402
+from examples.train_grasp_predictor.practice import Practice  # noqa: E402
 from examples.train_grasp_predictor.refinement import BEGUN, Refined, moved  # noqa: E402
 from examples.train_grasp_predictor.samples import Scene, Sight, Taught, sights, taught  # noqa: E402
 from examples.train_grasp_predictor.training import Lessons, train, turned  # noqa: E402
@@ -178,6 +178,7 @@ def test_practice_lifts_what_is_known_to_lift_and_not_what_is_far_away(hand: Han
     rows = net.encode(held, np.zeros(3))
     given = Taught([sight.scene] * 4, rows, np.ones(4), np.ones(4, bool), np.ones(4))
     far = dataclasses.replace(held, hand_pose=held.hand_pose + np.array([0.5, 0, 0, 0, 0, 0, 0]))
-    tries = practised(hand, {"block": block}, [given], [sight], lambda *_: far, seed=0)
+    practice = Practice(hand, {"block": block}, [given], [sight], lambda *_: far)
+    tries = practice.tried(practice.beginning, 1, np.random.default_rng(0))
     assert not tries.lifted[:4].any()  # what the source proposed
     assert tries.lifted[4:].mean() >= 0.25  # grasps of the data, moved or not
