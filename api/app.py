@@ -28,8 +28,8 @@ from api.routes.assets import asset_router
 from api.routes.dependencies import provide
 from api.routes.long_requests import EXPORTS, FORMS, UPLOADS, Turns
 from service.index.rebuild import complete_if_new
-from service.model.domain import AssetKind
 from service.model.errors import InputError, UnavailableError
+from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from service.pipeline.backends import Parts
 from service.queue.address import redis_url

@@ -8,12 +8,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.index.views import AttemptView, GraspView, ShardView, StageProgress, TagView, WorkerView
 from service.model.diversity import CELLS
-from service.model.domain import Digest, JobRequest, Stage, State
+from service.model.domain import Digest, JobRequest
 from service.model.labels import Name
 from service.model.metric_fields import OfferedName, filters, means, with_fields
 from service.model.records import Choice
 from service.model.robust import WORDS
 from service.model.scene_spec import Box, HalfSpace, SceneKind
+from service.model.states import Stage, State
 from service.model.where import LONGEST
 
 

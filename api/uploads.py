@@ -10,8 +10,8 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import PurePosixPath
 from typing import IO, Final
 
-from service.model.domain import AssetKind
 from service.model.errors import InputError, LimitError
+from service.model.states import AssetKind
 from service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from service.store.descriptions import json_object
 from service.store.hand_main import SUFFIXES, hand_name, main_of

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.version import STAGE_REVISIONS
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path

@@ -28,7 +28,7 @@ CHILD: Final = """
 import json, sys, time
 from dataclasses import replace
 import numpy as np
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import Run, Wanted

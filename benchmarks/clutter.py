@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import HANDS
-from service.model.domain import BATCH_SIZE, FIDELITIES, JobOptions
+from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import MeshError
+from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import SceneSpec
 from worker.certified import certified_grasps
 from worker.hands.load import hand_from_path

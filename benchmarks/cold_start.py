@@ -35,7 +35,8 @@ def lap(name):
 import worker.certified
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
-from service.model.domain import FIDELITIES, JobRequest
+from service.model.domain import JobRequest
+from service.model.fidelity import FIDELITIES
 lap("imports")
 hand = hand_from_path(sys.argv[1])
 obj = object_from_path(sys.argv[2], face_error_m=FIDELITIES["standard"].face_error_m)

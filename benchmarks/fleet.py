@@ -33,7 +33,7 @@ from sqlalchemy import func, select
 from benchmarks.service_load import cpu_s, say
 from service.index.tables import tasks
 from service.model import names
-from service.model.domain import Lane, State
+from service.model.states import Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.sharing import PART

@@ -27,7 +27,8 @@ from typing import Any, Final
 from service.model import names
 from service.model.ability import own_ability
 from service.model.clock import timestamp
-from service.model.domain import Lane, Stage, TaskMessage
+from service.model.messages import TaskMessage
+from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
 from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import cell_parser, planned
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel

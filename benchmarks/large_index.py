@@ -27,10 +27,11 @@ from service.index.index import Index
 from service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
 from service.model import names
 from service.model.digests import digest_json, job_id
-from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.model.domain import JobRequest
 from service.model.metrics import Indexed, indexed
 from service.model.planning import PlannedTask, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import AssetKind, Lane, Stage, State
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.settings import Settings
 from service.store.library import publish_builtins

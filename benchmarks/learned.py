@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from service.model.domain import FIDELITIES, JobOptions
+from service.model.domain import JobOptions
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import SceneSpec
 from service.model.version import PACKAGE_VERSION
 from worker.certified import certified_grasps

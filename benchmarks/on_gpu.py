@@ -24,7 +24,7 @@ import warp as wp
 
 from benchmarks.success import HANDS
 from service.model.cores import available_cores
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.version import PACKAGE_VERSION
 from worker.engines.devices import Device
 from worker.hands.load import hand_from_path

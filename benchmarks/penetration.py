@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.transforms import apply
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path

@@ -24,7 +24,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.domain import BATCH_SIZE, FIDELITIES
+from service.model.domain import BATCH_SIZE
+from service.model.fidelity import FIDELITIES
 from worker.grasps import GraspSet, joined
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

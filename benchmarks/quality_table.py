@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 from service.model.cores import available_cores
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.grasps import Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from service.model.domain import FIDELITIES, Fidelity
+from service.model.fidelity import FIDELITIES, Fidelity
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import synthesize

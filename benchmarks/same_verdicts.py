@@ -23,7 +23,7 @@ from benchmarks.chain import environment_of
 _COMMON: Final = """
 import sys, time
 import numpy as np
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

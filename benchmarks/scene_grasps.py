@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import HANDS, cell_parser
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import TOUCH, SceneSpec
 from service.model.version import PACKAGE_VERSION
 from worker.grasps import GraspSet

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from service.model.domain import resolve_fidelity
+from service.model.fidelity import resolve_fidelity
 from service.model.scene_spec import SceneSpec
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

@@ -24,9 +24,9 @@ import httpx
 import worker.process.main
 from service.index.index import Index
 from service.model import names
-from service.model.domain import Lane, State
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.run.supervisor import Supervisor

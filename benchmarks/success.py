@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import planned
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

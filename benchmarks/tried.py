@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.cells import HANDS, cell_parser, kept_json, write_json
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path

@@ -19,8 +19,9 @@ from api.formatting import count, duration, metric
 from api.models import GraspQuery, JobDetail
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
 from service.index.views import GraspView
-from service.model.domain import AssetKind, JobRequest, State
+from service.model.domain import JobRequest
 from service.model.errors import TaskError
+from service.model.states import AssetKind, State
 from service.run.supervisor import Supervisor
 from service.store import standing
 from service.store.assets import builtin_files

@@ -9,8 +9,9 @@ from pydantic import ValidationError
 
 from graspd.grasps import Grasps, joined
 from service.cli import validation_line
-from service.model.domain import JobRequest, State
+from service.model.domain import JobRequest
 from service.model.errors import InputError, TaskError
+from service.model.states import State
 from service.store.shards import read_shard
 
 try:

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.store.assets import builtin_files
 
 _PROGRAM: Final = (sys.executable, "-m", "graspd")

@@ -15,9 +15,11 @@ import numpy as np
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, JobRequest, Lane, Stage, TaskMessage
+from service.model.domain import JobRequest
+from service.model.messages import TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, Stage
 from service.pipeline.backends import Parts
 from service.store import packs
 from service.store.library import publish_asset

@@ -9,8 +9,8 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from service.model.domain import Lane, Stage
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards, shard_of
+from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.at_scrape import QueueNow, WorkerPulse
 from service.queue.port import (

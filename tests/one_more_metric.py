@@ -30,7 +30,7 @@ def main(folder: Path, older_index: str) -> None:
     from api.app import create_app
     from service.docs import schema_table
     from service.index.index import Index
-    from service.model.domain import Stage
+    from service.model.states import Stage
     from service.store.columns import SCHEMAS
     from service.store.manifests import load_manifest
     from tests.api.conftest import BASE_URL

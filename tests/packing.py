@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import JobRequest, Lane, Stage, TaskMessage
+from service.model.domain import JobRequest
+from service.model.messages import TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import Lane, Stage
 from service.pipeline.backends import Parts
 from service.queue.port import Event, EventKind
 from service.store.manifests import ShardManifest

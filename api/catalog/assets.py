@@ -14,9 +14,9 @@ from api.access.auth import caller_id, must_own, reach
 from service.index.views import AssetView, Page
 from service.model import names
 from service.model.digests import digest_files
-from service.model.domain import AssetKind
 from service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
 from service.model.projects import marks_of
+from service.model.states import AssetKind
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
 from service.store import library

@@ -13,7 +13,7 @@ from api.access.unfinished import DATASET_PREFIX
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import MatrixCell, Page
 from service.model.dataset_records import Snapshot
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline import deletion
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions

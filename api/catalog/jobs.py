@@ -16,7 +16,8 @@ from api.catalog.shards import Shards
 from api.models import Job, JobDetail, LossCurve, MeanMetrics
 from service.index.views import JobView, Page, TaskView
 from service.logs import bind
-from service.model.domain import JobRequest, Stage, State
+from service.model.domain import JobRequest
+from service.model.states import Stage, State
 from service.pipeline import deletion, job_actions
 from service.pipeline.backends import Parts
 

@@ -18,9 +18,9 @@ from service.index.at_scrape import read_index
 from service.index.damage import Damage
 from service.index.views import FailureGroup, Stats, TaskView
 from service.model.digests import digest_json
-from service.model.domain import Lane, Stage
 from service.model.errors import NotFoundError, UnavailableError
 from service.model.projects import Reach
+from service.model.states import Lane, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.sharing import PART
 from service.queue.at_scrape import QueueNow

@@ -10,7 +10,7 @@ from typing import Final
 
 from api.models import StageStatus, stage_state
 from service.index.views import JobView, StageProgress, TaskView
-from service.model.domain import State
+from service.model.states import State
 
 #: A shorter look at a task says more about when its progress was reported than about its speed.
 _LEAST_SPAN_S: Final = 1.0

@@ -14,8 +14,8 @@ from api.client.hand_files import upload_of
 from api.client.reports import UrlOption, open_client, show_asset
 from api.uploads import name_of_upload
 from service.cli import JsonFlag, reporting_errors
-from service.model.domain import AssetKind
 from service.model.errors import InputError
+from service.model.states import AssetKind
 from service.store.asset_options import (
     AllowOpenOption,
     ApproachOption,

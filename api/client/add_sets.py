@@ -15,8 +15,8 @@ from api.client.datasets import DatasetClient
 from api.client.reports import open_client
 from api.uploads import name_of_upload
 from service.cli import emit
-from service.model.domain import AssetKind
 from service.model.errors import InputError
+from service.model.states import AssetKind
 from service.store.asset_summary import verdict_line
 from service.store.assets import pack
 from service.store.descriptions import json_object

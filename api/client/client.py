@@ -16,8 +16,9 @@ from httpx_sse import EventSource
 from api.hosts import is_loopback
 from api.models import GraspQuery, Health, Job, JobDetail, Shard
 from service.index.views import AssetView, GraspView, Page
-from service.model.domain import AssetKind, JobRequest, State
+from service.model.domain import JobRequest
 from service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError
+from service.model.states import AssetKind, State
 
 _PATIENCE_S: Final = 30.0
 _CONNECT_S: Final = 5.0

@@ -21,9 +21,10 @@ from api.models import Job
 from api.uploads import MAIN_SUFFIXES, name_of_upload
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.diversity import MIN_DISTANCE_M
-from service.model.domain import AUDITS, NETWORK_METHODS, AssetKind, State
+from service.model.domain import AUDITS, NETWORK_METHODS
 from service.model.errors import InputError
 from service.model.scene_options import scene_option
+from service.model.states import AssetKind, State
 from service.store.asset_summary import hand_line, self_test_line
 
 app = typer.Typer(no_args_is_help=True)

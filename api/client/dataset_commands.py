@@ -21,8 +21,8 @@ from api.client.reports import UrlOption, open_client, say_deleted
 from api.formatting import count, percent, size
 from service.cli import JsonFlag, emit, reporting_errors
 from service.index.dataset_views import DatasetView
-from service.model.domain import State
 from service.model.errors import InputError, TaskError
+from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.export import FORMATS
 from service.pipeline.datasets.spec import DatasetRequest, Matrix

@@ -12,7 +12,8 @@ from rich.table import Table
 from api.client.datasets import DatasetClient
 from api.formatting import count, duration, metric, percent, size
 from service.index.dataset_views import CellView, DatasetView
-from service.model.domain import JobOptions, State
+from service.model.domain import JobOptions
+from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
 
 #: A table with more hands does not fit a terminal: then each cell has a line.

@@ -12,7 +12,7 @@ from api.client.client import Client
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import Page
 from service.model.dataset_records import Snapshot, SnapshotShard
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix
 

@@ -12,8 +12,9 @@ import typer
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from service.model.domain import OFFERED, JobOptions
+from service.model.domain import JobOptions
 from service.model.errors import InputError
+from service.model.fidelity import OFFERED
 
 _HELP: Final = {
     "grasps": "Grasps for each hand and object.",

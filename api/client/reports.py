@@ -14,8 +14,9 @@ from api.client.watching import JobDisplay
 from api.formatting import count, duration, metric, percent
 from api.models import Diversity, JobDetail
 from service.cli import emit, load_settings
-from service.model.domain import AssetKind, JobRequest, State
+from service.model.domain import JobRequest
 from service.model.errors import InputError, TaskError
+from service.model.states import AssetKind, State
 from service.run.address import recorded_address
 from service.store.asset_summary import summary
 

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from api.formatting import duration, metric
 from api.models import Job, StageStatus
-from service.model.domain import Stage, State
+from service.model.states import Stage, State
 
 _LINE_EVERY_S: Final = 2.0
 

@@ -23,8 +23,10 @@ from api.dashboard.forms import first_message
 from api.dashboard.rendering import render
 from api.routes.dependencies import AssetsOf, DatasetsOf, JobsOf, may_read, may_submit
 from service.index.dataset_views import CellView
-from service.model.domain import OFFERED, AssetKind, JobRequest, State
+from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError
+from service.model.fidelity import OFFERED
+from service.model.states import AssetKind, State
 from service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20

@@ -13,9 +13,10 @@ from pydantic import ValidationError
 from api.access.auth import reach
 from service.index.index import Index
 from service.index.queries.costs import BatchCost, Costs
-from service.model.domain import OFFERED, Stage
 from service.model.errors import GraspdError
+from service.model.fidelity import OFFERED
 from service.model.projects import Reach
+from service.model.states import Stage
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.spec import Matrix
 

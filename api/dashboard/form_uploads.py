@@ -17,8 +17,8 @@ from starlette.datastructures import FormData, UploadFile
 from api.catalog.assets import Assets
 from api.routes.assets import store_upload
 from service.index.views import AssetView
-from service.model.domain import AssetKind
 from service.model.errors import GraspdError, InputError
+from service.model.states import AssetKind
 from service.store.descriptions import json_object
 
 _CHECK_WAIT_S: Final = 15.0

@@ -20,10 +20,10 @@ from api.routes.dependencies import AssetsOf, GraspsOf, ShardsOf, TagsOf, may_re
 from api.routes.paging import next_address
 from service.index.views import GraspView, TagView
 from service.model.diversity import GraspType
-from service.model.domain import AssetKind
 from service.model.errors import InputError
 from service.model.metrics import GRASP_METRICS, Indexed, indexed
 from service.model.robust import MEANINGS
+from service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
 #: Sort key, label, unit of the metrics that lists of grasps show.

@@ -17,8 +17,8 @@ from api.routes.assets import store_correction
 from api.routes.dependencies import AssetsOf, may_read, may_submit
 from api.routes.hand_corrections import CorrectionRequest
 from service.index.views import AssetView
-from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError, NotFoundError
+from service.model.states import AssetKind
 from service.store.asset_summary import hand_line, self_test_line
 from service.store.hand_corrections import MAX_ENTRIES, HandFacts
 

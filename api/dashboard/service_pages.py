@@ -17,8 +17,8 @@ from api.models import STAGE_LABELS
 from api.routes.dependencies import DatasetsOf, JobsOf, OverviewOf, StoreOf, may_read
 from service.index.dataset_views import DatasetView
 from service.index.views import WorkerView
-from service.model.domain import State
 from service.model.errors import UnavailableError
+from service.model.states import State
 from service.queue.port import Keeping
 
 PAGE_SIZE: Final = 25

@@ -20,8 +20,9 @@ from api.routes.long_requests import UPLOADS, Turns
 from api.routes.paging import link_next
 from api.uploads import files_of_upload, name_of_upload
 from service.index.views import AssetView, Page
-from service.model.domain import AssetKind, Name
+from service.model.domain import Name
 from service.model.errors import InputError, RateError
+from service.model.states import AssetKind
 from service.store.hand_corrections import HandCorrections
 
 _GLB: Final = "model/gltf-binary"

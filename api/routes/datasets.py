@@ -13,7 +13,8 @@ from api.routes.paging import link_next
 from service.index.dataset_views import CellView, DatasetView, ObjectSetView, SnapshotView
 from service.index.views import Page
 from service.model.dataset_records import Snapshot
-from service.model.domain import Name, State
+from service.model.domain import Name
+from service.model.states import State
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
 

@@ -14,7 +14,8 @@ from api.problems import responses
 from api.routes.dependencies import Cursor, JobsOf, Limit, may_read, may_submit
 from api.routes.paging import link_next
 from service.index.views import Page
-from service.model.domain import JobRequest, State
+from service.model.domain import JobRequest
+from service.model.states import State
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.modelling.common import SEED, Row, cpu, hand_of, mean, object_of, share, verdicts
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.planners import synthesize
 from worker.planners.port import Wanted
 from worker.quality.penetration import penetration_depth

@@ -12,7 +12,7 @@ from sqlalchemy import Select, func, select
 from service.index.database import Database
 from service.index.tables import damage, jobs, shards
 from service.model.clock import age_of
-from service.model.domain import State
+from service.model.states import State
 
 #: Unfinished jobs are counted up to here.
 MOST_JOBS: Final = 10_000

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pydantic import Field
 
 from service.index.views import View
-from service.model.domain import JobOptions, State
+from service.model.domain import JobOptions
 from service.model.records import Choice
+from service.model.states import State
 
 
 class DatasetView(View):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.model.domain import Model
+from service.model.base import Model
 from service.model.metric_fields import SortedName
 
 Metric = SortedName

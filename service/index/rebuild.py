@@ -18,9 +18,9 @@ from service.index.index import Index
 from service.index.tables import LIVE_COLUMNS, LIVE_TABLES, metadata
 from service.model import names
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
-from service.model.domain import State
 from service.model.errors import DamagedError, InputError, NotFoundError
 from service.model.records import AttemptRecord, JobEvent, JobRecord, Record
+from service.model.states import State
 from service.model.tags import Tag
 from service.model.webhooks import Webhook
 from service.store.deletions import pending

@@ -14,9 +14,9 @@ from sqlalchemy import Column, Table, select
 from service.index.index import Index
 from service.index.tables import jobs, shards
 from service.model import names
-from service.model.domain import Stage
 from service.model.errors import DamagedError, NotFoundError
 from service.model.records import JobRecord
+from service.model.states import Stage
 from service.store.deletions import pending
 from service.store.packs import manifest_at, pack_at
 from service.store.records import read_record

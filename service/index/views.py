@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
-from service.model.domain import AssetKind, JobRequest, Lane, Stage, State
+from service.model.domain import JobRequest
 from service.model.metric_fields import values, with_fields
 from service.model.records import Choice
+from service.model.states import AssetKind, Lane, Stage, State
 
 T = TypeVar("T")
 

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from service.model.domain import IngestMessage, Stage, TaskMessage
+from service.model.messages import IngestMessage, TaskMessage
+from service.model.states import Stage
 from service.model.version import OLDEST_TASK_SCHEMA, STAGE_REVISIONS, TASK_SCHEMA
 
 #: What workers can do that do not say it: graspd 0.1.0 before they did.

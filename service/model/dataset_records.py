@@ -14,9 +14,11 @@ from pydantic import Field, model_validator
 
 from service.model.clock import timestamp
 from service.model.digests import digest_json
-from service.model.domain import AUTO, Digest, JobOptions, JobRequest, Lane, Name
+from service.model.domain import Digest, JobOptions, JobRequest, Name
+from service.model.fidelity import AUTO
 from service.model.projects import Project
 from service.model.records import Choice, JobRecord, Record
+from service.model.states import Lane
 
 
 class Member(Record):

@@ -10,7 +10,8 @@ from contextlib import AbstractContextManager
 from typing import IO
 
 from service.model.diversity import MIN_DISTANCE_M
-from service.model.domain import AssetKind, JobRequest, Stage
+from service.model.domain import JobRequest
+from service.model.states import AssetKind, Stage
 from service.model.version import STAGE_REVISIONS
 
 

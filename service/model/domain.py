@@ -1,4 +1,4 @@
-"""The words of graspd as types: hands, objects, fidelities, jobs, tasks, states.
+"""The words of graspd as types: jobs with all their options, and hands, objects and networks as they are kept.
 
 Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: position x y z, then unit quaternion w x y z.
 """
@@ -8,12 +8,13 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from enum import StrEnum
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
+from service.model.base import Model
 from service.model.diversity import MIN_DISTANCE_M
+from service.model.fidelity import AUTO, Fidelity, resolve_fidelity
 from service.model.labels import DIGEST
 from service.model.labels import Digest as Digest
 from service.model.labels import Name as Name
@@ -29,6 +30,7 @@ from service.model.scene_options import (
     scene_of,
 )
 from service.model.scene_spec import LEAST_TOUCH, MOST_NEIGHBOURS, MOST_TOUCH, TOUCH, SceneSpec
+from service.model.states import AssetKind
 
 BATCH_SIZE: Final = 32
 #: What pictures can show besides colour, depth and segmentation, in the order in which shards and digests name them.
@@ -38,109 +40,6 @@ EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 #: planning, judging and measuring two or three valid ones.
 AUDITS: Final = 8
 _AUDIT_EVERY: Final = 2
-
-
-class State(StrEnum):
-    """State of a job or a task. A task that lost its worker goes from `running` back to `queued`."""
-
-    QUEUED = "queued"
-    RUNNING = "running"
-    SUCCEEDED = "succeeded"
-    FAILED = "failed"
-    CANCELLED = "cancelled"
-
-    @property
-    def is_final(self) -> bool:
-        return self in (State.SUCCEEDED, State.FAILED, State.CANCELLED)
-
-
-class Stage(StrEnum):
-    """What a task does. `ingest` checks what was uploaded; the others make shards."""
-
-    INGEST = "ingest"
-    SYNTHESIZE = "synthesize"
-    SCENE = "scene"
-    RENDER = "render"
-
-
-class AssetKind(StrEnum):
-    """The kinds of things a user brings. A network proposes grasps of one hand (`service.store.network_file`)."""
-
-    HAND = "hand"
-    OBJECT = "object"
-    NETWORK = "network"
-
-
-class Model(BaseModel):
-    """Base of the domain models: frozen, and strict about unknown fields."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Fidelity(Model):
-    """How much is modelled, and so what a grasp costs. Each knob is priced by `graspd chart`."""
-
-    name: str = Field("custom", max_length=64)
-    starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp; half where they are tried")
-    finalists: int = Field(2, ge=1, le=64, description="of these, hands that enter the fine phase")
-    coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
-    fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
-    object_points: int = Field(4000, ge=16, le=65536, description="object surface points tested against the links")
-    face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
-    coarse_iterations: int = Field(100, ge=0, le=100_000)
-    fine_iterations: int = Field(40, ge=0, le=100_000)
-    polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
-    patience: int = Field(
-        10, ge=0, le=100_000, description="fine iterations without improvement after which a grasp is done; 0: never"
-    )
-    velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
-    contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
-    optimizer: Literal["adam", "gd"] = "adam"
-    leak: Literal["one_sided", "two_sided"] = "one_sided"
-    dilation: Literal["fixed", "touch"] = Field(
-        "fixed", description="first dilation of the object: 10 mm, or so much that it just touches the hand"
-    )
-    simulate: bool = Field(True, description="False: hands are only drawn to the surface; a control, not a method")
-    phong_alpha: float = Field(0.5, ge=0, le=1)
-
-
-FIDELITIES: Final[dict[str, Fidelity]] = {
-    "draft": Fidelity(
-        name="draft", starts=2, finalists=1, coarse_points=200, fine_points=800, object_points=2000, face_error_m=1e-3,
-        coarse_iterations=60, fine_iterations=20, polish_iterations=6,
-    ),
-    "standard": Fidelity(name="standard"),
-    "fine": Fidelity(
-        name="fine", starts=6, finalists=3, coarse_points=400, fine_points=4000, object_points=8000, face_error_m=1e-4,
-        coarse_iterations=120, fine_iterations=60, polish_iterations=15,
-    ),
-    # As the paper writes it: plain descent with one rate, one sweep of contacts, no penetration penalty, no selection.
-    "paper": Fidelity(
-        name="paper", starts=1, finalists=1, coarse_points=2000, coarse_iterations=200, fine_iterations=0, patience=0,
-        polish_iterations=0, contact_solver="gauss_seidel", optimizer="gd", leak="two_sided", phong_alpha=0.75,
-    ),
-    "control": Fidelity(name="control", simulate=False),
-}  # fmt: skip
-
-#: Stands in a request for the cheapest fidelity that meets its target; a stored job has that fidelity instead.
-AUTO: Final = "auto"
-
-#: Fidelities offered to users; the others are for comparison.
-OFFERED: Final = ("draft", "standard", "fine")
-
-
-def resolve_fidelity(value: str | Fidelity) -> Fidelity:
-    """The knobs behind a fidelity's name.
-
-    Raises:
-        ValueError: if the name is not one of `FIDELITIES`.
-    """
-    if isinstance(value, Fidelity):
-        return value
-    if value not in FIDELITIES:
-        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give the knobs")
-    return FIDELITIES[value]
-
 
 #: Methods of graspd's own that know no scene; what those of other packages know, a worker tells.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
@@ -430,66 +329,3 @@ class Asset(Model):
 
     # A newer graspd may have written more.
     model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class Origin(Model):
-    """Where a job came from, for the logs and traces of its tasks; keys share the queue evenly."""
-
-    request: str = Field("", max_length=64, description="id of the HTTP request")
-    key: str = Field("", max_length=64, description="name of the API key")
-    traceparent: str = Field("", max_length=64, description="W3C trace context")
-
-    # A newer front door may say more.
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class TaskMessage(Model):
-    """What travels through the queue: enough for a worker with the store alone to do the task."""
-
-    # `schema` is a field name in the message, an attribute of BaseModel in Python: hence the alias.
-    schema_: int = Field(alias="schema", description="oldest schema that can say this")
-    newest_schema: int = Field(0, ge=0, description="newest schema whose meaning the writer knew; 0: the same")
-    task_id: Word
-    job_id: Word
-    stage: Stage
-    batch: int = Field(ge=0)
-    count: int = Field(ge=1, description="grasps wanted of this batch")
-    revision: int = Field(1, ge=1, description="revision of the stage's algorithm that the output's address stands for")
-    attempt: int = Field(1, ge=1)
-    max_attempt: int = Field(3, ge=1, description="number of the attempt that is the last")
-    request: JobRequest
-    hand_digest: Digest
-    object_digest: Digest
-    inputs: tuple[Word, ...] = Field((), description="shard ids this task reads")
-    output: Word = Field(description="shard id this task writes")
-    origin: Origin | None = None
-
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
-
-    @model_validator(mode="after")
-    def _knows_its_files(self) -> Self:
-        check_known(self.request)
-        return self
-
-
-class IngestMessage(Model):
-    """A task that checks an uploaded hand, object or network in a child process."""
-
-    schema_: int = Field(alias="schema")
-    newest_schema: int = Field(0, ge=0)
-    task_id: Word
-    stage: Literal[Stage.INGEST] = Stage.INGEST
-    kind: AssetKind
-    name: Name
-    digest: Digest
-    attempt: int = Field(1, ge=1)
-    max_attempt: int = Field(3, ge=1)
-
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
-
-
-class Lane(StrEnum):
-    """Priority of a task: `interactive` goes first, but for every fourth task that a worker takes."""
-
-    INTERACTIVE = "interactive"
-    BULK = "bulk"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from service.model.digests import digest_json
-from service.model.domain import AssetKind, Stage
+from service.model.states import AssetKind, Stage
 
 ASSETS: Final = "assets"
 JOBS: Final = "jobs"

@@ -11,18 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from service.model.digests import digest_json, shard_id
-from service.model.domain import (
-    BATCH_SIZE,
-    AssetKind,
-    IngestMessage,
-    JobOptions,
-    JobRequest,
-    Lane,
-    Stage,
-    State,
-    TaskMessage,
-)
+from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
+from service.model.messages import IngestMessage, TaskMessage
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, Stage, State
 from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_FIELD, SCHEMA_OF_NETWORKS, SCHEMA_OF_PACKS, TASK_SCHEMA
 
 #: A job this small is somebody waiting at a screen; anything larger runs in bulk.

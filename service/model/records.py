@@ -6,8 +6,10 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.model.domain import AssetKind, Digest, JobRequest, Lane, Origin, Stage, check_known
+from service.model.domain import Digest, JobRequest, check_known
+from service.model.messages import Origin
 from service.model.projects import Project
+from service.model.states import AssetKind, Lane, Stage
 from service.model.version import STAGE_REVISIONS
 
 

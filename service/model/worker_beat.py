@@ -8,7 +8,8 @@ from typing import Annotated
 from pydantic import Field
 
 from service.model.ability import UNTOLD_REVISIONS, UNTOLD_SCHEMAS, Ability
-from service.model.domain import Stage, Word
+from service.model.domain import Word
+from service.model.states import Stage
 
 #: Anybody who writes to Redis may say anything: what is read from there is as long and as large as ours can be.
 HostWord = Annotated[str, Field(max_length=300)]

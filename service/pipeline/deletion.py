@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind
 from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.store.deletions import Deletion
 from service.store.records import put_record, read_record

@@ -10,8 +10,9 @@ from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
 from service.model.charts import FREE, IN_SCENE, IN_SCENES, SPEEDS
-from service.model.domain import AUTO, OFFERED, JobRequest
+from service.model.domain import JobRequest
 from service.model.errors import InputError
+from service.model.fidelity import AUTO, OFFERED
 from service.model.records import Choice
 from service.store.store import Store
 from service.store.study_records import charts_of, latest_key

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from typing import Final
 
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, Stage, State
 from service.model.errors import DamagedError, InputError, StoreUnavailable, UnavailableError
 from service.model.names import attempt as attempt_key
 from service.model.planning import backoff
 from service.model.records import AttemptRecord
+from service.model.states import AssetKind, Stage, State
 from service.pipeline.backends import Parts
 from service.pipeline.tally import Tally
 from service.queue.port import Event, EventKind

@@ -15,11 +15,13 @@ from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
 from service.model.digests import job_id
-from service.model.domain import AssetKind, JobRequest, Lane, Origin, State, TaskMessage
+from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from service.model.messages import Origin, TaskMessage
 from service.model.planning import lane_of, message_of
 from service.model.projects import EVERYTHING, Reach
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, State
 from service.pipeline.backends import Parts
 from service.pipeline.fidelity_choice import Resolver
 from service.pipeline.routes import Routes

@@ -21,10 +21,10 @@ from service.index.rebuild import complete_if_new, rebuild
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
-from service.model.domain import Lane
 from service.model.errors import DamagedError, IndexUnavailable, StoreUnavailable, UnavailableError
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards, shard_of
 from service.model.planning import ingest_id, ingest_message
+from service.model.states import Lane
 from service.model.turns import Turns
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts

@@ -11,11 +11,12 @@ from typing import Final
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, IngestMessage, Stage, TaskMessage
 from service.model.errors import DamagedError, UnavailableError
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards
+from service.model.messages import IngestMessage, TaskMessage
 from service.model.planning import ingest_id
 from service.model.records import AttemptRecord
+from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.indexer import Indexer
 from service.queue.port import Holder, Lease

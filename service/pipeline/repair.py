@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from service.index.damage import Damage
 from service.model import names
-from service.model.domain import Lane, Stage
 from service.model.errors import DamagedError, NotFoundError
 from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import JobRecord
+from service.model.states import Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.backends import Parts
 from service.pipeline.scrub import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.model.ability import Ability, Need, own_ability
-from service.model.domain import Stage
+from service.model.states import Stage
 from service.model.worker_beat import WorkerBeat
 
 

@@ -13,9 +13,10 @@ from service.index.damage import Damage
 from service.model import names
 from service.model.clock import age_of
 from service.model.dataset_records import DatasetEvent, DatasetRecord, ObjectSet, Snapshot
-from service.model.domain import Asset, Stage
+from service.model.domain import Asset
 from service.model.errors import DamagedError, NotFoundError
 from service.model.records import AttemptRecord, JobEvent, JobRecord
+from service.model.states import Stage
 from service.store.manifests import ShardManifest
 from service.store.packs import DeadShards, pack_at, read_manifests
 from service.store.records import parse_record

@@ -10,9 +10,9 @@ from typing import Final
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, Stage
 from service.model.errors import ConflictError, DamagedError, NotFoundError
 from service.model.planning import plan
+from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.deletion import delete_job
 from service.pipeline.pack_removal import remove_packed

@@ -12,7 +12,7 @@ from typing import Final
 
 from pydantic_core import from_json
 
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline.series import SERIES, STAGE_BUCKETS_S
 from service.queue.port import Counters
 from service.store.manifests import ShardManifest

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from service.model import names
-from service.model.domain import Stage
 from service.model.errors import DamagedError, NotFoundError
+from service.model.states import Stage
 from service.pipeline.backends import Parts
 from service.pipeline.scrub import STAGES
 from service.store.manifests import ShardManifest, described_again

@@ -7,9 +7,10 @@ from typing import TypeVar
 
 from service.index.views import AssetView
 from service.model.dataset_records import Member
-from service.model.domain import AssetKind, JobOptions
+from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 
 Options = TypeVar("Options", bound=JobOptions)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.model.clock import age_of
-from service.model.domain import Lane, Stage
+from service.model.states import Lane, Stage
 
 Place = tuple[Lane, Stage]
 

@@ -15,7 +15,8 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 from redis.exceptions import ResponseError
 
-from service.model.domain import IngestMessage, Stage, TaskMessage
+from service.model.messages import IngestMessage, TaskMessage
+from service.model.states import Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.port import Event, Message
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 from redis.exceptions import ResponseError
 
 from service.model.ability import FIRST_SCHEMA, Ability, Need
-from service.model.domain import Lane, Stage
+from service.model.states import Lane, Stage
 from service.queue import entries
 from service.queue.port import lane_order
 

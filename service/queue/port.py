@@ -9,8 +9,11 @@ from typing import Annotated, Final, Protocol
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from service.model.domain import IngestMessage, Lane, Model, Stage, TaskMessage, Word
+from service.model.base import Model
+from service.model.domain import Word
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards
+from service.model.messages import IngestMessage, TaskMessage
+from service.model.states import Lane, Stage
 from service.model.worker_beat import Count, HostWord, WorkerBeat
 from service.queue.at_scrape import QueueNow
 

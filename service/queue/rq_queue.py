@@ -16,9 +16,9 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from service.model.ability import need_of
-from service.model.domain import Lane, Stage
 from service.model.errors import QueueUnavailable
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards
+from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue import entries, shares
 from service.queue.adding import Appender

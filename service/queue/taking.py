@@ -9,7 +9,7 @@ from redis.exceptions import ResponseError
 from rq.exceptions import NoSuchJobError
 from rq.serializers import JSONSerializer
 
-from service.model.domain import TaskMessage
+from service.model.messages import TaskMessage
 from service.queue import entries
 from service.queue.allowed import TASK_FUNCTION, AllowedJob
 

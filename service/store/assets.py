@@ -17,8 +17,9 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Final, Self, TypeVar
 
 from service.model.digests import StreamedFiles, digest_bytes, digest_files
-from service.model.domain import Asset, AssetKind
+from service.model.domain import Asset
 from service.model.errors import InputError, LimitError, NotFoundError
+from service.model.states import AssetKind
 from service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)

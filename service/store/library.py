@@ -11,8 +11,9 @@ from typing import Final
 from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import digest_files
-from service.model.domain import Asset, AssetKind
+from service.model.domain import Asset
 from service.model.errors import ConflictError, DamagedError, InputError
+from service.model.states import AssetKind
 from service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
 from service.store.records import read_record
 from service.store.store import Store

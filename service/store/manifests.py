@@ -13,10 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import Digest, JobRequest, Stage, TaskMessage
+from service.model.domain import Digest, JobRequest
+from service.model.messages import TaskMessage
 from service.model.metric_fields import values, with_fields
 from service.model.metrics import indexed
 from service.model.robust import axis_word
+from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from service.store import standing
 from service.store.columns import SCHEMAS, ShardKind

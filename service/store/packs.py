@@ -20,8 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.model import names
 from service.model.digests import digest_bytes
-from service.model.domain import Digest, Stage
+from service.model.domain import Digest
 from service.model.errors import DamagedError, NotFoundError
+from service.model.states import Stage
 from service.store.integrity import MEND, read_checked
 from service.store.manifests import ShardManifest, load_manifest
 from service.store.parts import Part, part_of

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import job_id
-from service.model.domain import AssetKind, JobRequest, Lane, Stage
+from service.model.domain import JobRequest
 from service.model.planning import PlannedTask, message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.robust import Axis
+from service.model.states import AssetKind, Lane, Stage
 from service.model.transforms import pose_to_matrix
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.backends import Parts

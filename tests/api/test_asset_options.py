@@ -10,7 +10,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.uploads import files_of_upload
-from service.model.domain import AssetKind, IngestMessage
+from service.model.messages import IngestMessage
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.store.asset_options import hand_options, object_options
 from service.store.assets import builtin_files

@@ -19,8 +19,8 @@ from api.access.keys import Key, Scope
 from api.access.quotas import Quotas
 from api.middleware.body_limit import MAX_BODY_BYTES
 from service.index.queries import cursors
-from service.model.domain import AssetKind
 from service.model.errors import QuotaError
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.library import load_asset, load_check

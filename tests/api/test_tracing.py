@@ -12,9 +12,9 @@ from starlette.testclient import TestClient
 
 from service import tracing
 from service.model import names
-from service.model.domain import Stage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import Stage
 from service.pipeline.backends import Parts
 from service.store.records import read_record
 from tests.fakes import fake_stages

@@ -12,8 +12,8 @@ import pytest
 
 from api.uploads import files_of_upload
 from service.model.digests import digest_files
-from service.model.domain import AssetKind
 from service.model.errors import InputError
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.store.assets import pack
 from service.store.library import load_asset_files, publish_asset

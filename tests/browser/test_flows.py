@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.model.transforms import apply
 from service.store.assets import builtin_files
 from tests.waiting import until

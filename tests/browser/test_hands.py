@@ -8,7 +8,8 @@ from typing import Any
 import httpx
 import pytest
 
-from service.model.domain import AssetKind, IngestMessage
+from service.model.messages import IngestMessage
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.store import library
 from tests.browser.test_flows import colours

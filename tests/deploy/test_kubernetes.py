@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 import graspd.cli
-from service.model.domain import Lane, Stage
+from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
 from service.queue.lists import queue_name
 from service.settings import Settings

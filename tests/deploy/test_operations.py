@@ -12,7 +12,7 @@ import pytest
 import graspd.cli
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.settings import Settings

@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.large_index import fill
 from service.index.index import Index
 from service.model.clock import timestamp
-from service.model.domain import Lane
+from service.model.states import Lane
 from service.queue.port import Event, EventKind, Report
 from service.queue.rq_queue import RqQueue, cancel_key
 from service.queue.streams import EVENTS, EVENTS_KEPT, NUMBER

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline.backends import Parts
 from service.queue.address import redis_url
 from service.queue.rq_queue import RqQueue

@@ -20,8 +20,8 @@ from rq.serializers import JSONSerializer
 from service.index.filters import GraspFilter
 from service.index.rebuild import differences, rebuild
 from service.model import names
-from service.model.domain import State
 from service.model.errors import BusyError
+from service.model.states import State
 from service.pipeline import job_actions
 from service.queue.allowed import TASK_FUNCTION
 from service.queue.rq_queue import RqQueue

@@ -11,7 +11,7 @@ import pytest
 
 from service.index.rebuild import differences
 from service.model import names
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.status import status
 from service.store.manifests import ShardManifest

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.model.domain import State
+from service.model.states import State
 from tests.fakes import request as wanted
 from tests.system.conftest import System, alive
 

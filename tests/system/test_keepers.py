@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from service.index.rebuild import differences
-from service.model.domain import State
 from service.model.keeper_shards import shard_of
+from service.model.states import State
 from service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.house import House

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from service.model.clock import timestamp
-from service.model.domain import Lane, State
+from service.model.states import Lane, State
 from service.pipeline import job_actions
 from tests.fakes import request
 from tests.system.conftest import System

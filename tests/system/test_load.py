@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service.model.domain import State
+from service.model.states import State
 from tests.fakes import request
 from tests.system.conftest import System
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from service.index.rebuild import differences
-from service.model.domain import JobOptions, State
+from service.model.domain import JobOptions
+from service.model.states import State
 from service.store.network_file import to_bytes
 from service.store.shards import read_shard
 from tests.networks import LEARNED, random_network

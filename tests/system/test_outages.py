@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from service.index.rebuild import differences
-from service.model.domain import State
+from service.model.states import State
 from tests.fakes import request
 from tests.servers import PostgresServer, S3Server
 from tests.system.conftest import System

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from service.index.rebuild import differences
-from service.model.domain import AssetKind, JobRequest, Stage, State
+from service.model.domain import JobRequest
+from service.model.states import AssetKind, Stage, State
 from service.store.shards import read_shard
 from tests.system.conftest import System
 from worker.certified import certified_grasps

@@ -13,7 +13,7 @@ import pytest
 from redis import Redis
 from redis.exceptions import AuthenticationError
 
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.queue.address import redis_url

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.domain import JobOptions, resolve_fidelity
+from service.model.domain import JobOptions
 from service.model.errors import InputError, MeshError, TaskCancelled
+from service.model.fidelity import resolve_fidelity
 from worker import together
 from worker.certified import Certified, certified_grasps
 from worker.engines.joins import batches_at_once, fitting, parse_join

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.dataset_records import DatasetRecord, Snapshot, job_of
-from service.model.domain import AssetKind
 from service.model.errors import InputError, NotFoundError
 from service.model.planning import plan
+from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from service.readers import Shards, open_shards
 from service.store.assets import builtin_asset, builtin_files, builtin_names

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from service.model.clock import timestamp
 from service.model.diversity import CELLS, GraspType, entropy_bits, evenness
-from service.model.domain import AssetKind
 from service.model.metrics import GRASP_METRICS
+from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from worker.cards.contents import AssetFacts, Contents
 from worker.cards.directions import ELEVATION_BINS, ENOUGH, cell_counts

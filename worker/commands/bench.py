@@ -10,8 +10,8 @@ import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
 from service.model.cores import available_cores
-from service.model.domain import FIDELITIES, OFFERED, Fidelity
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from worker.engines.devices import Device
 
 app = typer.Typer()

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, load_settings, reporting_errors
-from service.model.domain import FIDELITIES, OFFERED
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES, OFFERED
 from service.model.robust import MODELS
 from service.model.scene_spec import SceneSpec, parse_scene
 from worker.engines.devices import Device

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.model.domain import AssetKind
 from service.model.errors import GraspdError, InputError
+from service.model.states import AssetKind
 from service.store.asset_options import (
     ApproachOption,
     ClosingOption,

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from service.cli import JsonFlag, emit, reporting_errors
-from service.model.domain import AssetKind
 from service.model.errors import GraspdError, InputError
+from service.model.states import AssetKind
 from service.store.asset_options import (
     AllowOpenOption,
     DensityOption,

@@ -15,8 +15,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from service.cli import JsonFlag, emit, load_settings, reporting_errors, validation_line
 from service.model.diversity import CELLS, MIN_DISTANCE_M
-from service.model.domain import FIDELITIES, JobOptions
+from service.model.domain import JobOptions
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES
 from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
 from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options

@@ -13,9 +13,9 @@ import typer
 
 from service import tracing
 from service.cli import keep_private, load_settings, log_to_stderr, reporting_errors
-from service.model.domain import Stage
 from service.model.errors import InputError, UnavailableError
 from service.model.imports import imports
+from service.model.states import Stage
 from service.settings import Settings
 
 app = typer.Typer(no_args_is_help=True)

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from service.model.domain import AssetKind
 from service.model.errors import ConflictError, InputError
+from service.model.states import AssetKind
 from service.readers.ways import scene_spec_of
 from service.store.attributes import Attribute
 from service.store.shards import Shard

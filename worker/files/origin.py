@@ -13,8 +13,8 @@ from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 from service.model.digests import digest_files, digest_variant
-from service.model.domain import AssetKind
 from service.model.errors import GraspdError, NotFoundError
+from service.model.states import AssetKind
 from service.store.assets import builtin_files, builtin_names
 from service.store.attributes import Attribute
 from service.store.library import load_asset_files

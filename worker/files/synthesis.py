@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.diversity import CELLS, GraspType, entropy_bits
-from service.model.domain import BATCH_SIZE, FIDELITIES, Fidelity, JobOptions
+from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.scene_spec import SceneSpec
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute

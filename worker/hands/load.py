@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from service.model.digests import digest_files, digest_variant
-from service.model.domain import AssetKind
 from service.model.errors import HandError, InputError, NotFoundError
+from service.model.states import AssetKind
 from service.model.transforms import compose
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack, without_common_folder
 from service.store.hand_files import files_of_hand

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.digests import digest_files, digest_variant
-from service.model.domain import AssetKind
 from service.model.errors import GraspdError, MeshError, NotFoundError
+from service.model.states import AssetKind
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.kept import kept_or_made

@@ -17,7 +17,7 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

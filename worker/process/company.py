@@ -12,7 +12,7 @@ from typing import Any
 
 from redis.exceptions import RedisError, ResponseError
 
-from service.model.domain import TaskMessage
+from service.model.messages import TaskMessage
 from service.queue.port import Event, EventKind, Events
 from service.queue.rq_queue import WORKERS
 from service.queue.taking import message_of, take_alike

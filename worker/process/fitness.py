@@ -19,8 +19,9 @@ from collections.abc import Callable, Collection
 from typing import Final, Protocol
 
 from service import user_cache
-from service.model.domain import IngestMessage, Stage
 from service.model.errors import DamagedError, InputError, TaskRefused, UnavailableError
+from service.model.messages import IngestMessage
+from service.model.states import Stage
 from service.queue.port import Message
 from service.store.manifests import shard_exists
 from service.store.store import Store

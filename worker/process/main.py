@@ -24,8 +24,9 @@ from rq.timeouts import BaseDeathPenalty
 
 from service.model.ability import own_ability
 from service.model.clock import timestamp
-from service.model.domain import BATCH_SIZE, Stage
+from service.model.domain import BATCH_SIZE
 from service.model.errors import QueueUnavailable
+from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.queue.address import redis_url

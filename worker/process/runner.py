@@ -16,9 +16,10 @@ from service import logs, tracing
 from service.model import names
 from service.model.ability import need_of, own_ability
 from service.model.clock import timestamp
-from service.model.domain import IngestMessage, Origin, Stage, TaskMessage
 from service.model.errors import DamagedError, DamagedShard, InputError, TaskCancelled, TaskRefused, UnavailableError
+from service.model.messages import IngestMessage, Origin, TaskMessage
 from service.model.records import AttemptRecord
+from service.model.states import Stage
 from service.queue.port import Event, EventKind, Message
 from service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from service.store.packs import find_manifest

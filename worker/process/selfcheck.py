@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from service.model.domain import JobRequest, Stage
+from service.model.domain import JobRequest
 from service.model.errors import GraspdError
 from service.model.imports import imports
+from service.model.states import Stage
 
 if TYPE_CHECKING:
     from worker.objects.model import ObjectModel

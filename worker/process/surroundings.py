@@ -6,8 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from service.model.domain import Stage
 from service.model.errors import QueueUnavailable
+from service.model.states import Stage
 from service.queue.port import READS_PACKS, Events, Presence, Report
 from service.settings import Settings
 from service.store.store import Store

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from service.model.digests import digest_files
-from service.model.domain import AssetKind
 from service.model.errors import InputError
+from service.model.states import AssetKind
 from worker.hands.collisions import resting_neighbours
 from worker.hands.load import body_model, files_from_path, main_file
 from worker.hands.model import Floats, HandModel

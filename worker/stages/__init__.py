@@ -6,7 +6,8 @@ from collections.abc import Hashable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from service.model.domain import Stage, TaskMessage
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 
 if TYPE_CHECKING:
     from worker.stages.context import TaskContext

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Hashable
 
-from service.model.domain import Stage, TaskMessage
 from service.model.errors import InputError
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from worker.planners import method
 
 

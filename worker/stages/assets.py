@@ -11,8 +11,9 @@ from typing import TypeVar, cast
 from cachetools import LRUCache
 
 from service.model import names
-from service.model.domain import AssetKind, TaskMessage
 from service.model.errors import MeshError
+from service.model.messages import TaskMessage
+from service.model.states import AssetKind
 from service.store.attributes import Attribute
 from service.store.library import load_asset_files
 from service.store.network_check import network_bytes

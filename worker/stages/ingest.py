@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.model import names
-from service.model.domain import AssetKind, IngestMessage
+from service.model.messages import IngestMessage
+from service.model.states import AssetKind
 from service.store.assets import pack, unpack
 from service.store.library import UNPACKED_LIMIT_BYTES, load_asset, load_asset_files
 from service.store.network_check import check_network

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from service.model.domain import Stage, TaskMessage
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from service.store.packs import find_shard
 from service.store.shards import Shard
 from worker.stages.context import TaskContext

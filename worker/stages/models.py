@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from service.model import names
-from service.model.domain import AssetKind, Fidelity
+from service.model.fidelity import Fidelity
+from service.model.states import AssetKind
 from service.store.assets import builtin_files, builtin_names
 from service.store.store import Store
 from worker.hands.load import load_hand

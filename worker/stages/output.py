@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.model.clock import timestamp
 from service.model.digests import digest_json
-from service.model.domain import TaskMessage
+from service.model.messages import TaskMessage
 from service.model.names import SHARD_KINDS
 from service.model.version import PACKAGE_VERSION
 from service.store.attributes import Attribute

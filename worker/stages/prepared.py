@@ -6,8 +6,8 @@ import zipfile
 
 from service.model import names
 from service.model.digests import digest_json
-from service.model.domain import AssetKind
 from service.model.errors import NotFoundError
+from service.model.states import AssetKind
 from service.model.version import STAGE_REVISIONS
 from service.store.library import load_asset_files
 from service.store.store import Store

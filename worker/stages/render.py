@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.model.domain import Stage, TaskMessage
+from service.model.messages import TaskMessage
 from service.model.scene_kinds import supports_in
+from service.model.states import Stage
 from service.model.transforms import compose
 from service.store import standing
 from service.store.attributes import Attribute

@@ -7,8 +7,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Stage, TaskMessage
 from service.model.errors import MeshError, SceneError
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute
 from worker.grasps import Posture

@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Stage, TaskMessage
 from service.model.errors import InputError, SceneError
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from service.store.attributes import Attribute
 from worker.certified import Certified, certified_grasps
 from worker.files.base_attributes import base_attributes

@@ -12,7 +12,7 @@ from typing import Any, Final
 import warp as wp
 
 from service.model.cores import available_cores
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from service.model.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from PIL import Image
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.transforms import apply
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses

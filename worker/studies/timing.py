@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from warp._src import context
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair

@@ -8,7 +8,7 @@ from typing import Final
 
 from service.index.dataset_views import CellView, DatasetView
 from service.index.views import MatrixCell
-from service.model.domain import State
+from service.model.states import State
 
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10

@@ -13,7 +13,7 @@ from service.index.changes.rows import clean
 from service.index.changes.states import settle
 from service.index.database import Database, chunks
 from service.index.tables import assets, jobs, tasks, workers
-from service.model.domain import State
+from service.model.states import State
 from service.model.worker_beat import WorkerBeat
 
 _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))

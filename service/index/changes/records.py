@@ -15,8 +15,9 @@ from service.index.changes.rows import asset_row, attempt_row, clean, grasp_rows
 from service.index.changes.states import settle, settle_batches
 from service.index.database import Database, chunks
 from service.index.tables import assets, attempts, grasps, jobs, shards, tasks
-from service.model.domain import Asset, State
+from service.model.domain import Asset
 from service.model.records import AttemptRecord, JobEvent, JobRecord
+from service.model.states import State
 from service.store.manifests import ShardManifest
 from service.store.parts import preference
 

@@ -11,8 +11,8 @@ from service.index.database import Database, chunks
 from service.index.dataset_tables import dataset_cells, dataset_snapshots, datasets, object_sets
 from service.index.tables import assets, attempts, grasps, jobs, shards, spent, tasks
 from service.index.views import AssetView
-from service.model.domain import AssetKind, Lane, State
 from service.model.errors import NotFoundError
+from service.model.states import AssetKind, Lane, State
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from service.model.domain import Asset, JobOptions, State
+from service.model.domain import Asset, JobOptions
 from service.model.planning import plan, stages_of
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import State
 from service.store.manifests import ShardManifest
 
 Row = dict[str, Any]

@@ -12,9 +12,9 @@ from sqlalchemy import ColumnElement, Connection, exists, func, select, tuple_, 
 from service.index.database import chunks
 from service.index.outgoing import note_ends
 from service.index.tables import attempts, jobs, tasks
-from service.model.domain import State
 from service.model.errors import SceneError
 from service.model.planning import TaskFacts, batch_ready, batch_states, job_state
+from service.model.states import State
 
 #: Jobs whose states are derived in one go.
 _JOBS_AT_ONCE: Final = 200

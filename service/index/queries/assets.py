@@ -13,9 +13,9 @@ from service.index.queries import cursors
 from service.index.reach import nearest_asset, seen_assets
 from service.index.tables import assets
 from service.index.views import AssetView, Page
-from service.model.domain import AssetKind
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import AssetKind
 
 
 @dataclass(frozen=True)

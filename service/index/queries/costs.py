@@ -10,9 +10,10 @@ from sqlalchemy import select
 from service.index.database import Database
 from service.index.reach import seen_shards
 from service.index.tables import shards
-from service.model.domain import JobRequest, Stage
+from service.model.domain import JobRequest
 from service.model.names import SHARD_KINDS
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import Stage
 
 #: Batches looked at of each stage, the newest first: what a machine did long ago says less.
 _NEWEST: Final = 2000

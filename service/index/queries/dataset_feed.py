@@ -11,8 +11,9 @@ from service.index.database import Database
 from service.index.dataset_tables import dataset_cells, datasets
 from service.index.tables import jobs
 from service.model.dataset_records import Cell, Member
-from service.model.domain import JobOptions, State
+from service.model.domain import JobOptions
 from service.model.records import Choice
+from service.model.states import State
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ from service.index.reach import seen_datasets
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import Page
 from service.model.dataset_records import SnapshotShard
-from service.model.domain import BATCH_SIZE, JobOptions, Stage, State
+from service.model.domain import BATCH_SIZE, JobOptions
 from service.model.errors import NotFoundError
 from service.model.planning import job_state, stages_of
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import Stage, State
 
 _SHARE: Final[ColumnElement[float]] = case(
     (tasks.c.state == State.SUCCEEDED.value, 1.0),

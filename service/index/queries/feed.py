@@ -11,10 +11,10 @@ from sqlalchemy import Column, ColumnElement, exists, or_, select
 
 from service.index.database import Database, chunks
 from service.index.tables import assets, jobs, tasks
-from service.model.domain import AssetKind, Lane, Stage, State
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards
 from service.model.planning import MAX_BACKOFF_S, PlannedTask
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, Stage, State
 from service.model.turns import Turns, WaitingJob, interleave, share_of
 
 

@@ -23,7 +23,7 @@ from service.index.filters import GraspFilter, GraspSort
 from service.index.queries.grasp_where import truth
 from service.index.tables import grasps, jobs, shards, tasks
 from service.index.tag_tables import tagged
-from service.model.domain import Stage
+from service.model.states import Stage
 from service.model.where import Node, parsed
 
 #: So many rows are fetched by an index and sorted in less time than all of a million are read.

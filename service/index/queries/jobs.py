@@ -14,9 +14,9 @@ from service.index.queries import cursors
 from service.index.reach import seen_jobs, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks
 from service.index.views import AttemptView, JobView, Page, StageProgress, TaskView
-from service.model.domain import Stage, State
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import Stage, State
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from service.index.queries import cursors
 from service.index.reach import seen_attempts, seen_jobs, seen_shards, seen_tasks
 from service.index.tables import attempts, jobs, shards, tasks, workers
 from service.index.views import FailureGroup, MatrixCell, Stats, Throughput, WorkerView
-from service.model.domain import State
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import State
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from service.model import names
 from service.model.clock import timestamp
 from service.model.dataset_records import DatasetRecord, Member, ObjectSet, Snapshot, object_set_of
 from service.model.digests import digest_json
-from service.model.domain import AssetKind, JobOptions, State
+from service.model.domain import JobOptions
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
 from service.model.projects import EVERYTHING, Reach
 from service.model.scene_options import NamedNeighbour, SceneDocument
+from service.model.states import AssetKind, State
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.spec import MAX_CELLS, DatasetRequest, Matrix, describe
 from service.pipeline.fidelity_choice import Resolver

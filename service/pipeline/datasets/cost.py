@@ -20,10 +20,11 @@ from typing import Final
 from service.index.index import Index
 from service.index.queries.costs import BatchCost
 from service.model.dataset_records import request_of
-from service.model.domain import BATCH_SIZE, AssetKind, JobOptions, JobRequest, Stage
+from service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from service.model.errors import LimitError
 from service.model.planning import stages_of
 from service.model.projects import EVERYTHING, Reach
+from service.model.states import AssetKind, Stage
 from service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
 from service.pipeline.datasets.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate
 from service.pipeline.datasets.spec import MAX_CELLS, Matrix

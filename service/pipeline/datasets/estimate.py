@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.index.views import View
-from service.model.domain import Stage
+from service.model.states import Stage
 
 
 class WorkersPlan(View):

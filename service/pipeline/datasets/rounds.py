@@ -13,8 +13,8 @@ from typing import Final
 
 from service.index.queries.dataset_feed import DatasetWork
 from service.model.dataset_records import job_of
-from service.model.domain import State
 from service.model.errors import ConflictError
+from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.store.records import job_events

@@ -10,7 +10,8 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from service.model.clock import timestamp
 from service.model.dataset_records import DatasetRecord, Member, request_of
 from service.model.digests import digest_json, job_id
-from service.model.domain import AUTO, JobOptions, JobRequest, Name
+from service.model.domain import JobOptions, JobRequest, Name
+from service.model.fidelity import AUTO
 from service.model.records import Choice
 from service.model.version import STAGE_REVISIONS
 

@@ -10,9 +10,9 @@ from collections import Counter
 from contextlib import closing
 from typing import Any, Final
 
-from service.model.domain import Stage
 from service.model.errors import QueueUnavailable
 from service.model.finding import Finding, bad, good, skipped, warning
+from service.model.states import Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.sharing import PART

@@ -13,8 +13,8 @@ from api.app import create_app
 from service.index.index import Index
 from service.index.rebuild import rebuild
 from service.model import names
-from service.model.domain import AssetKind, State
 from service.model.records import JobRecord
+from service.model.states import AssetKind, State
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.settings import Settings

@@ -22,10 +22,10 @@ from api.app import create_app
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
 from service.model import names
-from service.model.domain import AssetKind
 from service.model.errors import InputError
 from service.model.planning import plan
 from service.model.records import JobRecord
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.settings import Settings

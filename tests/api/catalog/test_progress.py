@@ -12,7 +12,8 @@ from api.client.watching import JobDisplay
 from api.formatting import duration, metric, percent, size
 from api.models import Job
 from service.index.views import JobView, StageProgress, TaskView
-from service.model.domain import JobRequest, Lane, Stage, State
+from service.model.domain import JobRequest
+from service.model.states import Lane, Stage, State
 
 
 class Clock:

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from api.client import add_sets
 from api.client.add_commands import add_object
 from api.client.client import Client
-from service.model.domain import AssetKind
 from service.model.errors import InputError
+from service.model.states import AssetKind
 from service.store.asset_options import sizes_of
 from service.store.assets import pack
 from service.store.object_sets import files_of_set

@@ -10,7 +10,6 @@ import pytest
 
 from api.client.client import Client, events_of
 from api.models import Job, Shard
-from service.model.domain import AssetKind, Stage, State
 from service.model.errors import (
     ConflictError,
     GraspdError,
@@ -20,6 +19,7 @@ from service.model.errors import (
     QuotaError,
     UnavailableError,
 )
+from service.model.states import AssetKind, Stage, State
 
 Handler = Callable[[httpx.Request], httpx.Response]
 

@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 from api.client.reports import job_summary
 from api.models import JobDetail, MeanMetrics
 from graspd.cli import build
-from service.model.domain import AssetKind, JobRequest, State
+from service.model.domain import JobRequest
+from service.model.states import AssetKind, State
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from service.store.library import load_asset_files

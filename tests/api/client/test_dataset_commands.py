@@ -8,7 +8,7 @@ import pytest
 
 from api.client.client import Client
 from api.client.datasets import DatasetClient
-from service.model.domain import State
+from service.model.states import State
 from service.run.supervisor import Supervisor
 from tests import waiting
 from tests.api.client.test_commands import Shell, graspd, said, service

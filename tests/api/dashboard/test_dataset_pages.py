@@ -7,7 +7,7 @@ from starlette.testclient import TestClient
 
 from api.dashboard.figures.matrix import of_service
 from service.index.views import MatrixCell
-from service.model.domain import State
+from service.model.states import State
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.rounds import DatasetRounds

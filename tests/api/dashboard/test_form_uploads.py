@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from api.dashboard import form_uploads
 from service.index.views import AssetView
 from service.model import names
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.store.library import load_asset, load_asset_files
 from tests.api.dashboard.test_pages import FORM

@@ -13,9 +13,9 @@ from service.index.damage import Damage
 from service.index.database import Database
 from service.index.queries.jobs import Jobs
 from service.index.queries.overview import Overview
-from service.model.domain import State
 from service.model.errors import IndexUnavailable, QueueUnavailable
 from service.model.planning import plan
+from service.model.states import State
 from service.pipeline.backends import Parts
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.memory_queue import MemoryQueue

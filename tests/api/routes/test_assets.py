@@ -9,8 +9,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.uploads import files_of_upload, name_of_upload
-from service.model.domain import AssetKind
 from service.model.errors import InputError, LimitError
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.asset_summary import summary

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from service.model import names
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.assets import builtin_files

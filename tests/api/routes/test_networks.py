@@ -12,9 +12,9 @@ from starlette.testclient import TestClient
 
 from api.uploads import files_of_upload
 from service.model import names
-from service.model.domain import AssetKind
 from service.model.errors import LimitError
 from service.model.records import JobRecord
+from service.model.states import AssetKind
 from service.pipeline.backends import Parts
 from service.store import network_file
 from service.store.library import load_asset_files

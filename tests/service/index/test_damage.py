@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 from service.index.index import Index
 from service.index.rebuild import differences, rebuild
 from service.model import names
-from service.model.domain import AssetKind, State
 from service.model.errors import IndexUnavailable
 from service.model.planning import plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import AssetKind, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper

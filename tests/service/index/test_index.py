@@ -23,10 +23,11 @@ from service.index.tables import metadata
 from service.index.views import GraspView
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, Lane, Origin, Stage, State
 from service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
+from service.model.messages import Origin
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import AssetKind, Lane, Stage, State
 from service.model.turns import Turns
 from service.model.version import STAGE_REVISIONS
 from service.pipeline import job_actions

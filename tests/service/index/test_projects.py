@@ -8,11 +8,12 @@ from service.index.rebuild import rebuild
 from service.index.views import UsageDay
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, Lane, Origin
 from service.model.keeper_shards import ALL_SHARDS, KeeperShards
+from service.model.messages import Origin
 from service.model.planning import message_of, plan
 from service.model.projects import Reach
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane
 from service.model.turns import Turns
 from service.pipeline.backends import Parts
 from service.store.records import put_record

@@ -15,9 +15,9 @@ from service.index.index import Index
 from service.index.rebuild import differences
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, Lane, State
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Lane, State
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.records import put_record

@@ -6,7 +6,8 @@ import pytest
 from pydantic import ValidationError
 
 from service.model.digests import shard_id
-from service.model.domain import JobRequest, Stage
+from service.model.domain import JobRequest
+from service.model.states import Stage
 from tests.fakes import request
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from service.model.clock import timestamp
 from service.model.digests import job_id
-from service.model.domain import JobRequest, Lane, Stage, State
+from service.model.domain import JobRequest
 from service.model.planning import (
     MAX_BACKOFF_S,
     TaskFacts,
@@ -21,6 +21,7 @@ from service.model.planning import (
     plan,
 )
 from service.model.records import JobRecord
+from service.model.states import Lane, Stage, State
 from tests.fakes import request
 
 HAND, OBJECT = "a" * 32, "b" * 32

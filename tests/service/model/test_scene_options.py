@@ -10,9 +10,10 @@ from pydantic import ValidationError
 from service.model.clock import timestamp
 from service.model.dataset_records import Member
 from service.model.digests import digest_json, job_id, shard_id
-from service.model.domain import SCENES, JobOptions, JobRequest, Lane, Stage
+from service.model.domain import SCENES, JobOptions, JobRequest
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import Lane, Stage
 from service.model.version import STAGE_REVISIONS
 from service.pipeline.datasets.spec import describe
 from tests.fakes import request

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from service.model.domain import AssetKind
 from service.model.errors import ConflictError
+from service.model.states import AssetKind
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions

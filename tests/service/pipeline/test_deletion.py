@@ -10,8 +10,8 @@ import pytest
 from service.index.changes.removals import Removals
 from service.index.rebuild import differences
 from service.model import names
-from service.model.domain import AssetKind, State
 from service.model.errors import ConflictError, NotFoundError
+from service.model.states import AssetKind, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions

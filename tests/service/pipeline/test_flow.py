@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.model.ability import own_ability
 from service.model.clock import timestamp
-from service.model.domain import Lane, Stage, State
+from service.model.states import Lane, Stage, State
 from service.model.worker_beat import WorkerBeat
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts

@@ -6,8 +6,8 @@ import pytest
 
 from service.index.rebuild import differences
 from service.model import names
-from service.model.domain import AssetKind, Lane, State
 from service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable
+from service.model.states import AssetKind, Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.store.library import publish_asset

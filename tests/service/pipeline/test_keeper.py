@@ -12,8 +12,9 @@ from service.index.index import Index
 from service.index.rebuild import differences
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, IngestMessage, Stage, State, TaskMessage
 from service.model.errors import QueueUnavailable, StoreUnavailable
+from service.model.messages import IngestMessage, TaskMessage
+from service.model.states import AssetKind, Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper

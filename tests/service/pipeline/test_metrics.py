@@ -15,7 +15,8 @@ from api.metrics import Metrics, Snapshot
 from service.index import at_scrape
 from service.index.damage import Damage
 from service.index.index import Index
-from service.model.domain import Lane, Stage, State, TaskMessage
+from service.model.messages import TaskMessage
+from service.model.states import Lane, Stage, State
 from service.pipeline.backends import Parts
 from service.pipeline.job_actions import submit
 from service.pipeline.series import SERIES

@@ -11,10 +11,11 @@ from pydantic import ValidationError
 from service.index.filters import GraspFilter
 from service.index.rebuild import differences
 from service.model import names
-from service.model.domain import AssetKind, Stage, TaskMessage
 from service.model.errors import ConflictError, InputError, NotFoundError, SceneError
+from service.model.messages import TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import AssetKind, Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions

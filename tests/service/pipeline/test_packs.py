@@ -15,9 +15,9 @@ from service.index.sample import compare, draw
 from service.model import names
 from service.model.ability import need_of
 from service.model.clock import timestamp
-from service.model.domain import Stage, State
 from service.model.errors import DamagedError, InputError
 from service.model.records import JobRecord
+from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions

@@ -8,8 +8,9 @@ from dataclasses import asdict, replace
 import pytest
 
 from service.model.ability import FIRST_SCHEMA, Need, own_ability
-from service.model.domain import JobRequest, Lane, Stage
+from service.model.domain import JobRequest
 from service.model.planning import needed_schema
+from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.routes import Place, Routes
 from service.queue import entries

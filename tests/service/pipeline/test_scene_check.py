@@ -8,8 +8,8 @@ import pytest
 
 from service.index.views import AssetView
 from service.model import names
-from service.model.domain import AssetKind
 from service.model.errors import SceneError
+from service.model.states import AssetKind
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.scene_check import check_scene

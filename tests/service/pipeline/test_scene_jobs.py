@@ -7,9 +7,9 @@ import pytest
 from service.index.filters import GraspFilter, GraspSort
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import Stage, State
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.store.records import put_record, read_record

@@ -10,8 +10,8 @@ import pytest
 
 from service.index.rebuild import differences
 from service.model import names
-from service.model.domain import State
 from service.model.errors import DamagedShard
+from service.model.states import State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper

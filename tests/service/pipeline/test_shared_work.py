@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from service.index.rebuild import differences
-from service.model.domain import Lane, State
 from service.model.errors import IndexUnavailable
 from service.model.keeper_shards import KeeperShards, shard_of
+from service.model.states import Lane, State
 from service.model.turns import Turns
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts

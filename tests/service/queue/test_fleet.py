@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.model.clock import timestamp
-from service.model.domain import Lane, Stage
+from service.model.states import Lane, Stage
 from service.queue.lists import queue_name
 from service.queue.port import Event, EventKind, Report
 from service.queue.rates import beat_every_s, report_every_s

@@ -15,8 +15,8 @@ from rq.serializers import JSONSerializer
 from api.metrics import Metrics, Snapshot
 from service.index.index import Index
 from service.model.clock import timestamp
-from service.model.domain import Stage, State
 from service.model.errors import UnavailableError
+from service.model.states import Stage, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper

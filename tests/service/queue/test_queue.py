@@ -11,8 +11,9 @@ from rq import SimpleWorker
 from rq.executions import prepare_execution
 
 from service.model.clock import timestamp
-from service.model.domain import IngestMessage, Lane, Stage, TaskMessage
 from service.model.keeper_shards import KeeperShards
+from service.model.messages import IngestMessage, TaskMessage
+from service.model.states import Lane, Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.allowed import AllowedJob, AllowedQueue
 from service.queue.lists import queue_names

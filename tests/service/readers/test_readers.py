@@ -158,7 +158,7 @@ def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> 
 
 
 def test_a_full_cache_drops_what_was_unused_longest(parts: Parts, tmp_path: Path) -> None:
-    from service.model.domain import Stage
+    from service.model.states import Stage
 
     data = [bytes([number]) * 1000 for number in range(3)]
     keys = [shard_file(Stage.SYNTHESIZE, f"{number:032x}") for number in range(3)]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from service.model.domain import Stage
 from service.model.errors import DamagedShard
+from service.model.states import Stage
 from service.store.integrity import Checked, read_checked
 from service.store.manifests import ShardManifest, load_shard
 from service.store.shards import read_shard

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from service.model import names
-from service.model.domain import Stage
 from service.model.errors import DamagedError, DamagedShard, InputError
+from service.model.states import Stage
 from service.store import packs
 from service.store.integrity import Checked, read_checked
 from service.store.manifests import publish_shard

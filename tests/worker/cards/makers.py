@@ -14,9 +14,9 @@ from service.index.index import Index
 from service.model import names
 from service.model.clock import timestamp
 from service.model.dataset_records import Snapshot
-from service.model.domain import Stage
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import Stage
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.rounds import DatasetRounds

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.model.diversity import BANDS, SECTORS, evenness
-from service.model.domain import Stage
+from service.model.states import Stage
 from service.model.transforms import quat_from_axis_angle
 from service.readers import Grasps
 from service.store.manifests import load_manifest

@@ -8,7 +8,7 @@ import logging
 import numpy as np
 import pytest
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.engines import cuda_errors
 from worker.engines.cuda_errors import DeviceLost, check_device, is_out_of_memory
 from worker.hands.load import hand_from_path

@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 from typing import Final
 
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.store.assets import builtin_files
 from tests.worker.hands.grippers import gripper_urdf
 from tests.worker.hands.mjcfs import FOUR_BAR

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.model.transforms import IDENTITY_POSE, compose, invert
 from service.store.assets import builtin_asset, builtin_files, builtin_names
 from worker.hands.builtins import HANDS, files_of

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.store.assets import builtin_names
 from service.store.hand_corrections import HandCorrections, corrected, facts_of
 from tests.worker.hands.grippers import gripper

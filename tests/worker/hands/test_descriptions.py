@@ -12,8 +12,8 @@ import pytest
 
 from api.client.hand_files import upload_of
 from api.uploads import files_of_upload
-from service.model.domain import AssetKind
 from service.model.errors import HandError
+from service.model.states import AssetKind
 from tests.worker.hands.urdfs import joint, link, robot
 from worker.commands.hands import report_hand
 from worker.hands.check import check_hand

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.model.domain import AssetKind
 from service.model.errors import InputError
+from service.model.states import AssetKind
 from service.store.assets import builtin_files
 from worker.hands.load import load_hand
 

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.store.store import open_store
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.urdfs import joint, link, robot

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from api.uploads import files_of_upload
-from service.model.domain import AssetKind
 from service.model.errors import HandError, InputError
+from service.model.states import AssetKind
 from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
 from worker.hands.load import hand_from_path

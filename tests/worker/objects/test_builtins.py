@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.store.assets import builtin_files, builtin_names
 from worker.objects.builtin import OBJECTS, files_of
 from worker.objects.check import check_object

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.domain import resolve_fidelity
+from service.model.fidelity import resolve_fidelity
 from service.model.transforms import apply, quat_from_matrix, quat_rotate
 from tests.worker.simulation.rigs import ball
 from worker.grasps import Posture

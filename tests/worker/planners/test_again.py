@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd import planner

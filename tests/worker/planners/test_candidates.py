@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.domain import resolve_fidelity
+from service.model.fidelity import resolve_fidelity
 from service.model.scene_spec import SceneSpec
 from tests.worker.models import two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture

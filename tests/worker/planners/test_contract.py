@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from service.model.domain import FIDELITIES
 from service.model.errors import TaskCancelled
+from service.model.fidelity import FIDELITIES
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from service.model.domain import FIDELITIES, Fidelity
 from service.model.errors import InputError, TaskCancelled
+from service.model.fidelity import FIDELITIES, Fidelity
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

@@ -14,7 +14,7 @@ from typing import Any
 import trimesh
 
 from service.model.digests import digest_bytes
-from service.model.domain import FIDELITIES, Fidelity
+from service.model.fidelity import FIDELITIES, Fidelity
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import load_object
 from worker.planners import PLANNERS, method, synthesize

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.domain import resolve_fidelity
 from service.model.errors import InputError, MeshError, TaskCancelled
+from service.model.fidelity import resolve_fidelity
 from service.model.scene_spec import SceneSpec
 from worker.grasps import GraspSet
 from worker.hands.load import hand_from_path

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import graspd
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.transforms import quat_rotate
 from tests.worker.simulation.rigs import object_of
 from worker.hands.kinematics import body_poses

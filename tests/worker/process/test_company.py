@@ -13,9 +13,10 @@ import pytest
 from rq.serializers import JSONSerializer
 
 from service.model.clock import timestamp
-from service.model.domain import Lane, Stage, TaskMessage
+from service.model.messages import TaskMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
+from service.model.states import Lane, Stage
 from service.queue.allowed import TASK_FUNCTION, AllowedJob
 from service.queue.lists import queue_name
 from service.queue.port import READS_PACKS, EventKind

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from service.model.domain import Lane, Stage, TaskMessage
+from service.model.messages import TaskMessage
+from service.model.states import Lane, Stage
 from service.queue.port import Event, EventKind
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from service.model.domain import Stage, TaskMessage
 from service.model.errors import DamagedError, MeshError
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from service.queue.port import Event, EventKind
 from service.store.records import task_attempts
 from service.store.store import Store, open_store

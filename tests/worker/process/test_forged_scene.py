@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from service.model.domain import Lane, Stage
+from service.model.states import Lane, Stage
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from tests.fakes import message_for

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from service.model.clock import timestamp
-from service.model.domain import Stage
+from service.model.states import Stage
 from service.model.worker_beat import WorkerBeat
 from service.queue.port import EventKind
 from service.queue.rq_queue import RqQueue, worker_key

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from service.model import names
-from service.model.domain import Stage, TaskMessage
 from service.model.errors import InputError, MeshError, QueueUnavailable, StoreUnavailable, TaskRefused
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from service.queue.port import Event, EventKind
 from service.store.manifests import load_manifest
 from service.store.records import task_attempts

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from service.model.domain import Stage
+from service.model.states import Stage
 from worker import certified
 from worker.process.selfcheck import EngineError, check_engine
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.model.domain import Stage
+from service.model.states import Stage
 from service.settings import Settings
 from service.store.store import open_store
 from tests.worker.pool import works

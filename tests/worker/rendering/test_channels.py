@@ -9,8 +9,9 @@ import pytest
 import trimesh
 
 from service.model.digests import shard_id
-from service.model.domain import JobRequest, Stage
+from service.model.domain import JobRequest
 from service.model.errors import InputError
+from service.model.states import Stage
 from service.store.shards import check_columns
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.objects.model import ObjectModel

@@ -11,8 +11,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.domain import resolve_fidelity
 from service.model.errors import InputError
+from service.model.fidelity import resolve_fidelity
 from service.model.scene_spec import SceneSpec
 from service.store.shards import read_shard
 from tests.worker.models import object_from_mesh

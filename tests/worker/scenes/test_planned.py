@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.domain import resolve_fidelity
+from service.model.fidelity import resolve_fidelity
 from service.model.scene_spec import SceneSpec
 from service.store.shards import read_shard
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted

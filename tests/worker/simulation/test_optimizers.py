@@ -6,8 +6,8 @@ from typing import get_args
 
 import pytest
 
-from service.model.domain import Fidelity
 from service.model.errors import InputError
+from service.model.fidelity import Fidelity
 from tests.worker.simulation.rigs import ball, rig
 from worker.hands.load import hand_from_path
 from worker.simulation.model import LossOptions

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from tests.worker.models import object_from_mesh, two_finger_hand
 from worker.planners import Wanted
 from worker.planners.fast_graspd import planner

@@ -18,8 +18,9 @@ import pytest
 
 from api.uploads import files_of_upload
 from service.model import names
-from service.model.domain import AssetKind, IngestMessage, Stage
 from service.model.errors import InputError
+from service.model.messages import IngestMessage
+from service.model.states import AssetKind, Stage
 from service.model.version import TASK_SCHEMA
 from service.queue.port import EventKind
 from service.store.library import publish_asset

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from service.model import names
-from service.model.domain import AssetKind, IngestMessage
 from service.model.errors import InputError, TaskCancelled
+from service.model.messages import IngestMessage
+from service.model.states import AssetKind
 from service.store.library import publish_asset, record_asset, store_files
 from service.store.store import Store, open_store
 from tests.worker.hands.grippers import gripper_urdf

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from service.model import names
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.model.transforms import IDENTITY_POSE, apply
 from service.store.assets import builtin_files, builtin_model, builtin_names
 from service.store.store import open_store

@@ -13,11 +13,13 @@ import pytest
 from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import digest_bytes, job_id
-from service.model.domain import Asset, AssetKind, IngestMessage, JobOptions, JobRequest, Lane, Stage
+from service.model.domain import Asset, JobOptions, JobRequest
+from service.model.messages import IngestMessage
 from service.model.planning import message_of, plan
 from service.model.records import JobRecord
 from service.model.scene_kinds import has_table
 from service.model.scene_options import scene_of
+from service.model.states import AssetKind, Lane, Stage
 from service.queue.port import EventKind
 from service.store.assets import builtin_files, pack
 from service.store.library import load_check, publish_asset

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from service.model.domain import Stage, TaskMessage
+from service.model.messages import TaskMessage
+from service.model.states import Stage
 from tests.fakes import request
 from worker.stages.output import batch_seed
 

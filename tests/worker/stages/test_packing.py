@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from service.model import names
-from service.model.domain import TaskMessage
 from service.model.errors import StoreUnavailable
+from service.model.messages import TaskMessage
 from service.store.packs import pack_at
 from service.store.store import Store, open_store
 from tests.packing import batches, made_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.model.digests import digest_files
-from service.model.domain import AssetKind
+from service.model.states import AssetKind
 from service.store.library import publish_asset
 from service.store.store import Store, open_store
 from tests.worker.objects.shapes import box, join, sphere, stl

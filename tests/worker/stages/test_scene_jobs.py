@@ -14,11 +14,12 @@ import pytest
 from service.model import names
 from service.model.clock import timestamp
 from service.model.digests import job_id
-from service.model.domain import AssetKind, JobRequest, Lane, Stage
+from service.model.domain import JobRequest
 from service.model.errors import TaskRefused
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.scene_kinds import supports_in
+from service.model.states import AssetKind, Lane, Stage
 from service.queue.port import EventKind
 from service.readers import Grasps, Pictures, open_shards
 from service.store.assets import builtin_files

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from worker.commands.bench import app
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.store.store import open_store
 from service.store.study_records import latest
 from worker.commands.chart import app

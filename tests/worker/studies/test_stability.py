@@ -13,8 +13,9 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from service.model.domain import FIDELITIES, JobRequest
+from service.model.domain import JobRequest
 from service.model.errors import MeshError
+from service.model.fidelity import FIDELITIES
 from service.model.stability import MapCell, Stability, StabilityMap, from_json, graded
 from service.store.store import open_store
 from service.store.study_records import latest

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from service.model.digests import digest_files, digest_json
-from service.model.domain import AssetKind, JobRequest
+from service.model.domain import JobRequest
 from service.model.errors import InputError
 from service.model.scene_spec import SceneSpec
+from service.model.states import AssetKind
 from service.store.attributes import Attribute
 from service.store.shards import json_attribute, write_shard
 from worker.certified import scored

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
 from service.model.errors import InputError, TaskCancelled
+from service.model.fidelity import Fidelity
 from worker.grasps import GraspSet
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.scene_starts import free_ways

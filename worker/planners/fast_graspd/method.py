@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.planners.fast_graspd.planner import plan, plan_joined
 from worker.planners.port import Method
 

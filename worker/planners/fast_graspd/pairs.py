@@ -8,7 +8,7 @@ from typing import Final
 
 from cachetools import LRUCache
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.surface import sample_surface
 from worker.objects.model import ObjectModel

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.simulation.model import LossOptions
 from worker.simulation.state import Schedule
 

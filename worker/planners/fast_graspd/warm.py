@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Placed

@@ -7,8 +7,8 @@ from typing import Final
 
 from pydantic import Field
 
-from service.model.domain import Fidelity
 from service.model.errors import InputError
+from service.model.fidelity import Fidelity
 from service.model.labels import Digest
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
 from service.model.errors import SceneError
+from service.model.fidelity import Fidelity
 from service.model.scene_kinds import UPRIGHT
 from service.model.transforms import compose, invert, quat_conjugate, quat_rotate
 from worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts

@@ -9,7 +9,7 @@ from typing import Any, Final
 import warp as wp
 
 from service.model.clock import timestamp
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.model.version import PACKAGE_VERSION
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from service.model.domain import FIDELITIES
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES
 from worker.planners import method, planner
 from worker.run import Run
 from worker.studies.chart.trials import Setting

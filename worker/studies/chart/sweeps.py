@@ -14,8 +14,8 @@ from typing import Any, Final
 
 import warp as wp
 
-from service.model.domain import FIDELITIES, Fidelity
 from service.model.errors import InputError
+from service.model.fidelity import FIDELITIES, Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import Fidelity
+from service.model.fidelity import Fidelity
 from worker.grasps import GraspSet, Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

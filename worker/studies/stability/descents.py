@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import FIDELITIES, Fidelity
+from service.model.fidelity import FIDELITIES, Fidelity
 from service.model.stability import MapCell, StabilityMap, graded, reachable, short
 from service.model.transforms import quat_rotate
 from worker.hands.model import HandModel

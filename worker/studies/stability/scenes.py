@@ -8,8 +8,9 @@ from typing import Any, Final
 import numpy as np
 import trimesh
 
-from service.model.domain import FIDELITIES, JobRequest
+from service.model.domain import JobRequest
 from service.model.errors import GraspdError
+from service.model.fidelity import FIDELITIES
 from service.model.scene_spec import Box, HalfSpace, SceneSpec
 from service.model.stability import MapCell, Outcome, StabilityMap, reachable
 from service.model.transforms import quat_rotate

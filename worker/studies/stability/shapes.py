@@ -9,9 +9,11 @@ import numpy as np
 import trimesh
 
 from service.model.digests import digest_files
-from service.model.domain import FIDELITIES, AssetKind, JobRequest
+from service.model.domain import JobRequest
 from service.model.errors import GraspdError
+from service.model.fidelity import FIDELITIES
 from service.model.stability import MapCell, Outcome, StabilityMap, reachable
+from service.model.states import AssetKind
 from worker.certified import certified_grasps
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel

@@ -7,9 +7,9 @@ from typing import Any
 
 from service.model import names
 from service.model.clock import timestamp
-from service.model.domain import AssetKind, Stage
 from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
+from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
 from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest

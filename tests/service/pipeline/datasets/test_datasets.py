@@ -8,8 +8,9 @@ import pytest
 
 from service.index.rebuild import differences, rebuild
 from service.model import names
-from service.model.domain import AssetKind, JobRequest, Lane, State
+from service.model.domain import JobRequest
 from service.model.errors import ConflictError, InputError, LimitError, NotFoundError
+from service.model.states import AssetKind, Lane, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions

@@ -15,8 +15,8 @@ from service.index.database import downgrade
 from service.index.index import Index
 from service.index.rebuild import rebuild
 from service.model import names
-from service.model.domain import Stage
 from service.model.finding import Condition, Finding
+from service.model.states import Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.run.doctor import database

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from service.model.clock import timestamp
-from service.model.domain import Lane, Stage
 from service.model.finding import Condition
+from service.model.states import Lane, Stage
 from service.model.version import PACKAGE_VERSION
 from service.model.worker_beat import WorkerBeat
 from service.pipeline.sharing import PART

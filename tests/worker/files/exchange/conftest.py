@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.cli import build
-from service.model.domain import FIDELITIES
+from service.model.fidelity import FIDELITIES
 from service.store.shards import Shard, read_shard, write_shard
 from worker.engines import backend
 from worker.grasps import GraspSet

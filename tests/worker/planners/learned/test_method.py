@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.model.domain import resolve_fidelity
 from service.model.errors import InputError
+from service.model.fidelity import resolve_fidelity
 from service.model.scene_spec import SceneSpec
 from service.model.transforms import compose, quat_from_matrix, quat_rotate
 from service.store.network_file import ProposalNetwork

@@ -1,0 +1,76 @@
+"""Fidelities: how much of a grasp is modelled, and the names of what is offered."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from pydantic import Field
+
+from service.model.base import Model
+
+
+class Fidelity(Model):
+    """How much is modelled, and so what a grasp costs. Each knob is priced by `graspd chart`."""
+
+    name: str = Field("custom", max_length=64)
+    starts: int = Field(4, ge=1, le=64, description="hands that set out for each grasp; half where they are tried")
+    finalists: int = Field(2, ge=1, le=64, description="of these, hands that enter the fine phase")
+    coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
+    fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
+    object_points: int = Field(4000, ge=16, le=65536, description="object surface points tested against the links")
+    face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
+    coarse_iterations: int = Field(100, ge=0, le=100_000)
+    fine_iterations: int = Field(40, ge=0, le=100_000)
+    polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
+    patience: int = Field(
+        10, ge=0, le=100_000, description="fine iterations without improvement after which a grasp is done; 0: never"
+    )
+    velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
+    contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
+    optimizer: Literal["adam", "gd"] = "adam"
+    leak: Literal["one_sided", "two_sided"] = "one_sided"
+    dilation: Literal["fixed", "touch"] = Field(
+        "fixed", description="first dilation of the object: 10 mm, or so much that it just touches the hand"
+    )
+    simulate: bool = Field(True, description="False: hands are only drawn to the surface; a control, not a method")
+    phong_alpha: float = Field(0.5, ge=0, le=1)
+
+
+FIDELITIES: Final[dict[str, Fidelity]] = {
+    "draft": Fidelity(
+        name="draft", starts=2, finalists=1, coarse_points=200, fine_points=800, object_points=2000, face_error_m=1e-3,
+        coarse_iterations=60, fine_iterations=20, polish_iterations=6,
+    ),
+    "standard": Fidelity(name="standard"),
+    "fine": Fidelity(
+        name="fine", starts=6, finalists=3, coarse_points=400, fine_points=4000, object_points=8000, face_error_m=1e-4,
+        coarse_iterations=120, fine_iterations=60, polish_iterations=15,
+    ),
+    # As the paper writes it: plain descent with one rate, one sweep of contacts, no penetration penalty, no selection.
+    "paper": Fidelity(
+        name="paper", starts=1, finalists=1, coarse_points=2000, coarse_iterations=200, fine_iterations=0, patience=0,
+        polish_iterations=0, contact_solver="gauss_seidel", optimizer="gd", leak="two_sided", phong_alpha=0.75,
+    ),
+    "control": Fidelity(name="control", simulate=False),
+}  # fmt: skip
+
+
+#: Stands in a request for the cheapest fidelity that meets its target; a stored job has that fidelity instead.
+AUTO: Final = "auto"
+
+
+#: Fidelities offered to users; the others are for comparison.
+OFFERED: Final = ("draft", "standard", "fine")
+
+
+def resolve_fidelity(value: str | Fidelity) -> Fidelity:
+    """The knobs behind a fidelity's name.
+
+    Raises:
+        ValueError: if the name is not one of `FIDELITIES`.
+    """
+    if isinstance(value, Fidelity):
+        return value
+    if value not in FIDELITIES:
+        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give the knobs")
+    return FIDELITIES[value]

@@ -1,0 +1,68 @@
+"""What travels through the queue: tasks, and where they came from."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from service.model.base import Model
+from service.model.domain import JobRequest, check_known
+from service.model.labels import Digest, Name, Word
+from service.model.states import AssetKind, Stage
+
+
+class Origin(Model):
+    """Where a job came from, for the logs and traces of its tasks; keys share the queue evenly."""
+
+    request: str = Field("", max_length=64, description="id of the HTTP request")
+    key: str = Field("", max_length=64, description="name of the API key")
+    traceparent: str = Field("", max_length=64, description="W3C trace context")
+
+    # A newer front door may say more.
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class TaskMessage(Model):
+    """What travels through the queue: enough for a worker with the store alone to do the task."""
+
+    # `schema` is a field name in the message, an attribute of BaseModel in Python: hence the alias.
+    schema_: int = Field(alias="schema", description="oldest schema that can say this")
+    newest_schema: int = Field(0, ge=0, description="newest schema whose meaning the writer knew; 0: the same")
+    task_id: Word
+    job_id: Word
+    stage: Stage
+    batch: int = Field(ge=0)
+    count: int = Field(ge=1, description="grasps wanted of this batch")
+    revision: int = Field(1, ge=1, description="revision of the stage's algorithm that the output's address stands for")
+    attempt: int = Field(1, ge=1)
+    max_attempt: int = Field(3, ge=1, description="number of the attempt that is the last")
+    request: JobRequest
+    hand_digest: Digest
+    object_digest: Digest
+    inputs: tuple[Word, ...] = Field((), description="shard ids this task reads")
+    output: Word = Field(description="shard id this task writes")
+    origin: Origin | None = None
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    @model_validator(mode="after")
+    def _knows_its_files(self) -> Self:
+        check_known(self.request)
+        return self
+
+
+class IngestMessage(Model):
+    """A task that checks an uploaded hand, object or network in a child process."""
+
+    schema_: int = Field(alias="schema")
+    newest_schema: int = Field(0, ge=0)
+    task_id: Word
+    stage: Literal[Stage.INGEST] = Stage.INGEST
+    kind: AssetKind
+    name: Name
+    digest: Digest
+    attempt: int = Field(1, ge=1)
+    max_attempt: int = Field(3, ge=1)
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
