@@ -29,12 +29,12 @@ PICTURES: Final = 32
 PROPOSED: Final = 8
 GRASPS: Final = 8
 #: Pictures of each object in each later round, and what is chosen for each of them.
-LATER: Final = 16
+LATER: Final = 24
 CHOSEN: Final = 16
 #: Sizes of the moves of these grasps, in turn.
 SIZES: Final = (0.0, 0.5, 1.0, 2.0)
 #: How often an evaluator's own choices are tried, and learned from.
-AGAIN: Final = 2
+AGAIN: Final = 1
 #: Training steps of an evaluator.
 STEPS: Final = 1500
 
