@@ -33,7 +33,7 @@ _LITTLE = "--hands barrett --objects 077_rubiks_cube --grasps 4"
 
 
 _TRAIN = (
-    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free "
+    "python -m examples.train_grasp_predictor --shards WORK/tables --free WORK/free --peer WORK/peer "
     "--meshes DATA/objects --held-out 006_mustard_bottle,025_mug,035_power_drill,061_foam_brick "
     "-o OUT/results/predictor.json"
 )
@@ -252,8 +252,8 @@ STUDIES: Final = (
         ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
          "graspd datasets export tables -o WORK/tables",
          "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
-         f"{_TRAIN} --hand barrett --sheet OUT/results/predictor-barrett.png",
-         f"{_TRAIN} --hand allegro --sheet OUT/results/predictor-allegro.png"),
+         f"{_TRAIN} --hand barrett --network WORK/barrett.npz --sheet OUT/results/predictor-barrett.png --ablations",
+         f"{_TRAIN} --hand allegro --network WORK/allegro.npz --sheet OUT/results/predictor-allegro.png"),
         stages=ALL, seeds=(0, 1, 2), needs=(SERVICE, TORCH),
     ),
     Study(
