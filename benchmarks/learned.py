@@ -1,6 +1,6 @@
 """Seeds from a network against fast_graspd's own: processor time to the first valid grasp, and valid grasps a second.
 
-usage: python -m benchmarks.learned --network NET.npz [--network OTHER.npz ...] [--data DATA_DIR] [--objects NAME ...]
+usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DATA_DIR] [--objects NAME ...]
            [--many 32] [--seeds 5] [--starts 4 ...] [--out FOLDER]
        DATA_DIR holds objects/; without it objects are files or names of built-in ones
 
@@ -129,7 +129,7 @@ def _object(name: str, data: Path | None) -> ObjectModel:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--network", action="append", type=Path, required=True)
+    parser.add_argument("--network", nargs="+", type=Path, required=True)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--objects", nargs="+", default=list(HELD_OUT))
     parser.add_argument("--many", type=int, default=32)
@@ -157,7 +157,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.out is not None:
         command = "python -m benchmarks.learned " + " ".join(
             f"--{name} {' '.join(str(Path(str(part)).name) for part in parts)}"
-            for name, parts in (("network", given.network), ("objects", given.objects), ("starts", given.starts))
+            for name, parts in (
+                ("network", given.network),
+                ("objects", given.objects),
+                ("starts", given.starts),
+                ("many", [given.many]),
+                ("seeds", [given.seeds]),
+            )
         )
         given.out.mkdir(parents=True, exist_ok=True)
         (given.out / "learned.json").write_text(json.dumps({"networks": networks, "rows": rows}, indent=1) + "\n")

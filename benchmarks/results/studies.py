@@ -16,8 +16,8 @@ IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Beside DATA, SOURCES and BEFORE: what a study may need.
 SERVICE, BROWSER, GPU, TORCH, FIRST_JUDGE = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
-#: A file that training made: its study is run by hand, with the file in the place of NETWORK.
-NETWORK = "a trained network"
+#: Files that the study `predictor` leaves in WORK.
+NETWORK = "trained networks"
 
 _ALLEGRO = "DATA/hands/allegro/allegro_hand_right.urdf"
 _BARRETT = "DATA/hands/barrett_bh280/bh280.urdf"
@@ -261,7 +261,8 @@ STUDIES: Final = (
     ),
     Study(
         "learned", "seeds from a network against the planner's own", ("results/learned.*",),
-        ("python -m benchmarks.learned --network NETWORK --data DATA --out OUT/results",),
+        ("python -m benchmarks.learned --network WORK/barrett.npz WORK/allegro.npz --data DATA --seeds 3 "
+         "--out OUT/results",),
         stages=IN_SCENES, seeds=(404,), needs=(NETWORK,),
     ),
     Study(
