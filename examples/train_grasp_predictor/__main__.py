@@ -155,8 +155,8 @@ def main(
                 drawn.setdefault(exam.object, {})[source] = (exam, ready, lifted)
         output.write_text(json.dumps(rows, indent=1) + "\n")
         typer.echo(_line(source, seed, facts, rows))
-    if sheet is not None and drawn:
-        sheet.write_bytes(page(model, drawn))
+        if sheet is not None and seed == 0 and source in shown:
+            sheet.write_bytes(page(model, drawn))
     typer.echo(markdown(rows))
 
 
