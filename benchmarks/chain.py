@@ -28,7 +28,7 @@ CHILD: Final = """
 import json, sys, time
 from dataclasses import replace
 import numpy as np
-from service.model.fidelity import FIDELITIES
+from service.model.domain import JobOptions
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners import Run, Wanted
@@ -40,7 +40,7 @@ from worker.quality.referee.judge import judge
 from worker.quality.table import measure
 
 path, name, count, seed = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-fidelity, run, spent = FIDELITIES["standard"], Run(threads=1), {}
+fidelity, run, spent = JobOptions(fidelity="standard").knobs, Run(threads=1), {}
 hand, obj = hand_from_path(path), object_from_path(name, face_error_m=fidelity.face_error_m)
 pieces = decompose(obj)
 

@@ -20,16 +20,17 @@ import numpy as np
 
 from benchmarks.chain import environment_of
 
+#: Runs in each checkout, so it uses only what both have.
 _COMMON: Final = """
 import sys, time
 import numpy as np
-from service.model.fidelity import FIDELITIES
+from service.model.domain import JobOptions
 from worker.grasps import GraspSet, Posture
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.run import Run
 
-fidelity, run = FIDELITIES["standard"], Run(threads=1)
+fidelity, run = JobOptions(fidelity="standard").knobs, Run(threads=1)
 hand = hand_from_path(sys.argv[1])
 obj = object_from_path(sys.argv[2], face_error_m=fidelity.face_error_m)
 """
