@@ -16,7 +16,6 @@ import typer
 from examples.train_grasp_predictor import sources
 from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, Proposer, Row, examined
 from examples.train_grasp_predictor.evaluator import learned
-from examples.train_grasp_predictor.practice import STEPS as JUDGE_STEPS
 from examples.train_grasp_predictor.practice import Practice
 from examples.train_grasp_predictor.refinement import Refined, joined
 from examples.train_grasp_predictor.samples import Sight, Taught, sights
@@ -187,7 +186,7 @@ def _proposers(
                 continue
             by = _by(made, SPREADS)
             tries = tries or Practice(study.hand, study.models, given, study.seen, by).tries(seed=seed)
-            refined = Refined(study.hand, learned(study.hand, tries, steps=JUDGE_STEPS, seed=seed), by)
+            refined = Refined(study.hand, learned(study.hand, tries, seed=seed), by)
             told |= {"tries": len(tries)}
             whole: dict[str, Proposer] = {source: refined}
             if source == sources.SCENES:

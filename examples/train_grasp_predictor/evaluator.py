@@ -28,7 +28,8 @@ HAND_POINTS: Final = 96
 SHOWN: Final = 160
 #: Distances are told up to this [m], in units of `_NEAR_M`.
 _FAR_M, _NEAR_M = 0.06, 0.05
-#: Hands of a training step, and noise of points [m].
+#: Training steps; hands of each, and noise of points [m].
+STEPS: Final = 1500
 BATCH: Final = 64
 JITTER_M: Final = 0.001
 #: Looks at a picture, each at other points of it, whose verdicts are averaged; hands of one pass.
@@ -147,7 +148,7 @@ class Evaluator(nn.Module):
         return self.verdict(torch.cat(pooled, dim=1))[:, 0]
 
 
-def learned(hand: HandModel, tries: Tries, *, steps: int, seed: int, rate: float = 2e-3) -> Evaluator:
+def learned(hand: HandModel, tries: Tries, *, seed: int, steps: int = STEPS, rate: float = 2e-3) -> Evaluator:
     """An evaluator that has seen so many batches of the tries."""
     torch.manual_seed(seed)
     evaluator = Evaluator(hand)

@@ -35,8 +35,6 @@ CHOSEN: Final = 16
 SIZES: Final = (0.0, 0.5, 1.0, 2.0)
 #: How often an evaluator's own choices are tried, and learned from.
 AGAIN: Final = 1
-#: Training steps of an evaluator.
-STEPS: Final = 1500
 
 #: From the rows of a scene's grasps, a picture of it and a generator to hands.
 _HandsFor = Callable[[Floats, Sight, np.random.Generator], Proposals]
@@ -61,7 +59,7 @@ class Practice:
         rng = np.random.default_rng(seed)
         tries = self.tried(self.beginning, PICTURES, rng)
         for _ in range(AGAIN):
-            refined = Refined(self.hand, learned(self.hand, tries, steps=STEPS, seed=seed), self.source)
+            refined = Refined(self.hand, learned(self.hand, tries, seed=seed), self.source)
             tries = tries.and_those(self.tried(partial(_chosen, refined), LATER, rng))
         return tries
 
