@@ -168,6 +168,18 @@ def test_hands_move_to_where_the_evaluator_believes_in_them(hand: HandModel) -> 
     assert moved_on[0] < moved_on[1]
 
 
+def test_tries_of_two_rounds_keep_each_its_picture_and_its_verdict(hand: HandModel) -> None:
+    high = ball()
+    low = dataclasses.replace(high, points=high.points - [0.0, 0.0, 0.1])
+    one = Tries.of(hand, [high, low], [hands_at(hand, np.full((1, 3), 0.1 * k)) for k in (1, 2)], np.array([1, 0]))
+    other = Tries.of(hand, [low], [hands_at(hand, np.full((3, 3), 0.3))], np.array([0, 1, 1]))
+    both = one.and_those(other)
+    heights = both.points[both.picture].mean(dim=1)[:, 2].numpy() - 0.2
+    np.testing.assert_allclose(heights, [0.0, -0.1, -0.1, -0.1, -0.1], atol=0.01)
+    np.testing.assert_allclose(both.hands.place[:, 0].numpy(), [0.1, 0.2, 0.3, 0.3, 0.3], rtol=1e-6)
+    assert both.lifted.tolist() == [1, 0, 0, 1, 1]
+
+
 @pytest.mark.slow
 def test_practice_lifts_what_is_known_to_lift_and_not_what_is_far_away(hand: HandModel) -> None:
     block = object_from_path("block")
