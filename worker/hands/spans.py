@@ -58,6 +58,8 @@ BEYOND_M: Final = 0.012
 #: Pairs of a posture that are looked at closely, and postures that are compared at once.
 CLOSELY: Final = 8
 AT_ONCE: Final = 16
+#: Points that are nearer to each other are at one place [m].
+_NEXT_TO: Final = 1e-9
 
 
 def spans_of(hand: HandModel, size: Size) -> Oppositions:
@@ -124,12 +126,15 @@ class _Look:
         self.points = sample_surface(hand, POINTS[size])
         body = self.points.body
         holds = np.ones(len(body), bool) if size == "small" else np.isin(body, hand.fingertips)
-        self.holding = np.flatnonzero(holds)
-        one, other = np.triu_indices(len(self.holding), k=1)
-        apart = body[self.holding[one]] != body[self.holding[other]]
-        self.one, self.other = one[apart], other[apart]
+        # Body by body, so that the pairs of a body's points with those of later bodies are one product of matrices.
+        self.holding = np.flatnonzero(holds)[np.argsort(body[holds], kind="stable")]
         flat = _flatness(hand, self.points)[self.holding] if size == "small" else np.ones(len(self.holding))
-        self.round = ROUND_M * (1 - np.minimum(flat[self.one], flat[self.other]))
+        self.round = ROUND_M * (1 - np.minimum(flat[:, None], flat))
+        count = len(self.holding)
+        ends = np.flatnonzero(np.diff(body[self.holding])) + 1
+        self.blocks = [(slice(a, b), slice(b, count)) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        pairs = [np.mgrid[mine, later].reshape(2, -1) for mine, later in self.blocks]
+        self.one, self.other = np.concatenate(pairs, axis=1)
 
     def at(self, q: Floats, wanted: Floats) -> _Found:
         """The best pair of each posture (n, D) for the widths `wanted` (n,)."""
@@ -144,24 +149,46 @@ class _Look:
         place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
         normal = quat_rotate(pose[..., 3:], points.normal)[:, self.holding]
         held = place[:, self.holding]
-        way = held[:, self.other] - held[:, self.one]
-        width = np.sqrt(np.einsum("npi,npi->np", way, way))
-        ahead = np.einsum("npi,npi->np", way, normal[:, self.one])
-        back = -np.einsum("npi,npi->np", way, normal[:, self.other])
-        facing = np.minimum(ahead, back) / np.maximum(width, 1e-9)
-        cost = TURNED_M * np.maximum(0.0, self.facing - facing) + np.abs(width - wanted[:, None]) + self.round
-        close = np.argpartition(cost, CLOSELY, axis=1)[:, :CLOSELY]
+        close = np.argpartition(self._costs(held, normal, wanted), CLOSELY, axis=1)[:, :CLOSELY]
         row = np.arange(len(q))[:, None]
-        cost, width = cost[row, close], width[row, close]
-        axis = way[row, close] / width[..., None]
-        ends = held[row, self.one[close]], held[row, self.other[close]]
+        one, other = self.one[close], self.other[close]
+        ends = held[row, one], held[row, other]
+        way = ends[1] - ends[0]
+        width = np.sqrt(np.einsum("npi,npi->np", way, way))
+        ahead = np.einsum("npi,npi->np", way, normal[row, one])
+        back = -np.einsum("npi,npi->np", way, normal[row, other])
+        facing = np.minimum(ahead, back) / np.maximum(width, 1e-9)
+        cost = TURNED_M * np.maximum(0.0, self.facing - facing) + np.abs(width - wanted[:, None])
+        cost += self.round[one, other]
+        axis = way / width[..., None]
         cost += DEEP * self._stands_in(place, axis, *ends, width)
-        parts = self.holding[self.one[close]], self.holding[self.other[close]]
+        parts = self.holding[one], self.holding[other]
         cost += np.maximum(0.0, CLOSES_M - self._closes(q, bodies, axis, parts, ends))
         best = cost.argmin(axis=1)
         row = np.arange(len(q))
         middle = 0.5 * (ends[0] + ends[1])
         return axis[row, best], middle[row, best], width[row, best], cost[row, best]
+
+    def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
+        """(n, pairs) what each pair lacks, but for room: to find those worth a closer look, by matrix products, whose
+        rounding (1e-16 m² of squared distances) decides nothing."""
+        square = np.einsum("npi,npi->np", held, held)
+        own = np.einsum("npi,npi->np", held, normal)
+        parts = []
+        for one, other in self.blocks:
+            mine, its = held[:, one], held[:, other].swapaxes(1, 2)
+            width = square[:, one, None] + square[:, None, other] - 2 * (mine @ its)
+            np.sqrt(np.maximum(width, _NEXT_TO**2, out=width), out=width)
+            cost = normal[:, one] @ its - own[:, one, None]
+            np.minimum(cost, mine @ normal[:, other].swapaxes(1, 2) - own[:, None, other], out=cost)
+            cost /= width
+            np.subtract(self.facing, cost, out=cost)
+            cost = TURNED_M * np.maximum(0.0, cost, out=cost)
+            width -= wanted[:, None, None]
+            cost += np.abs(width, out=width)
+            cost += self.round[one, other]
+            parts.append(cost.reshape(len(held), -1))
+        return np.concatenate(parts, axis=1)
 
     def _closes(
         self, q: Floats, bodies: Floats, axis: Floats, parts: tuple[Ints, Ints], ends: tuple[Floats, Floats]
@@ -184,11 +211,14 @@ class _Look:
         half = 0.5 * width
         start = np.minimum(np.einsum("nki,nki->nk", one, up), np.einsum("nki,nki->nk", other, up))
         start = start - np.minimum(half, BEYOND_M)
-        off = place[:, None] - 0.5 * (one + other)[:, :, None]
-        along = half[..., None] - np.abs(np.einsum("nksi,nki->nks", off, axis))
-        aside = half[..., None] - np.abs(np.einsum("nksi,nki->nks", off, np.cross(axis, up)))
-        above = np.einsum("nsi,nki->nks", place, up) - start[..., None]
-        inside = np.minimum(np.minimum(along, aside), np.minimum(above, width[..., None] - above))
+        # (n, K, points), along the line between both ends, across it and upwards.
+        middle, points, across = 0.5 * (one + other), place.swapaxes(1, 2), np.cross(axis, up)
+        along, aside, above = axis @ points, across @ points, up @ points
+        along -= np.einsum("nki,nki->nk", axis, middle)[..., None]
+        aside -= np.einsum("nki,nki->nk", across, middle)[..., None]
+        above -= (start + half)[..., None]
+        beside = np.maximum(np.maximum(np.abs(along), np.abs(aside)), np.abs(above))
+        inside = half[..., None] - beside
         deepest: Floats = np.maximum(inside, 0.0).max(axis=2)
         return deepest
 

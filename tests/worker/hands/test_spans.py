@@ -9,7 +9,7 @@ from service.model.transforms import IDENTITY_POSE, quat_rotate
 from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.oppositions import oppositions_of
-from worker.hands.spans import Size, spans_of
+from worker.hands.spans import TURNED_M, Size, _Look, spans_of
 from worker.hands.surface import sample_surface
 
 
@@ -41,3 +41,21 @@ def test_spans_begin_where_pads_end() -> None:
     pads = oppositions_of(hand).width
     assert spans_of(hand, "small").width[0] < pads[0] - 0.005
     assert spans_of(hand, "wide").width[-1] > pads[-1] + 0.005
+
+
+def test_pairs_taken_together_cost_what_each_of_them_costs() -> None:
+    look, rng = _Look(hand_from_path("barrett"), "small"), np.random.default_rng(0)
+    count = len(look.holding)
+    held, normal = rng.normal(0, 0.05, (2, count, 3)), rng.normal(size=(2, count, 3))
+    wanted = np.array([0.01, 0.03])
+    found = look._costs(held, normal, wanted)
+    for one, other, its in list(zip(look.one, look.other, found.T, strict=True))[::997]:
+        way = held[:, other] - held[:, one]
+        width = np.linalg.norm(way, axis=1)
+        facing = np.minimum((way * normal[:, one]).sum(axis=1), -(way * normal[:, other]).sum(axis=1)) / width
+        cost = TURNED_M * np.maximum(0, look.facing - facing) + np.abs(width - wanted) + look.round[one, other]
+        # Distances come from squares, so rounding of 1e-17 m² counts most where points nearly meet.
+        np.testing.assert_allclose(its, cost, atol=1e-10)
+    body = look.points.body[look.holding]
+    assert (body[look.one] != body[look.other]).all()
+    assert len(look.one) == (body[:, None] != body).sum() / 2
