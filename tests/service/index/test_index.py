@@ -452,7 +452,7 @@ def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts,
         while not done.is_set():
             with contextlib.suppress(ConflictError):
                 change(other, job.id)
-            done.wait(0.02)
+            done.wait(0.1)
 
     threads = [threading.Thread(target=interfere, args=(change,)) for change in (job_actions.cancel, job_actions.retry)]
     for thread in threads:
