@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import graspd.cli
+from service.model.states import State
 from tests.docs_files import files_for
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
@@ -53,6 +54,8 @@ _TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
 _OURS: Final = {"graspd", "api", "service", "worker", "benchmarks", "examples", "tests"}
 #: What an indented block of commands begins with; any other is a file or a formula.
 _FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|cp|curl|docker|kubectl) ")
+#: Words that differ between what has ended and what is shown on its way.
+_STATES: Final = {*(state.value for state in State), "min", "left"}
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
 #: What a line has that is not run here, and why. A line with none of it is run.
 NOT_RUN: Final = (
@@ -123,7 +126,9 @@ class Line:
 
 
 def _words(text: str) -> list[str]:
-    return re.findall(r"[a-z]{3,}", text.lower())
+    """Without numbers, states and names like `005_tomato_soup_can`."""
+    found = re.findall(r"\w{3,}", text.lower())
+    return [word for word in found if word.isalpha() and word not in _STATES]
 
 
 def lines_of(page: Path) -> Iterator[Line]:

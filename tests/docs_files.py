@@ -40,7 +40,7 @@ def files_for(page: Path, folder: Path, data: Path, environment: Mapping[str, st
     text = page.read_text()
     _meshes(folder)
     _hands(folder)
-    for name in ("benchmarks", "examples"):
+    for name in ("benchmarks", "examples", "tests"):
         (folder / name).symlink_to(REPOSITORY / name)
     (folder / "graspd-data").symlink_to(data)
     shutil.copytree(
