@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -192,7 +192,11 @@ def measure(workers: int, keepers: int, given: argparse.Namespace) -> Result:
         before = at.cpu()
         begun = time.perf_counter()
         with fleet(at.settings, workers, 0.0, given.pack):
-            _wait(lambda: _finished(at.parts) >= given.tasks, "all tasks are in the index")
+            _wait(
+                lambda: _finished(at.parts) >= given.tasks,
+                "all tasks are in the index",
+                lambda: f"({_finished(at.parts)} of {given.tasks})",
+            )
             seconds = time.perf_counter() - begun
             spent = {name: 1000 * (used - before[name]) / given.tasks for name, used in at.cpu().items()}
             streams = streams_kept(at.queue.connection)
@@ -248,11 +252,11 @@ def _started(stack: ExitStack, command: Sequence[str], environment: dict[str, st
     return process.pid
 
 
-def _wait(met: Any, what: str) -> None:
+def _wait(met: Callable[[], bool], what: str, stands: Callable[[], object] = str) -> None:
     end = time.monotonic() + _PATIENCE_S
     while not met():
         if time.monotonic() > end:
-            raise TimeoutError(f"after {_PATIENCE_S:g} s still not: {what}")
+            raise TimeoutError(f"after {_PATIENCE_S:g} s still not: {what} {stands()}")
         time.sleep(0.05)
 
 

@@ -252,8 +252,8 @@ STUDIES: Final = (
         ("graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
          "graspd datasets export tables -o WORK/tables",
          "bash examples/train_grasp_predictor/data.sh DATA/objects WORK",
-         "graspd datasets create tables-raw --hands barrett --objects DATA/objects --grasps 256 --want raw --scene table "
-         "--faces all --views 2 --yes --wait",
+         "graspd datasets create tables-raw --hands barrett --objects DATA/objects --grasps 256 --want raw "
+         "--scene table --faces all --views 2 --yes --wait",
          "graspd datasets export tables-raw -o WORK/raw",
          f"{_TRAIN} --hand barrett --network WORK/barrett.npz --sheet OUT/results/predictor-barrett.png "
          "--raw WORK/raw --ablations",
