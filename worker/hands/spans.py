@@ -149,17 +149,13 @@ class _Look:
         place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
         normal = quat_rotate(pose[..., 3:], points.normal)[:, self.holding]
         held = place[:, self.holding]
-        close = np.argpartition(self._costs(held, normal, wanted), CLOSELY, axis=1)[:, :CLOSELY]
+        costs = self._costs(held, normal, wanted)
+        close = np.argpartition(costs, CLOSELY, axis=1)[:, :CLOSELY]
         row = np.arange(len(q))[:, None]
-        one, other = self.one[close], self.other[close]
+        one, other, cost = self.one[close], self.other[close], costs[row, close]
         ends = held[row, one], held[row, other]
         way = ends[1] - ends[0]
         width = np.sqrt(np.einsum("npi,npi->np", way, way))
-        ahead = np.einsum("npi,npi->np", way, normal[row, one])
-        back = -np.einsum("npi,npi->np", way, normal[row, other])
-        facing = np.minimum(ahead, back) / np.maximum(width, 1e-9)
-        cost = TURNED_M * np.maximum(0.0, self.facing - facing) + np.abs(width - wanted[:, None])
-        cost += self.round[one, other]
         axis = way / width[..., None]
         cost += DEEP * self._stands_in(place, axis, *ends, width)
         parts = self.holding[one], self.holding[other]
@@ -170,8 +166,8 @@ class _Look:
         return axis[row, best], middle[row, best], width[row, best], cost[row, best]
 
     def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
-        """(n, pairs) what each pair lacks, but for room: to find those worth a closer look, by matrix products, whose
-        rounding (1e-16 m² of squared distances) decides nothing."""
+        """(n, pairs) what each pair lacks, but for room, by products of matrices: the square of a width is rounded to
+        1e-17 m²."""
         square = np.einsum("npi,npi->np", held, held)
         own = np.einsum("npi,npi->np", held, normal)
         parts = []
