@@ -34,8 +34,8 @@ _CHUNK: Final = 200_000
 def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     """(P, 2) pairs of faces without a common vertex that pass through each other; None: too many faces to look.
 
-    Broad phase: faces cut into pieces of one size, and pieces whose balls meet. Narrow phase: an edge of one face
-    through the inside of the other.
+    Broad phase: faces cut into pieces of one size, pieces whose balls meet, and faces whose boxes do. Narrow phase: an
+    edge of one face through the inside of the other.
     """
     from scipy.spatial import cKDTree
 
@@ -52,7 +52,7 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
     near = owner[tree.query_pairs(2 * radius, output_type="ndarray")]
-    near = _distinct(near[near[:, 0] != near[:, 1]], len(faces))
+    near = _distinct(near[(near[:, 0] != near[:, 1]) & _boxes_meet(corners, near)], len(faces))
     apart = ~(faces[near[:, 0]][:, :, None] == faces[near[:, 1]][:, None, :]).any(axis=(1, 2))
     near = near[apart]
     depth = DEPTH * float(np.ptp(vertices, axis=0).max())
@@ -70,6 +70,17 @@ def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return np.stack(np.divmod(keys, count), axis=1)
 
 
+def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
+    """(P,) whether the boxes along the axes of two faces (P, 2) have a point in common."""
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    one, other = pairs.T
+    meet = np.ones(len(pairs), dtype=bool)
+    for axis in range(3):
+        start, end = low[:, axis], high[:, axis]
+        meet &= (start[one] <= end[other]) & (start[other] <= end[one])
+    return meet
+
+
 def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
     """(P,) whether an edge of the one triangle (P, 3, 3) goes through the inside of the other, `depth` [m] deep."""
     a, b, c = np.moveaxis(triangles, 1, 0)
@@ -79,12 +90,14 @@ def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_
     hit = np.zeros(len(triangles), dtype=bool)
     for k in range(3):
         start, end = height[:, k], height[:, (k + 1) % 3]
-        through = (start * end < 0) & (np.minimum(np.abs(start), np.abs(end)) > depth)
-        t = start / np.where(through, start - end, 1.0)
-        point = edges_of[:, k] + t[:, None] * (edges_of[:, (k + 1) % 3] - edges_of[:, k]) - a
-        v = np.einsum("ij,ij->i", np.cross(point, c - a), normal) / square
-        w = np.einsum("ij,ij->i", np.cross(b - a, point), normal) / square
-        hit |= through & (v > _RIM) & (w > _RIM) & (v + w < 1 - _RIM)
+        (row,) = np.nonzero((start * end < 0) & (np.minimum(np.abs(start), np.abs(end)) > depth))
+        t = start[row] / (start[row] - end[row])
+        first, second = b[row] - a[row], c[row] - a[row]
+        begin, finish = edges_of[row, k], edges_of[row, (k + 1) % 3]
+        point = begin + t[:, None] * (finish - begin) - a[row]
+        v = np.einsum("ij,ij->i", np.cross(point, second), normal[row]) / square[row]
+        w = np.einsum("ij,ij->i", np.cross(first, point), normal[row]) / square[row]
+        hit[row] |= (v > _RIM) & (w > _RIM) & (v + w < 1 - _RIM)
     return hit
 
 
