@@ -15,7 +15,7 @@ import typer
 
 from examples.train_grasp_predictor import sources
 from examples.train_grasp_predictor.evaluation import FACE, OBJECT, Exam, Proposer, Row, examined
-from examples.train_grasp_predictor.evaluator import learned
+from examples.train_grasp_predictor.evaluator import Ensemble, learned
 from examples.train_grasp_predictor.practice import Practice
 from examples.train_grasp_predictor.refinement import Refined, joined
 from examples.train_grasp_predictor.samples import Sight, Taught, sights
@@ -42,6 +42,8 @@ PICTURES: Final = (16, 4)
 #: the unseen faces; and where an evaluator does, for each half.
 SPREAD: Final = 0.3
 SPREADS: Final = (0.3, 1.0)
+#: Evaluators that judge together.
+MEMBERS: Final = 3
 #: Noise of the depth camera that all are shown.
 NOISE: Final = "stereo"
 
@@ -172,7 +174,7 @@ def _proposers(
         if not missing:
             continue
         given = [make(obj) for obj in study.objects]
-        lessons, tries = Lessons.of(study.pictures_for(source), given), None
+        lessons, judged = Lessons.of(study.pictures_for(source), given), None
         controls = _without(study, given) if source == sources.SCENES else {}
         facts: Row = {"grasps": sum(map(len, given)), "views": len(lessons)}
         for seed in missing:
@@ -185,9 +187,9 @@ def _proposers(
                 yield source, seed, told, _by(made, (SPREAD,))
                 continue
             by = _by(made, SPREADS)
-            tries = tries or Practice(study.hand, study.models, given, study.seen, by).tries(seed=seed)
-            refined = Refined(study.hand, learned(study.hand, tries, seed=seed), by)
-            told |= {"tries": len(tries)}
+            judged = judged or _judges(Practice(study.hand, study.models, given, study.seen, by))
+            refined = Refined(study.hand, judged[0], by)
+            told |= {"tries": judged[1]}
             whole: dict[str, Proposer] = {source: refined}
             if source == sources.SCENES:
                 whole |= {ALONE: _by(made, (SPREAD,)), UNMOVED: replace(refined, rounds=())}
@@ -199,6 +201,12 @@ def _proposers(
             for seed in range(seeds):
                 if (study.hand.name, name, seed) not in done:
                     yield name, seed, {"grasps": facts["grasps"] if name == NEAREST else 0}, proposer
+
+
+def _judges(practice: Practice) -> tuple[Ensemble, int]:
+    """What a source's first network is practised with until it can judge them all, and by how many tries."""
+    tries = practice.tries(seed=0)
+    return Ensemble(learned(practice.hand, tries, seed=seed) for seed in range(MEMBERS)), len(tries)
 
 
 def _without(study: Study, given: Sequence[Taught]) -> dict[str, Proposer]:

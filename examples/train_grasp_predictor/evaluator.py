@@ -6,6 +6,7 @@ table: what is near what, as in the evaluator of 6-DOF GraspNet (Mousavian et al
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -148,6 +149,19 @@ class Evaluator(nn.Module):
         return self.verdict(torch.cat(pooled, dim=1))[:, 0]
 
 
+class Ensemble(nn.Module):
+    """The mean of evaluators that learned by themselves: a hand that is moved until one of them believes in it is where
+    that one errs, and the others seldom err there too."""
+
+    def __init__(self, members: Iterable[nn.Module]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(self, points: torch.Tensor, normals: torch.Tensor, hands: Hands) -> torch.Tensor:
+        """(N,) as of one."""
+        return torch.stack([member(points, normals, hands) for member in self.members]).mean(dim=0)
+
+
 def learned(hand: HandModel, tries: Tries, *, seed: int, steps: int = STEPS, rate: float = 2e-3) -> Evaluator:
     """An evaluator that has seen so many batches of the tries."""
     torch.manual_seed(seed)
@@ -168,7 +182,7 @@ def learned(hand: HandModel, tries: Tries, *, seed: int, steps: int = STEPS, rat
     return evaluator.eval()
 
 
-def scores(evaluator: Evaluator, hand: HandModel, sight: Sight, hands: Proposals) -> Floats:
+def scores(evaluator: nn.Module, hand: HandModel, sight: Sight, hands: Proposals) -> Floats:
     """(N,) logits of hands at one picture: always at the same points of it."""
     found, seen = np.zeros(len(hands)), Hands.of(hand, hands)
     points, normals = _tensor(sight.points), _tensor(sight.normals)

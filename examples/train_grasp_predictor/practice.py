@@ -31,10 +31,12 @@ GRASPS: Final = 8
 #: Pictures of each object in each later round, and what is chosen for each of them.
 LATER: Final = 24
 CHOSEN: Final = 16
+#: Proposals that these are chosen among: fewer than later, for what they teach is where errors lie.
+AMONG: Final = 32
 #: Sizes of the moves of these grasps, in turn.
 SIZES: Final = (0.0, 0.5, 1.0, 2.0)
 #: How often an evaluator's own choices are tried, and learned from.
-AGAIN: Final = 1
+AGAIN: Final = 2
 
 #: From the rows of a scene's grasps, a picture of it and a generator to hands.
 _HandsFor = Callable[[Floats, Sight, np.random.Generator], Proposals]
@@ -59,7 +61,7 @@ class Practice:
         rng = np.random.default_rng(seed)
         tries = self.tried(self.beginning, PICTURES, rng)
         for _ in range(AGAIN):
-            refined = Refined(self.hand, learned(self.hand, tries, seed=seed), self.source)
+            refined = Refined(self.hand, learned(self.hand, tries, seed=seed), self.source, begun=AMONG)
             tries = tries.and_those(self.tried(partial(_chosen, refined), LATER, rng))
         return tries
 

@@ -7,18 +7,19 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from torch import nn
 
 from examples.train_grasp_predictor.evaluation import Proposer
-from examples.train_grasp_predictor.evaluator import Evaluator, scores
+from examples.train_grasp_predictor.evaluator import scores
 from examples.train_grasp_predictor.execution import made_ready, part_of
 from examples.train_grasp_predictor.samples import Floats, Sight
 from service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from worker.hands.model import HandModel
 from worker.planners.learned.network import Proposals
 
-#: Moves of size 1, standard deviations: of the place [m], the attitude [rad] and the joints [rad or m], each by itself
-#: and all closing ones together.
-PLACE_M, TURN, JOINT, CLOSING = 0.008, 0.1, 0.05, 0.05
+#: Moves of size 1, standard deviations: of the place [m], the attitude [rad] and the joints [rad or m], each by itself,
+#: all closing ones together, and these at the squeeze alone: too little and too much of it both lose what is held.
+PLACE_M, TURN, JOINT, CLOSING, SQUEEZE = 0.008, 0.1, 0.05, 0.05, 0.05
 #: Sizes of the moves, round by round; the hands that go on from each, and the moves of each of these.
 ROUNDS: Final = (1.0, 0.7, 0.5, 0.4)
 KEPT, MOVES = 12, 4
@@ -27,8 +28,8 @@ _BLOCKED: Final = 4.0
 #: Hands whose places are no farther apart are the same proposal [m].
 APART_M: Final = 0.01
 
-#: Proposals that a picture begins with.
-BEGUN: Final = 32
+#: Proposals that a picture begins with: 32 lifted fewer of the unseen faces, 256 no more.
+BEGUN: Final = 96
 
 
 @dataclass(frozen=True)
@@ -36,13 +37,15 @@ class Refined:
     """A `Proposer` of what an evaluator has chosen."""
 
     hand: HandModel
-    evaluator: Evaluator
+    evaluator: nn.Module
+    """An `Evaluator` or an `Ensemble`."""
     source: Proposer
     rounds: tuple[float, ...] = ROUNDS
+    begun: int = BEGUN
 
     def __call__(self, sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
         """(count,) hands, the best first."""
-        hands, values = self._scored(self.source(sight, BEGUN, rng), sight)
+        hands, values = self._scored(self.source(sight, self.begun, rng), sight)
         for size in self.rounds:
             best = np.argsort(-values, kind="stable")[:KEPT]
             hands, values = part_of(hands, best), values[best]
@@ -69,9 +72,10 @@ def moved(hand: HandModel, hands: Proposals, size: ArrayLike, rng: np.random.Gen
     pose[:, 3:] = quat_multiply(rotation, pose[:, 3:])
     own = JOINT * by * rng.standard_normal(hands.joints.shape)
     closing = CLOSING * by * rng.standard_normal((n, 1)) * hand.closing
+    harder = closing + SQUEEZE * by * rng.standard_normal((n, 1)) * hand.closing
     joints = (
-        np.asarray(hand.expand(np.clip(hand.reduce(part + own) + closing, hand.lower, hand.upper)))
-        for part in (hands.joints, hands.pregrasp, hands.squeeze)
+        np.asarray(hand.expand(np.clip(hand.reduce(part + own) + more, hand.lower, hand.upper)))
+        for part, more in ((hands.joints, closing), (hands.pregrasp, closing), (hands.squeeze, harder))
     )
     return Proposals(pose, quat_rotate(rotation, hands.approach), *joints)
 

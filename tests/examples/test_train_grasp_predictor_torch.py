@@ -11,7 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs these tests")
 
-from examples.train_grasp_predictor.evaluator import Evaluator, Hands, Tries, learned, scores  # noqa: E402
+from examples.train_grasp_predictor.evaluator import Ensemble, Evaluator, Hands, Tries, learned, scores  # noqa: E402
 from examples.train_grasp_predictor.network import Proposer  # noqa: E402
 from examples.train_grasp_predictor.practice import Practice  # noqa: E402
 from examples.train_grasp_predictor.refinement import BEGUN, Refined, moved  # noqa: E402
@@ -144,6 +144,25 @@ def test_moves_of_no_size_leave_a_hand_and_others_stay_within_its_limits(hand: H
     assert (hand.reduce(far.joints) >= hand.lower - 1e-9).all()
     assert (hand.reduce(far.joints) <= hand.upper + 1e-9).all()
     np.testing.assert_allclose(np.linalg.norm(far.approach, axis=1), 1.0)
+
+
+def test_moves_squeeze_more_or_less_and_keep_the_fingers_way_to_the_grasp(hand: HandModel) -> None:
+    hands = hands_at(hand, np.zeros((40, 3)))
+    middle = np.tile(hand.expand(0.5 * (hand.lower + hand.upper)), (40, 1))  # no limit is near
+    hands = dataclasses.replace(hands, joints=middle, pregrasp=middle, squeeze=middle)
+    found = moved(hand, hands, 1.0, np.random.default_rng(0))
+    np.testing.assert_allclose(found.pregrasp, found.joints, atol=1e-12)
+    harder = hand.reduce(found.squeeze) - hand.reduce(found.joints)
+    assert (np.abs(harder[:, hand.closing == 0]) < 1e-12).all()
+    assert (harder @ hand.closing > 0).any() and (harder @ hand.closing < 0).any()
+
+
+def test_evaluators_together_say_what_they_say_on_average(hand: HandModel) -> None:
+    torch.manual_seed(0)
+    members = [Evaluator(hand).eval() for _ in range(3)]
+    hands = hands_at(hand, np.random.default_rng(0).normal(0, 0.05, (5, 3)))
+    each = [scores(member, hand, ball(), hands) for member in members]
+    np.testing.assert_allclose(scores(Ensemble(members), hand, ball(), hands), np.mean(each, axis=0), atol=1e-5)
 
 
 class Wish(torch.nn.Module):
