@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
@@ -12,7 +11,7 @@ import pytest
 
 from service.model.errors import NotFoundError, StoreUnavailable
 from service.store.store import Store, open_store
-from tests.servers import S3Server, free_ports
+from tests.servers import MissingServer, S3Server, free_ports
 
 pytestmark = pytest.mark.s3
 
@@ -98,8 +97,12 @@ def test_a_server_that_is_away_is_unavailable_for_every_call(s3_url: str, monkey
         assert "\n" not in str(found.value)
 
 
-def test_what_was_written_is_there_after_the_server_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with S3Server() as server:
+def test_what_was_written_is_there_after_the_server_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        own = S3Server()
+    except MissingServer as missing:
+        pytest.skip(str(missing))
+    with own as server:
         for name, value in server.environment.items():
             monkeypatch.setenv(name, value)
         store = open_store(server.url)
