@@ -64,19 +64,19 @@ class Work:
 class Measured:
     """Inputs that were measured; `docs/scaling.md` says with which commands."""
 
-    core_s_per_grasp: float = 0.36
-    """CPU time of a valid Allegro grasp, standard fidelity: plan, judge, postures, quality [core s]."""
-    core_s_per_scene: float = 0.9
-    """CPU time of a scene with the grasps of its batch [core s]."""
-    core_s_per_picture: float = 0.29
-    """CPU time of a picture 320 x 240 with all channels [core s]."""
+    core_s_per_grasp: float = 0.31
+    """A worker's time on one core for a valid grasp, standard fidelity: plan, judge, postures, quality [core s]."""
+    core_s_per_scene: float = 0.18
+    """The same of a scene with the grasps of its batch [core s]."""
+    core_s_per_picture: float = 0.56
+    """The same of a picture 320 x 240 with all channels [core s]."""
     busy: float = 0.9
     """Share of a worker's time in which it computes: the rest is starts, ends of jobs, waiting."""
-    base_bytes_per_grasp: float = 1338.0
-    scene_bytes: float = 7686.0
+    base_bytes_per_grasp: float = 1496.0
+    scene_bytes: float = 7837.0
     """Of one scene with the grasps of its batch."""
-    picture_bytes: float = 102_976.0
-    manifest_bytes: float = 4871.0
+    picture_bytes: float = 111_034.0
+    manifest_bytes: float = 6000.0
     """Mean over the manifests of the stages."""
     index_bytes_per_grasp: float = 869.0
     """Of all tables and their indexes on SQLite, jobs, tasks and shards included."""

@@ -243,7 +243,7 @@ def test_a_dataset_is_deleted_by_its_key_or_an_admin(
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
     assert client.delete("/v1/datasets/d", headers=people["ann"]).status_code == 409, "it has not ended"
     client.post("/v1/datasets/d/cancel", headers=people["ann"])
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
 
 

@@ -22,7 +22,7 @@ def test_a_report_names_the_standing_of_what_it_counts(parts: Parts, referee: st
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "referee": referee}
     wanted = DatasetRequest.model_validate(given)
     actions.create(parts, wanted)
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     finish_all(parts, add_job(parts, referee=referee))
     out = io.StringIO()
     console = Console(file=out, width=200)

@@ -21,7 +21,7 @@ def _two(parts: Parts) -> None:
     fine = {"name": "fine", "hands": ["allegro"], "objects": ["mug", "block"], "grasps": 32}
     for given in (rough, fine):
         actions.create(parts, DatasetRequest.model_validate(given))
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     finish_all(parts, add_job(parts, fidelity="draft"))
 
 

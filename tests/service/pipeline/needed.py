@@ -26,6 +26,6 @@ def needed_until_its_users_are_deleted(
     with pytest.raises(ConflictError, match=f"needed by dataset {wanted.name!r}"):
         delete_asset(parts, kind, name)
     actions.cancel(parts, wanted.name)
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     delete_dataset(parts, wanted.name)
     delete_asset(parts, kind, name)

@@ -45,7 +45,7 @@ def dataset(parts: Parts, name: str = "d", **changes: Any) -> str:
     """A finished dataset of one cell."""
     wanted = DatasetRequest(name=name, hands=("gripper",), objects=("ball",), **{"grasps": 32, **changes})
     actions.create(parts, wanted)
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     _make_all(parts)
     assert parts.index.datasets.get(name).state is State.SUCCEEDED
     return name

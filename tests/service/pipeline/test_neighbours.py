@@ -94,7 +94,7 @@ def test_a_dataset_hands_its_neighbours_on_to_each_job(parts: Parts) -> None:
     )
     made, new = actions.create(parts, wanted)
     assert new and made.options.beside[0].digest == cup
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     jobs = parts.index.jobs.page().items
     assert len(jobs) == 2 and all(job.request.beside[0].digest == cup for job in jobs)
     assert actions.create(parts, wanted)[1] is False, "the same again is the same dataset"

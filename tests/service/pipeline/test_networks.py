@@ -107,7 +107,7 @@ def test_a_dataset_hands_its_network_on_to_each_job(parts: Parts) -> None:
     wanted = DatasetRequest(name="d", hands=("gripper",), objects=("ball",), **LEARNED, **NAMED)
     made, new = actions.create(parts, wanted)
     assert new and made.options.network == net
-    DatasetRounds(parts).advance()
+    DatasetRounds(parts).advance(10)
     assert [job.request.network for job in parts.index.jobs.page().items] == [net]
     assert actions.create(parts, wanted)[1] is False, "the same again is the same dataset"
     add(parts, seed=1)

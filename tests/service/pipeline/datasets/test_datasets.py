@@ -54,7 +54,7 @@ def test_a_planner_that_was_stopped_is_continued(parts: Parts) -> None:
     assert planned.count(True) == 2
     plan_all(parts)
     assert all(cell.planned for cell in parts.index.datasets.cells("grasps").items)
-    assert not DatasetRounds(parts).advance()
+    assert not DatasetRounds(parts).advance(10)
 
 
 def test_two_datasets_share_the_jobs_that_both_want(parts: Parts) -> None:
