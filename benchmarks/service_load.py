@@ -98,6 +98,7 @@ def queue() -> None:
         worker.process.main.run_worker(parts.settings, table=fake_stages(), max_tasks=400)
         whole = (time.perf_counter() - start) / len(spent)
     alone = whole - statistics.fmean(spent)
+    say("| what | measured | beside |\n| --- | --: | --: |")
     say(f"| queue, lease and events | {1000 * alone:.1f} ms | {alone / BATCH_S:.1%} of a batch of {BATCH_S:g} s |")
     say(f"| with shard, manifest, index | {1000 * whole:.1f} ms | {whole / BATCH_S:.1%} |")
 
@@ -106,12 +107,13 @@ def workers() -> None:
     """Tasks a second by N workers, each task a wait of half a second."""
     task_s = 0.5
     first = 0.0
+    say("| workers | tasks a second | of N times one |\n| --: | --: | --: |")
     for count in (1, 2, 4, 8):
         with service(workers=count, task_s=task_s) as parts:
             run(parts, 2 * count, 0)
             rate = 20 * count / run(parts, 20 * count, 1)
         first = first or rate
-        say(f"| {count} workers | {rate:.2f} tasks/s | {rate / first / count:.0%} of {count} times one worker |")
+        say(f"| {count} | {rate:.2f} | {rate / first / count:.0%} |")
 
 
 def indexer(url: str | None) -> None:
@@ -128,6 +130,7 @@ def indexer(url: str | None) -> None:
             index.write.add_manifests(made[begin : begin + 100])
         rate = len(made) / (time.perf_counter() - start)
         index.close()
+    say("| what | shards | grasps |\n| --- | --: | --: |")
     say(f"| indexer | {rate:.0f} shards/s | {32 * rate:.0f} grasps/s |")
 
 
