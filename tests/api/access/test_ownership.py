@@ -16,12 +16,12 @@ from service.model import names
 from service.model.records import JobRecord
 from service.model.states import AssetKind, State
 from service.pipeline.backends import Parts
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.settings import Settings
 from service.store.network_file import to_bytes
 from service.store.records import read_record
 from tests.api.factories import add_job, fail
 from tests.networks import random_network
+from tests.planning import plan_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 MATRIX = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
@@ -92,19 +92,16 @@ def test_a_job_of_another_key_survives_the_end_of_a_dataset_that_has_it_too(
 ) -> None:
     job = submitted(client, people["ann"])
     client.post("/v1/datasets", json=MATRIX | {"objects": ["mug", "bottle"]}, headers=people["bob"])
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
     assert client.post("/v1/datasets/d/cancel", headers=people["bob"]).status_code == 202
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
     states = {cell.job_id == job: cell.state for cell in parts.index.datasets.cells("d").items}
     assert states == {True: State.QUEUED, False: State.CANCELLED}
 
 
 def test_jobs_of_a_dataset_belong_to_its_key(client: TestClient, people: dict[str, Headers], parts: Parts) -> None:
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
     job = parts.index.datasets.cells("d").items[0].job_id
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["bob"]).status_code == 403
     assert client.post(f"/v1/jobs/{job}/cancel", headers=people["ann"]).status_code == 202
@@ -243,7 +240,7 @@ def test_a_dataset_is_deleted_by_its_key_or_an_admin(
     client.post("/v1/datasets", json=MATRIX, headers=people["ann"])
     assert client.delete("/v1/datasets/d", headers=people["ann"]).status_code == 409, "it has not ended"
     client.post("/v1/datasets/d/cancel", headers=people["ann"])
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     assert client.delete("/v1/datasets/d", headers=people[who]).status_code == status
 
 

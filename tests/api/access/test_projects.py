@@ -27,7 +27,6 @@ from service.model.planning import plan
 from service.model.records import JobRecord
 from service.model.states import AssetKind
 from service.pipeline.backends import Parts
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.settings import Settings
 from service.store.network_file import to_bytes
 from service.store.records import read_record
@@ -35,6 +34,7 @@ from service.store.store import open_store
 from tests.api.factories import add_worker, fail, finish_all
 from tests.memory_queue import MemoryQueue
 from tests.networks import random_network
+from tests.planning import plan_all
 
 Headers = dict[str, str]
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32, "scenes": 1, "views": 1, "seed": 77}
@@ -95,8 +95,7 @@ class World:
         self.post("/v1/object-sets", ann, json={"name": "red-secret-set", "objects": ["red-secret-ball", "mug"]})
         matrix = {"name": "red-secret-data", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
         self.post("/v1/datasets", ann, json=matrix | {"scenes": 1, "views": 1, "seed": 77})
-        while DatasetRounds(self.parts).advance(10):
-            pass
+        plan_all(self.parts)
         hook = self.post("/v1/webhooks", ann, json={"url": "https://red-secret.example/"}).json()
         snapshot = self.post("/v1/datasets/red-secret-data/snapshots", ann).json()["digest"]
         tag = self.post("/v1/tags", ann, json={"name": "red-secret-tag", "grasps": [{"shard_id": shard, "row": 0}]})

@@ -12,9 +12,9 @@ from service.model.domain import JobOptions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
 
 
 @pytest.mark.parametrize("referee", ["none", "certificate"])
@@ -22,7 +22,7 @@ def test_a_report_names_the_standing_of_what_it_counts(parts: Parts, referee: st
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "referee": referee}
     wanted = DatasetRequest.model_validate(given)
     actions.create(parts, wanted)
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     finish_all(parts, add_job(parts, referee=referee))
     out = io.StringIO()
     console = Console(file=out, width=200)

@@ -10,9 +10,9 @@ from api.catalog.datasets import Datasets
 from service.index.filters import GraspFilter
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
 
 
 def _two(parts: Parts) -> None:
@@ -21,7 +21,7 @@ def _two(parts: Parts) -> None:
     fine = {"name": "fine", "hands": ["allegro"], "objects": ["mug", "block"], "grasps": 32}
     for given in (rough, fine):
         actions.create(parts, DatasetRequest.model_validate(given))
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     finish_all(parts, add_job(parts, fidelity="draft"))
 
 

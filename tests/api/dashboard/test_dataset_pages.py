@@ -10,9 +10,9 @@ from service.index.views import MatrixCell
 from service.model.states import State
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, fail, finish_all
+from tests.planning import plan_all
 
 
 def cell(**fields: object) -> MatrixCell:
@@ -77,7 +77,7 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, parts: P
     page = http.post("/datasets", data=form).text
     assert "kitchen" in page
     assert page.count('class="cell queued') == 2
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     assert (
         "1 job cancelled"
         in http.post(
@@ -139,7 +139,7 @@ def test_grasps_that_nobody_judged_are_counted_and_not_called_valid(
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
     actions.create(parts, DatasetRequest.model_validate(given | options))
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     finish_all(parts, add_job(parts, **options))
     http.post("/datasets/k/snapshot")
     word = shown.partition(" ")[2]
@@ -157,7 +157,7 @@ def test_the_share_of_a_cell_says_in_which_scene_its_grasps_are_valid(
 ) -> None:
     given = {"name": "k", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "scene": scene}
     actions.create(parts, DatasetRequest.model_validate(given))
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     finish_all(parts, add_job(parts, scene=scene))
     valid = parts.index.datasets.get("k").valid
     page = " ".join(http.get("/datasets/k").text.split())

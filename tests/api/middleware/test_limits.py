@@ -18,11 +18,11 @@ from api.middleware.rates import Allowance, Rates
 from service.model import names
 from service.model.records import JobRecord
 from service.pipeline.backends import Parts
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.records import read_record
 from tests.api.factories import finish_all
+from tests.planning import plan_all
 from tests.waiting import PATIENCE_S
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
@@ -206,8 +206,7 @@ def test_a_dataset_counts_with_the_grasps_of_all_its_cells_until_it_ends(
         assert client.post("/v1/datasets", json=matrix, headers=headers).status_code == 202
     assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 429
     assert client.post("/v1/datasets/d/cancel", headers=headers).status_code == 202
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
     assert client.post("/v1/jobs", json=JOB | {"seed": 1}, headers=headers).status_code == 202
     assert client.post("/v1/datasets/d/retry", headers=headers).status_code == 429
 

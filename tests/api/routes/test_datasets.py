@@ -10,10 +10,10 @@ from starlette.testclient import TestClient
 from service.model import names
 from service.model.records import JobRecord
 from service.pipeline.backends import Parts
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.store.records import read_record
 from service.store.study_records import publish
 from tests.api.factories import finish_all
+from tests.planning import plan_all
 from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart
 
 WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
@@ -27,8 +27,7 @@ def kitchen(http: TestClient) -> dict[str, Any]:
 
 
 def carry_out(parts: Parts) -> None:
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
 
 
 def finish_cells(parts: Parts, http: TestClient, count: int) -> None:

@@ -18,11 +18,11 @@ from service.index.rebuild import differences, rebuild
 from service.model import names
 from service.model.tags import MOST_TAGGED
 from service.pipeline.backends import Parts
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.readers.where import parse
 from service.store.manifests import ShardManifest
 from service.store.shards import Shard, read_shard
 from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
 
 Grasps = list[dict[str, Any]]
 
@@ -225,8 +225,7 @@ def test_a_zip_of_nothing_of_too_much_or_of_a_damaged_shard_is_refused(
 def test_grasps_of_a_dataset_are_those_of_its_cells(http: TestClient, made: ShardManifest, parts: Parts) -> None:
     matrix = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
     http.post("/v1/datasets", json=matrix)
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
     finish_all(parts, add_job(parts, seed=5))
     assert rows_of(http, dataset="d") == list(range(32)) != rows_of(http)
     assert http.get("/v1/grasps?dataset=none").status_code == 404

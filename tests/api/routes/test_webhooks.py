@@ -21,10 +21,10 @@ from service.index.rebuild import rebuild
 from service.model.webhooks import MOST_HOOKS, WAITS_S
 from service.pipeline.backends import Parts
 from service.pipeline.courier import Courier
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.posting import Answer
 from service.settings import Settings
 from tests.api.factories import add_job, finish_all
+from tests.planning import plan_all
 
 ADDRESS = "https://ci.example.org/graspd"
 MASTER = "a secret of the operator's"
@@ -92,8 +92,7 @@ def test_a_dataset_that_ended_is_told_once(http: TestClient, parts: Parts, ear: 
     http.post("/v1/datasets", json={"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32})
     ear.round()
     http.post("/v1/datasets/d/cancel")
-    while DatasetRounds(parts).advance(10):
-        pass
+    plan_all(parts)
     ear.round()
     ear.round()
     told = [one for one in http.get("/v1/events").json()["items"] if one["kind"] == "dataset"]

@@ -9,9 +9,9 @@ from service.model.states import AssetKind
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
+from tests.planning import plan_all
 
 
 def needed_until_its_users_are_deleted(
@@ -26,6 +26,6 @@ def needed_until_its_users_are_deleted(
     with pytest.raises(ConflictError, match=f"needed by dataset {wanted.name!r}"):
         delete_asset(parts, kind, name)
     actions.cancel(parts, wanted.name)
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     delete_dataset(parts, wanted.name)
     delete_asset(parts, kind, name)

@@ -15,13 +15,13 @@ from service.model.states import AssetKind, State
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset, delete_dataset, delete_job
 from service.pipeline.sweeper import Sweeper
 from service.store.deletions import pending
 from service.store.library import publish_asset
 from tests.fakes import OBJECT_FILES, make_shard, request
+from tests.planning import plan_all
 
 
 def finished(parts: Parts, **changes: Any) -> str:
@@ -45,7 +45,7 @@ def dataset(parts: Parts, name: str = "d", **changes: Any) -> str:
     """A finished dataset of one cell."""
     wanted = DatasetRequest(name=name, hands=("gripper",), objects=("ball",), **{"grasps": 32, **changes})
     actions.create(parts, wanted)
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     _make_all(parts)
     assert parts.index.datasets.get(name).state is State.SUCCEEDED
     return name

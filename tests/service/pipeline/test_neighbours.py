@@ -19,12 +19,12 @@ from service.model.states import AssetKind, Stage
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset
 from service.store.library import publish_asset
 from service.store.records import read_record
 from tests.fakes import make_shard, request
+from tests.planning import plan_all
 from tests.service.pipeline.needed import needed_until_its_users_are_deleted
 
 FLOOR = {"kind": "half_space"}
@@ -94,7 +94,7 @@ def test_a_dataset_hands_its_neighbours_on_to_each_job(parts: Parts) -> None:
     )
     made, new = actions.create(parts, wanted)
     assert new and made.options.beside[0].digest == cup
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     jobs = parts.index.jobs.page().items
     assert len(jobs) == 2 and all(job.request.beside[0].digest == cup for job in jobs)
     assert actions.create(parts, wanted)[1] is False, "the same again is the same dataset"

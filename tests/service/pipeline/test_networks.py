@@ -19,7 +19,6 @@ from service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS
 from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from service.pipeline.deletion import delete_asset
 from service.pipeline.sweeper import Sweeper
@@ -29,6 +28,7 @@ from service.store.records import read_record
 from tests.api.factories import fail
 from tests.fakes import request
 from tests.networks import network_files, random_network
+from tests.planning import plan_all
 from tests.service.pipeline.needed import needed_until_its_users_are_deleted
 
 LEARNED = {"scene": "table", "method": "learned"}
@@ -107,7 +107,7 @@ def test_a_dataset_hands_its_network_on_to_each_job(parts: Parts) -> None:
     wanted = DatasetRequest(name="d", hands=("gripper",), objects=("ball",), **LEARNED, **NAMED)
     made, new = actions.create(parts, wanted)
     assert new and made.options.network == net
-    DatasetRounds(parts).advance(10)
+    plan_all(parts)
     assert [job.request.network for job in parts.index.jobs.page().items] == [net]
     assert actions.create(parts, wanted)[1] is False, "the same again is the same dataset"
     add(parts, seed=1)

@@ -19,7 +19,6 @@ from service.model.records import AttemptRecord, JobRecord
 from service.model.states import Stage
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from service.settings import Settings
 from service.store.manifests import publish_shard
@@ -28,6 +27,7 @@ from service.store.shards import json_attribute
 from service.store.store import open_store
 from tests.api.factories import add_builtins, poses, scene_columns
 from tests.memory_queue import MemoryQueue
+from tests.planning import plan_all
 from worker.stages.output import Output, shard_of
 
 HANDS = ("allegro", "barrett")
@@ -79,9 +79,7 @@ def dataset(
         {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}
     )
     actions.create(parts, wanted)
-    planner = DatasetRounds(parts)
-    while planner.advance(5.0):
-        pass
+    plan_all(parts)
     for cell in parts.index.datasets.cells(NAME, limit=200).items:
         record = read_record(JobRecord, parts.store, names.job_record(cell.job_id))
         if (cell.hand, cell.object) == fails:

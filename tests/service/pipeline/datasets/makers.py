@@ -11,7 +11,6 @@ from service.model.planning import message_of, plan
 from service.model.records import AttemptRecord, JobRecord
 from service.model.states import AssetKind, Stage
 from service.pipeline.backends import Parts
-from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.spec import DatasetRequest
 from service.store.library import publish_asset
 from service.store.records import put_record, read_record
@@ -33,13 +32,6 @@ def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
     """Two hands x two objects, one batch each."""
     given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "referee": "certificate"}
     return DatasetRequest.model_validate({"name": name, **given, **changes})
-
-
-def plan_all(parts: Parts) -> None:
-    """Rounds of the planner until nothing is left."""
-    planner = DatasetRounds(parts)
-    while planner.advance(5.0):
-        pass
 
 
 def finish(parts: Parts, job: str, *, batches: int | None = None) -> None:

@@ -12,7 +12,8 @@ from service.pipeline.datasets import actions
 from service.pipeline.datasets.cost import estimate
 from service.pipeline.datasets.estimate import Estimate
 from service.pipeline.datasets.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
-from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
+from tests.planning import plan_all
+from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 
 #: Seconds that a stage of the fakes says it took.
 FAKE_SECONDS = 0.5

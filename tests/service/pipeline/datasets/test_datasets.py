@@ -18,7 +18,8 @@ from service.pipeline.datasets.rounds import DatasetRounds
 from service.pipeline.datasets.status import status
 from service.store.records import job_events
 from service.store.store import open_store
-from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, plan_all, wanted
+from tests.planning import plan_all
+from tests.service.pipeline.datasets.makers import add_asset, fail, finish, jobs_of, wanted
 
 
 def test_a_dataset_has_a_job_for_each_hand_and_object(either: Parts) -> None:

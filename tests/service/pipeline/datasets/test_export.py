@@ -15,7 +15,8 @@ from service.model.errors import DamagedShard, InputError, StoreUnavailable
 from service.pipeline.backends import Parts
 from service.pipeline.datasets import actions
 from service.pipeline.datasets.export import export_shards, path_of
-from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
+from tests.planning import plan_all
+from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 
 
 @pytest.fixture

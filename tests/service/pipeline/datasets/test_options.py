@@ -23,7 +23,8 @@ from service.pipeline.fidelity_choice import Resolver
 from service.store.datasets import load_dataset
 from service.store.records import read_record
 from service.store.study_records import charts_of, publish
-from tests.service.pipeline.datasets.makers import finish, jobs_of, plan_all, wanted
+from tests.planning import plan_all
+from tests.service.pipeline.datasets.makers import finish, jobs_of, wanted
 
 ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
 AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}

@@ -1,0 +1,13 @@
+"""Datasets planned at once, as the keeper would round by round."""
+
+from __future__ import annotations
+
+from service.pipeline.backends import Parts
+from service.pipeline.datasets.rounds import DatasetRounds
+
+
+def plan_all(parts: Parts) -> None:
+    """Rounds of the planner until nothing is left, however slow the machine."""
+    planner = DatasetRounds(parts)
+    while planner.advance():
+        pass
