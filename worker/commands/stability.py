@@ -21,7 +21,7 @@ app = typer.Typer()
 
 STUDIES: Final = (
     "time_step", "stiffness", "contact_count", "gradient", "shapes", "starts", "rates", "length",
-    "scene_height", "scene_wall", "scene_neighbours", "scene_size",
+    "hands", "model_errors", "peers", "scene_height", "scene_wall", "scene_neighbours", "scene_size",
 )  # fmt: skip
 
 

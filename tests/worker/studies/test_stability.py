@@ -175,7 +175,7 @@ def test_without_a_choice_all_studies_are_made(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(studies, "run", lambda names, *_, **__: asked.extend(names) or [])
     assert command("--json")[0] == 0
     assert asked == list(STUDIES)
-    assert len(asked) == 12
+    assert len(asked) == 15
 
 
 def test_published_maps_are_the_latest_in_the_store(tmp_path: Path) -> None:

@@ -43,6 +43,8 @@ class Batches:
         """(n,) the batch of each row."""
         self.index = np.concatenate([np.arange(count) for count in counts])
         """(n,) number of each row within its batch."""
+        self.opened = np.zeros(len(self.owner), bool)
+        """(n,) whether hands of a row set out more open than their pre-shape: in that they had no place."""
         self.errors: dict[int, Exception] = {}
         """What became of the batches that are out."""
         self._steps = [Steps(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]

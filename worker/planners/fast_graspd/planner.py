@@ -227,6 +227,10 @@ def _set_out(launch: _Launch, rows: Rows, attempt: int = 0) -> _Begun:
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
         state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
+        # At later attempts those that opened at the first: the others have starts already, and keep what they get.
+        may_open = np.repeat(batches.opened[rows] | (attempt == 0), fidelity.starts)
+        opened = starts.open_further(coarse, generators, state, depth, may_open)
+        batches.opened[rows] |= opened.reshape(len(rows), -1).any(axis=1)
     else:
         starts_of = batches.warm or scene_starts.clear_scene_starts
         state, depth = starts_of(coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways)

@@ -8,7 +8,8 @@ A start is taken only if nothing touches: hands that start inside a thin wall ne
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -39,6 +40,9 @@ POSTURE_NOISE: Final = 0.08
 CLEAR: Final = 0.001
 #: Draws per grasp before the least penetrating one is taken.
 DRAWS: Final = 48
+#: How far hands that have no place in their pre-shape open, as shares of the way to their ends, and draws at each.
+OPENED: Final = (0.5, 1.0)
+OPENED_DRAWS: Final = 24
 #: A start that is deeper than this is none [m].
 NO_PLACE: Final = 0.01
 
@@ -169,9 +173,9 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     Raises:
         InputError: not one draw of some grasp came within 10 mm of being clear.
     """
-    state, depth = clear_starts(
-        model, [start_generator(seed, batch, i, k) for i in indices for k in range(each)], each=each
-    )
+    generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
+    state, depth = clear_starts(model, generators, each=each)
+    open_further(model, generators, state, depth, np.ones(len(depth), bool))
     if depth.max() > NO_PLACE:
         raise no_place(model)
     return state
@@ -202,25 +206,69 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
     if jaws is None and each > 1 and (reaching := Reaching.of(model)) is not None:
         rows = np.arange(count)
         _reach(reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest)
-    open_ = np.flatnonzero(deepest > CLEAR)
-    for _ in range(DRAWS):
-        if not len(open_):
-            break
+
+    def drawn(rows: NDArray[np.intp]) -> HandState:
         if jaws is None:
-            states = _retreated(*draw(pair, [generators[i] for i in open_]))
-        else:
-            states = jaws.draw(np.array([generators[i].random(jaw_starts.UNIFORM) for i in open_]))
-        depth = probe.depths(states).reshape(len(open_), len(retreats))
+            return _retreated(*draw(pair, [generators[i] for i in rows]))
+        return jaws.draw(np.array([generators[i].random(jaw_starts.UNIFORM) for i in rows]))
+
+    _draw_until_clear(drawn, probe, DRAWS, np.flatnonzero(deepest > CLEAR), best, deepest)
+    return best, deepest
+
+
+def open_further(
+    model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Draws again, with hands that are more open, where `clear_starts` found no place: in the pre-shape the fingers of
+    some hands leave no gap as wide as the object.
+
+    Args:
+        model: of the starts.
+        generators: of the n starts, as `clear_starts` left them.
+        state, depth: what it found; better ones take their place.
+        wanted: (n,) which of them may be opened.
+
+    Returns:
+        (n,) those that were.
+    """
+    hand, obj = model.hand.model, model.obj.model
+    lost = wanted & (depth > NO_PLACE)
+    if not lost.any() or JawStarts.of(hand, obj) is not None:
+        return np.zeros(len(depth), bool)
+    rows = np.flatnonzero(lost)
+    probe = Probe(model, len(rows) * len(RETREATS))
+    ends = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, hand.preshape))
+    for share in OPENED:
+        wider = replace(hand, preshape=hand.preshape + share * (ends - hand.preshape))
+        pair = _Pair.of(wider, obj)
+
+        def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
+            return _retreated(*draw(pair, [generators[i] for i in rows]))
+
+        _draw_until_clear(drawn, probe, OPENED_DRAWS, rows[depth[rows] > CLEAR], state, depth)
+    return lost
+
+
+def _draw_until_clear(
+    drawn: Callable[[NDArray[np.intp]], HandState], probe: Probe, draws: int, rows: NDArray[np.intp], best: HandState,
+    deepest: Floats,
+) -> None:  # fmt: skip
+    """Put into `best` and `deepest` the nearest clear start of each of `rows`, or else the least deep. `drawn` gives a
+    draw of some rows at each distance of retreat."""
+    for _ in range(draws):
+        if not len(rows):
+            return
+        states = drawn(rows)
+        depth = probe.depths(states).reshape(len(rows), -1)
         # The nearest clear distance, or else the least deep.
         clear = depth <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), depth.argmin(axis=1))
-        found = states[np.arange(len(open_)) * len(retreats) + pick]
-        depth = depth[np.arange(len(open_)), pick]
-        better = depth < deepest[open_]
-        _put(best, open_[better], found[better])
-        deepest[open_[better]] = depth[better]
-        open_ = open_[deepest[open_] > CLEAR]
-    return best, deepest
+        found = states[np.arange(len(rows)) * depth.shape[1] + pick]
+        depth = depth[np.arange(len(rows)), pick]
+        better = depth < deepest[rows]
+        _put(best, rows[better], found[better])
+        deepest[rows[better]] = depth[better]
+        rows = rows[deepest[rows] > CLEAR]
 
 
 def _reach(

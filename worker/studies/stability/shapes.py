@@ -11,7 +11,6 @@ import trimesh
 from service.model.digests import digest_files
 from service.model.domain import JobRequest
 from service.model.errors import GraspdError
-from service.model.fidelity import FIDELITIES
 from service.model.stability import MapCell, Outcome, StabilityMap, reachable
 from service.model.states import AssetKind
 from worker.certified import certified_grasps
@@ -104,7 +103,7 @@ def shape_map(
     cells = []
     for panel, value, mesh, options in jobs:
         for fidelity in fidelities:
-            cell = _cell(hand, panel, value, mesh, options, fidelity, count, run)
+            cell = shape_cell(hand, (panel, value, fidelity), mesh, options, {"fidelity": fidelity}, count, run)
             say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
             cells.append(cell)
     return StabilityMap(
@@ -127,18 +126,34 @@ def prepared(mesh: Any, options: dict[str, Any], face_error_m: float) -> ObjectM
     return load_object(files, name="shape", digest=digest, face_error_m=face_error_m, options=options)
 
 
-def _cell(
-    hand: HandModel, panel: str, value: float | str, mesh: Any, options: dict[str, Any], fidelity: str, count: int,
-    run: Run,
+def shape_cell(
+    hand: HandModel, place: tuple[str, float | str, float | str], mesh: Any, options: dict[str, Any],
+    asked: dict[str, Any], count: int, run: Run,
 ) -> MapCell:  # fmt: skip
-    request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", fidelity=fidelity, audits=0)
+    """Raw grasps of a hand on a mesh, planned and judged as a job does.
+
+    Args:
+        hand: the hand.
+        place: panel, x and y of the cell.
+        mesh: comes in through the same door as an upload.
+        options: of the object, as an upload states them.
+        asked: fidelity or method of the job, and what else it asks for.
+        count: grasps.
+        run: its threads.
+    """
+    request = JobRequest(hand="hand", object="shape", grasps=count, want="raw", audits=0, **asked)
     try:
-        obj = prepared(mesh, options, FIDELITIES[fidelity].face_error_m)
+        obj = prepared(mesh, options, request.knobs.face_error_m)
         found = certified_grasps(hand, obj, request, count=count, run=run)
     except GraspdError as error:
-        return MapCell(panel, value, fidelity, float("nan"), "refused", str(error))
+        return refused(*place, error)
     valid = float(found.columns["quality/valid"].mean())
     depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
     finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
     outcome: Outcome = "broken" if not finite or valid == 0 else "weak" if valid < 0.5 else "good"
-    return MapCell(panel, value, fidelity, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")
+    return MapCell(*place, valid, outcome, f"{valid:.0%} valid, {depth:.2f} mm deep (median)")
+
+
+def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> MapCell:
+    """The cell of what is turned away with an error."""
+    return MapCell(panel, x, y, float("nan"), "refused", str(error))

@@ -7,14 +7,17 @@ from typing import Any, Final
 
 from service.model.stability import StabilityMap
 from worker.hands.load import hand_from_path
+from worker.hands.model import HandModel
 from worker.objects.prepare import object_from_path
 from worker.run import Run
-from worker.studies.stability import descents, gradients, integrators, scenes, shapes
+from worker.studies.stability import descents, gradients, hands, integrators, model_errors, peers, scenes, shapes
 
 Say = Callable[[str], None]
 
 #: Hands beside the one that is named, for what depends on a hand's size and build.
 OTHER_HANDS: Final = ("barrett",)
+#: And for what depends on its drives.
+ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
 
 def run(
@@ -26,7 +29,10 @@ def run(
     def few(values: Sequence[float]) -> Sequence[float]:
         return values[1::2] if quick else values
 
-    hands = [model] if quick else [model, *(hand_from_path(name) for name in OTHER_HANDS if name != model.name)]
+    def beside(names: Sequence[str]) -> list[HandModel]:
+        return [model] if quick else [model, *(hand_from_path(name) for name in names if name != model.name)]
+
+    pair = beside(OTHER_HANDS)
     gaps = (5, 80) if quick else scenes.GAPS_MM
     place: dict[str, Any] = {"count": 2 if quick else 8, "run": work, "say": say}
     lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
@@ -50,17 +56,30 @@ def run(
             model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=4 if quick else 8, say=say
         ),
         "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
+        "hands": lambda: hands.hand_map(
+            fingers=(1, 3) if quick else hands.FINGERS, sizes=() if quick else hands.SIZES,
+            ratios=() if quick else hands.RATIOS, couplings=("each joint",) if quick else hands.COUPLINGS,
+            fidelity="draft" if quick else "standard", count=4 if quick else 8, run=work, say=say,
+        ),
+        "model_errors": lambda: model_errors.model_error_map(
+            beside(ALL_HANDS), thing, every=3 if quick else 1, fidelity="draft" if quick else "standard",
+            count=2 if quick else 16, run=work, say=say,
+        ),
+        "peers": lambda: peers.peer_map(
+            model, methods=peers.METHODS[:2] if quick else peers.METHODS,
+            shapes={"cube": (60,)} if quick else peers.SHAPES, count=4 if quick else 8, run=work, say=say,
+        ),
         "scene_height": lambda: scenes.height_map(
-            hands, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM, **place
+            pair, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM, **place
         ),
         "scene_wall": lambda: scenes.wall_map(
-            hands, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS), **place
+            pair, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS), **place
         ),
         "scene_neighbours": lambda: scenes.neighbour_map(
-            hands, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS), **place
+            pair, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS), **place
         ),
         "scene_size": lambda: scenes.size_map(
-            hands, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS, **place
+            pair, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS, **place
         ),
     }  # fmt: skip
     found = []
