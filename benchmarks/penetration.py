@@ -1,10 +1,13 @@
 """Penetration, contact and variety of the planner's grasps with and without the final projection, as Markdown.
 
-usage: python -m benchmarks.penetration DATA_DIR     DATA_DIR holds hands/ and objects/ (YCB) and bad/
+usage: python -m benchmarks.penetration DATA_DIR [--objects NAME ...] [--grasps 32]
+
+DATA_DIR holds hands/ and objects/ (YCB) and bad/.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -24,7 +27,7 @@ from worker.quality.table import measure
 COMPACT = ("061_foam_brick", "005_tomato_soup_can", "006_mustard_bottle", "011_banana", "056_tennis_ball")
 SHELLS = ("025_mug", "024_bowl")
 THIN = ("037_scissors", "048_hammer")
-GRASPS = 32
+PLATE = "plate of 1 mm"
 
 
 def nearest_mm(hand: HandModel, poses: np.ndarray, joints: np.ndarray) -> float:
@@ -36,12 +39,12 @@ def nearest_mm(hand: HandModel, poses: np.ndarray, joints: np.ndarray) -> float:
     return 1e3 * float(distance[np.triu_indices(len(poses), 1)].min())
 
 
-def row(hand: HandModel, path: Path, label: str, polish: bool) -> str:
+def row(hand: HandModel, path: Path, label: str, polish: bool, grasps: int) -> str:
     fidelity = FIDELITIES["standard"]
     if not polish:
         fidelity = fidelity.model_copy(update={"polish_iterations": 0})
     obj = object_from_path(path, face_error_m=fidelity.face_error_m)
-    found = synthesize(hand, obj, Wanted(count=GRASPS, fidelity=fidelity, seed=2))
+    found = synthesize(hand, obj, Wanted(count=grasps, fidelity=fidelity, seed=2))
     quality = measure(hand, obj, found, friction=1.0)
     depth, own = quality["quality/penetration_depth_mm"], quality["quality/self_penetration_depth_mm"]
     column = int(np.argmin(np.abs(quality["quality/thresholds_m"] - 0.005)))
@@ -54,18 +57,23 @@ def row(hand: HandModel, path: Path, label: str, polish: bool) -> str:
     )
 
 
-def main(data: Path) -> None:
-    hand = hand_from_path(data / "hands" / "allegro" / "allegro_hand_right.urdf")
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--objects", nargs="*", default=[*COMPACT, *SHELLS, *THIN, PLATE])
+    parser.add_argument("--grasps", type=int, default=32)
+    given = parser.parse_args()
+    hand = hand_from_path(given.data / "hands" / "allegro" / "allegro_hand_right.urdf")
     sys.stdout.write(
         "| object | projection | mean depth mm | max | below 1 mm | self mean mm | contact cm2 | ε | nearest two mm |\n"
         "| --- | --- | --: | --: | --: | --: | --: | --: | --: |\n"
     )
-    objects = [(name, data / "objects" / name / "clean.stl") for name in (*COMPACT, *SHELLS, *THIN)]
-    for name, path in [*objects, ("plate of 1 mm", data / "bad" / "thin_sheet_1mm.stl")]:
+    for name in given.objects:
+        mesh = Path("bad/thin_sheet_1mm.stl") if name == PLATE else Path("objects", name, "clean.stl")
         for polish in (False, True):
-            sys.stdout.write(row(hand, path, name, polish) + "\n")
+            sys.stdout.write(row(hand, given.data / mesh, name, polish, given.grasps) + "\n")
             sys.stdout.flush()
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

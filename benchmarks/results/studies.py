@@ -85,6 +85,13 @@ STUDIES: Final = (
         stages=(),
     ),
     Study(
+        "bench-points", "the same with other numbers of hand points and faces", ("results/points/*",),
+        (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --points 500 --points 1000 "
+         "--points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 --out OUT/results/points",),
+        ("graspd bench --fidelity draft --batch 4 --threads 2 --repeats 1 --points 500 --out OUT/results/points",),
+        stages=(),
+    ),
+    Study(
         "chart", "speed against accuracy: methods, fidelities, knobs",
         ("results/chart.*", "results/sweeps.png"),
         (f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
@@ -106,6 +113,12 @@ STUDIES: Final = (
         ("graspd stability --only time_step --only stiffness --only contact_count --only gradient --only shapes "
          "--only starts --only rates --only length --long --out OUT/results/stability",),
         ("graspd stability --quick --only time_step --only gradient --only shapes --out OUT/results/stability",),
+    ),
+    Study(
+        "hands-stability", "where hands, wrong models and other methods break", ("results/hands-stability/*",),
+        ("graspd stability --only hands --only model_errors --only peers --out OUT/results/hands-stability",),
+        ("graspd stability --quick --only hands --only model_errors --only peers "
+         "--out OUT/results/hands-stability",),
     ),
     Study(
         "scenes-stability", "where planning in scenes breaks", ("results/scenes-stability/*",),
@@ -151,6 +164,18 @@ STUDIES: Final = (
         "success", "success and quality by hand and object, in one table", ("results/success.md",),
         ("python -m benchmarks.success DATA 32",), ("python -m benchmarks.success DATA 1 Barrett",),
         seeds=(101,), prints="results/success.md",
+    ),
+    Study(
+        "penetration", "how deep hands are, with and without the projection", ("results/penetration.md",),
+        ("python -m benchmarks.penetration DATA",),
+        ("python -m benchmarks.penetration DATA --objects 056_tennis_ball --grasps 4",),
+        seeds=(2,), prints="results/penetration.md",
+    ),
+    Study(
+        "recipes", "what each part of the recipe buys", ("results/recipes.md",),
+        ("python -m benchmarks.recipes DATA",),
+        ("python -m benchmarks.recipes DATA --objects 077_rubiks_cube --grasps 4",),
+        seeds=(101,), prints="results/recipes.md",
     ),
     Study(
         "tried", "hands chosen by merit, and by a short test", ("results/tried.*",),
