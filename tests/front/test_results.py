@@ -76,6 +76,18 @@ def test_a_figure_of_older_algorithms_is_shown_as_stale() -> None:
     assert staleness(study, record | {"stage_revisions": dict(STAGE_REVISIONS)}) == ""
 
 
+def test_a_revision_that_makes_the_same_leaves_figures_fresh_but_those_that_it_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(STAGE_REVISIONS, "synthesize", 9)
+    monkeypatch.setattr(
+        manifest, "SAME", {("synthesize", 9): (8, frozenset({"robust"})), ("synthesize", 8): (7, frozenset({"chart"}))}
+    )
+    made = {number: {"stage_revisions": STAGE_REVISIONS | {"synthesize": number}} for number in (6, 7, 8, 9)}
+    stale = {name: [n for n in made if staleness(BY_NAME[name], made[n])] for name in ("quality", "robust", "chart")}
+    assert stale == {"quality": [6], "robust": [6, 7, 8], "chart": [6, 7]}
+
+
 def test_every_command_of_the_list_is_there() -> None:
     commands = {name for name, *_ in graspd.cli.COMMANDS}
     for line in (line for study in STUDIES for line in (*study.run, *study.quick)):

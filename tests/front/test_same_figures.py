@@ -1,4 +1,5 @@
-"""Figures of synthesize 18 hold for 19: none of their objects is too small or too wide for the pads of their hands."""
+"""Figures of synthesize 18 hold for 19: none of their objects is too small or too wide for the pads of their hands.
+Those of 19 hold for 20: none of their hands is a gripper of more than two digits."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from worker.hands.jaws import MAX_DOFS
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
 from worker.planners.fast_graspd.across import crossings_of
@@ -21,6 +23,12 @@ def test_pads_of_the_hands_hold_the_objects_of_the_docs(file: str, shared_data: 
     assert len(meshes) >= 14
     sizes = {mesh.parent.name: size_to_pads(hand, crossings_of(object_from_path(mesh)).width) for mesh in meshes}
     assert not any(sizes.values()), sizes
+
+
+@pytest.mark.parametrize("file", [*HANDS, "allegro", "barrett", "shadow"])
+def test_no_hand_of_the_docs_is_a_gripper(file: str, shared_data: Path) -> None:
+    hand = hand_from_path(shared_data / "hands" / file if "/" in file else file)
+    assert hand.dofs > MAX_DOFS
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])

@@ -46,6 +46,8 @@ _STEPS: Final = 17
 _TOWARDS: Final = 1.0
 #: Pads that are this near touch [m].
 _TOUCH_M: Final = 2e-4
+#: Least over greatest singular value of the ends' motions from which on they are in no plane.
+_IN_SPACE: Final = 0.2
 
 
 @dataclass(frozen=True)
@@ -127,12 +129,15 @@ _lock = threading.Lock()
 
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
-    """The jaws of a hand whose `closing` is known; None where more dofs close it, or nothing opposes."""
+    """The jaws of a hand whose `closing` is known; None where more dofs close it, nothing opposes, or more than two
+    digits close from more than two sides: those hold as a hand does."""
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
     points = _points(hand)
     path = _path(hand, np.linspace(0.0, 1.0, _STEPS))
+    if _is_centric(hand, points, path):
+        return None
     met = _meeting(hand, points, path)
     if met is None:
         return None
@@ -193,6 +198,19 @@ def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -
             second.append(j)
             gaps.append(gap[j])
     return np.array(first, np.intp), np.array(second, np.intp), np.array(gaps)
+
+
+def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
+    """Whether three digits or more close around a place, as those of a centric gripper do. Jaws, and the links of their
+    mechanisms, move in one plane, that of the jaws and the approach; digits around a place move in space."""
+    ends = [body for body in set(points.body.tolist()) if body not in hand.parent]
+    if len(ends) < 3:
+        return False
+    q, step = path[len(path) // 2], path[-1] - path[0]
+    motion = sum((_motion(hand, points, q, d) * step[d] for d in range(hand.dofs)), np.zeros((len(points), 3)))
+    way = np.array([motion[points.body == body].mean(axis=0) for body in ends])
+    strength = np.linalg.svd(way, compute_uv=False)
+    return bool(strength[2] > _IN_SPACE * strength[0])
 
 
 def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:

@@ -17,6 +17,7 @@ from worker.hands.model import HandModel
 from worker.quality.referee.decomposition import decompose
 from worker.quality.referee.model import MujocoOptions, build
 from worker.simulation.device import joint_units
+from worker.studies.stability.hands import ring_hand
 
 #: The pads are planes, so points on them tell their distance to rounding.
 PLANE_M = 1e-9
@@ -87,3 +88,15 @@ def test_a_hand_of_several_fingers_is_no_gripper(name: str) -> None:
     hand = hand_from_path(name)
     assert jaws_of(hand) is None
     assert (joint_units(hand) == 1.0).all()
+
+
+@pytest.mark.parametrize("fingers", [3, 4, 6])
+def test_digits_that_close_around_a_place_are_no_jaws(fingers: int) -> None:
+    hand = ring_hand(fingers, coupling="one drive")
+    assert jaws_of(hand) is None
+    assert sorted(hand.body_names[tip] for tip in hand.fingertips) == [f"finger_{k}_2" for k in range(fingers)]
+    assert hand.closing.tolist() == [1.0]
+
+
+def test_two_digits_of_one_drive_are_jaws() -> None:
+    assert jaws_of(ring_hand(2, coupling="one drive")) is not None

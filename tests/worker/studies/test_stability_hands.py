@@ -57,3 +57,9 @@ def test_a_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     by_fingers = {cell.x: cell for cell in found.cells}
     assert by_fingers[0].outcome == "refused"
     assert by_fingers[3].value > 0
+
+
+def test_fingers_of_one_drive_hold_a_cube_between_them() -> None:
+    backend.start()
+    found = hands.hand_map(fingers=(3, 5), sizes=(), ratios=(), couplings=("one drive",), fidelity="draft", count=4)
+    assert [cell.outcome for cell in found.cells] == ["good", "good"]
