@@ -111,12 +111,23 @@ def _dataset(name: str, graspd: Graspd) -> None:
 def _for_datasets(text: str, folder: Path, graspd: Graspd) -> None:
     """The files that the page prints, the reader's hand, and a second version of what is exported."""
     graspd("hands", "add", "my_hand/my_hand.urdf", "--no-self-test")
-    for name, begin in (("kitchen.toml", "```toml\nname"), ("assets.json", '```json\n{"objects"')):
-        body = text[text.index(begin) :]
-        (folder / name).write_text(body.partition("\n")[2].partition("```")[0])
+    (folder / "kitchen.toml").write_text(_printed(text, "```toml\nname"))
+    (folder / "assets.json").write_text(_printed(text, '```json\n{"objects"'))
     (folder / "kitchen-v2").symlink_to("kitchen-v1")
+
+
+def _for_million(text: str, folder: Path, graspd: Graspd) -> None:
+    """Sources of the objects, as the page of datasets prints them, and those of the pilot's."""
+    del text, graspd
+    datasets = (REPOSITORY / "docs" / "datasets.md").read_text()
+    (folder / "assets.json").write_text(_printed(datasets, '```json\n{"objects"'))
     # Licences of objects that the small datasets lack would be refused.
     (folder / "docs" / "results" / "pilot" / "assets.json").write_text('{"objects": {"*": {"licence": "CC-BY-4.0"}}}')
+
+
+def _printed(text: str, begin: str) -> str:
+    """The first block of a page that begins so."""
+    return text[text.index(begin) :].partition("\n")[2].partition("```")[0]
 
 
 def _for_scaling(text: str, folder: Path, graspd: Graspd) -> None:
@@ -162,6 +173,7 @@ def _for_scenes(text: str, folder: Path, graspd: Graspd) -> None:
 
 _OF_PAGE: Final[dict[str, Callable[[str, Path, Graspd], None]]] = {
     "datasets.md": _for_datasets,
+    "million.md": _for_million,
     "planners.md": _for_planners,
     "quality.md": _for_quality,
     "scaling.md": _for_scaling,
