@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from alembic.config import Config
-from alembic.script import ScriptDirectory
 from sqlalchemy import make_url, text
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
-from service.index.database import MIGRATIONS, connect_postgres, mapped
+from service.index.database import connect_postgres, mapped, newest_revision
 from service.model.errors import IndexDamaged, IndexUnavailable, InputError
 
 _TIMEOUT_S: Final = 5.0
@@ -56,13 +54,6 @@ def look(url: str) -> IndexCondition | None:
         raise InputError(
             f"the index URL cannot be used ({error}); give sqlite:///PATH or postgresql+psycopg://..."
         ) from None
-
-
-def newest_revision() -> str:
-    """The schema that this graspd makes."""
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
-    return str(ScriptDirectory.from_config(config).get_current_head())
 
 
 def _look_at_file(path: Path) -> IndexCondition | None:

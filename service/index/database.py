@@ -8,11 +8,14 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from alembic import command
 from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from alembic.util import CommandError
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
@@ -227,11 +230,26 @@ def downgrade(url: str, revision: str) -> None:
         engine.dispose()
 
 
+@cache
+def newest_revision() -> str:
+    """The schema that this graspd makes."""
+    return str(ScriptDirectory.from_config(_config()).get_current_head())
+
+
+def _config() -> Config:
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    return config
+
+
 def _migrate(engine: Engine) -> None:
     try:
         with _migrating(engine) as config:
-            command.upgrade(config, "head")
-            if added := add_missing(config.attributes["connection"]):
+            connection = config.attributes["connection"]
+            # Alembic reads every revision to find that there is nothing to do.
+            if MigrationContext.configure(connection).get_current_heads() != (newest_revision(),):
+                command.upgrade(config, "head")
+            if added := add_missing(connection):
                 log.info("the index has new columns of grasps: %s", ", ".join(added))
     except CommandError as error:
         raise IndexUnavailable(
@@ -249,8 +267,7 @@ def _migrating(engine: Engine) -> Iterator[Config]:
         else:
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         try:
-            config = Config()
-            config.set_main_option("script_location", str(MIGRATIONS))
+            config = _config()
             config.attributes["connection"] = connection
             yield config
             connection.commit()
