@@ -37,7 +37,8 @@ CHART = {
 @pytest.fixture
 def places(parts: Parts) -> list[str]:
     """Addresses of every page, over a service in which something of everything has happened."""
-    record = add_job(parts, scenes=1, views=2, stereo=True)
+    # A list of few grasps has what one of many has, and is looked at sooner.
+    record = add_job(parts, grasps=6, scenes=1, views=2, stereo=True)
     shard = finish_all(parts, record)[0].shard_id
     fail(parts, add_job(parts, seed=9), "a reason " * 30)
     waiting = add_job(parts, seed=10)
@@ -115,17 +116,26 @@ def test_a_press_on_a_bar_shows_the_grasps_in_it(page: Any, parts: Parts) -> Non
     assert page.locator("#found tbody tr").count() == count
 
 
+def a_look_later(page: Any) -> None:
+    """The page's clock moves on by as long as it waits between two looks at what no event tells of."""
+    page.clock.fast_forward(1000 * int(page.get_attribute("body", "data-poll")))
+
+
 def test_a_chart_that_is_published_appears(page: Any, parts: Parts) -> None:
+    page.clock.install()
     page.goto("/chart")
     page.wait_for_selector("text=Nothing is measured yet")
     parts.store.put("charts/20261121T120000Z.json", json.dumps(CHART).encode())
+    a_look_later(page)
     page.wait_for_selector(".trade circle")
 
 
 def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, parts: Parts) -> None:
+    page.clock.install()
     page.goto("/stability")
     page.wait_for_selector("text=Nothing is measured yet")
     publish(parts.store, "stability", a_record())
+    a_look_later(page)
     page.wait_for_selector(".cells td.broken")
     page.locator("#stiffness .cells td.broken").first.hover()
     assert "penalty: stiffness [N/m] 1e4, time step [s] 0.01: broken; note 4" in page.inner_text("#stiffness .reading")

@@ -33,6 +33,8 @@ def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_one_slider_leads_from_the_standoff_to_the_lift_in_the_scene(page: Any, parts: Parts, bin_file: Path) -> None:
     shard = finish_with(parts, bin_file).shard_id
+    # A small canvas is drawn quickly without a GPU.
+    page.set_viewport_size({"width": 700, "height": 700})
     page.goto(f"/grasps/{shard}/0")
     page.wait_for_selector(".viewer[data-state=ready]")
     assert page.locator("[data-posture]").all_inner_texts() == STOPS
