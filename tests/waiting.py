@@ -14,10 +14,13 @@ PATIENCE_S: Final = 120.0
 
 def until(met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S, logs: Callable[[], str] = str) -> None:
     """Until a condition is met; fails with what was waited for, and the logs, when it does not come."""
-    end = time.monotonic() + seconds
+    began = asked = time.monotonic()
     while not met():
-        assert time.monotonic() < end, f"after {seconds:g} s still not: {what}\n{logs()}"
-        time.sleep(0.05)
+        now = time.monotonic()
+        assert now < began + seconds, f"after {seconds:g} s still not: {what}\n{logs()}"
+        # Who looks for long waits for long: the processor is for what is waited for.
+        time.sleep(max(0.05, 2 * (now - asked)))
+        asked = time.monotonic()
 
 
 def until_a_worker_is_idle(address: str) -> None:

@@ -18,6 +18,7 @@ from service.pipeline.backends import Parts
 from service.run.supervisor import Supervisor
 from service.settings import Settings
 from tests.fakes import add_assets
+from tests.indexes import empty_index
 from tests.waiting import PATIENCE_S, until
 
 
@@ -41,8 +42,8 @@ class System:
 
     def finish(self, *jobs: str, seconds: float = PATIENCE_S) -> list[JobView]:
         """The jobs once all are at their end."""
-        states = lambda: [self.parts.index.jobs.get(job).state for job in jobs]  # noqa: E731
-        self.until(lambda: all(state.is_final for state in states()), f"{len(jobs)} jobs done", seconds=seconds)
+        is_done = lambda job: self.parts.index.jobs.get(job).state.is_final  # noqa: E731
+        self.until(lambda: all(map(is_done, jobs)), f"{len(jobs)} jobs done", seconds=seconds)
         return [self.parts.index.jobs.get(job) for job in jobs]
 
     def kill(self, name: str) -> int:
@@ -78,6 +79,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
         wanted = Settings(data_dir=tmp_path / "data", port=0, device="cpu", keeper_interval_s=0.5, **settings)
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
         supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))
+        empty_index(wanted.resolved_index_url).close()
         supervisor.start()
         try:
             supervisor.wait_ready(PATIENCE_S)
