@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,10 @@ settings.load_profile("graspd")
 #: The processes of tests share the cores: a second thread of a small matrix product only waits, and computes to do so.
 #: NumPy, which is not imported yet, reads it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Hundreds of processes of tests import the same modules: where Python may keep none, each compiles them anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # What is imported while tests are collected is no garbage.
 gc.disable()
