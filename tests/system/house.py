@@ -18,6 +18,7 @@ from service.run.embedded import server_command
 from service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.fakes import add_assets
+from tests.indexes import empty_index
 from tests.service.conftest import wait_for_redis
 from tests.waiting import until
 
@@ -34,6 +35,7 @@ class House:
         self.hold = folder / "hold"
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.start("redis", *server_command(self.settings))
+        empty_index(self.settings.resolved_index_url).close()
         self.parts = Parts.open(self.settings)
         assert isinstance(self.parts.queue, RqQueue)
         wait_for_redis(self.parts.queue)

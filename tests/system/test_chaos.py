@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from service.settings import Settings
 from service.store.shards import read_shard
 from tests.fakes import fake_synthesize, message_for
 from tests.fakes import request as wanted
-from tests.system.conftest import System, alive
+from tests.system.conftest import System, alive, starting
 from tests.waiting import PATIENCE_S, until
 from worker.stages.context import TaskContext
 
@@ -47,8 +47,7 @@ def running_on(system: System, job: str) -> str | None:
     return tasks[0].worker if tasks else None
 
 
-def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(start: Start) -> None:
-    system = start()
+def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(system: System) -> None:
     reference = system.submit(wanted(seed=1))
     (untouched,) = system.finish(reference)
     system.hold.touch()
@@ -74,8 +73,15 @@ def test_a_task_whose_worker_is_killed_runs_again_and_its_result_appears_once(st
     assert differences(system.parts.index, system.parts.store) == []
 
 
-def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> None:
-    system = start(workers=2, environment={"FAKE_SECONDS": "0.3"})
+@pytest.fixture(scope="module")
+def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    """A service of two workers that are busy for a while with each task."""
+    with pytest.MonkeyPatch.context() as patch, starting(tmp_path_factory.mktemp("two"), patch) as make:
+        yield make(workers=2, environment={"FAKE_SECONDS": "0.1"})
+
+
+def test_redis_killed_in_the_middle_comes_back_with_its_tasks(two_workers: System) -> None:
+    system = two_workers
     system.hold.touch()
     jobs = [system.submit(wanted(grasps=96, scenes=1, seed=seed)) for seed in range(3)]
     system.until(lambda: any(running_on(system, job) for job in jobs), "the first task runs")
@@ -88,14 +94,14 @@ def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> N
     assert differences(system.parts.index, system.parts.store) == []
 
 
-def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(start: Start) -> None:
-    system = start(workers=2, environment={"FAKE_SECONDS": "0.1"})
+def test_five_jobs_for_two_workers_finish_and_a_rebuild_changes_no_row(two_workers: System) -> None:
+    system = two_workers
     # One that still checks its engine takes no tasks, and the other might do them all.
     system.until(lambda: [beat.state for beat in system.parts.queue.workers()] == ["idle"] * 2, "both can work")
-    jobs = [system.submit(wanted(grasps=70, scenes=2, seed=seed)) for seed in range(5)]
+    jobs = [system.submit(wanted(grasps=70, scenes=2, seed=seed)) for seed in range(10, 15)]
     done = system.finish(*jobs)
     assert {(job.state, job.grasps) for job in done} == {(State.SUCCEEDED, 70)}
-    workers = {shard.worker for shard in system.parts.index.shards.page(limit=200).items}
+    workers = {shard.worker for job in jobs for shard in system.parts.index.shards.page(job=job, limit=200).items}
     assert len(workers) == 2, "both took part"
     assert differences(system.parts.index, system.parts.store) == []
     before = [system.parts.index.jobs.get(job) for job in jobs]
@@ -115,21 +121,22 @@ def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) ->
     assert differences(system.parts.index, system.parts.store) == []
 
 
-def test_a_running_job_is_cancelled_long_before_its_task_would_end(start: Start) -> None:
-    system = start(environment={"FAKE_SECONDS": "3600"})
-    job = system.submit(wanted())
+def test_a_running_job_is_cancelled_long_before_its_task_would_end(system: System) -> None:
+    system.hold.touch()
+    job = system.submit(wanted(seed=6))
     system.until(lambda: running_on(system, job), "the task runs")
     assert job_actions.cancel(system.parts, job).state is State.CANCELLED
     system.until(lambda: not system.parts.queue.leases(), "the worker let go")
     assert system.parts.index.jobs.attempts(job=job) == []
-    again = system.submit(wanted(grasps=1, seed=3))
+    again = system.submit(wanted(grasps=1, seed=7))
     system.until(lambda: running_on(system, again), "the worker takes the next task")
+    system.hold.unlink()
+    system.finish(again)
 
 
-def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None:
-    system = start()
+def test_a_worker_told_to_stop_hands_its_task_back_at_once(system: System) -> None:
     system.hold.touch()
-    job = system.submit(wanted())
+    job = system.submit(wanted(seed=3))
     system.until(lambda: running_on(system, job), "the task runs")
     first = running_on(system, job)
     os.kill(system.supervisor.pids["worker-0"], signal.SIGTERM)
@@ -151,8 +158,7 @@ def test_a_task_that_takes_too_long_is_stopped_with_that_reason(start: Start) ->
     assert "GRASPD_TASK_TIMEOUT_S" in job.reason
 
 
-def test_forged_entries_run_nothing_and_stop_nobody(start: Start, tmp_path: Path) -> None:
-    system = start()
+def test_forged_entries_run_nothing_and_stop_nobody(system: System, tmp_path: Path) -> None:
     witness = tmp_path / "witness"
     assert isinstance(system.parts.queue, RqQueue)
     plain = Queue("interactive-synthesize", connection=system.parts.queue.connection, serializer=JSONSerializer)
@@ -163,27 +169,25 @@ def test_forged_entries_run_nothing_and_stop_nobody(start: Start, tmp_path: Path
     broken = plain.enqueue_call(TASK_FUNCTION, args=({},))
     system.parts.queue.connection.hset(f"rq:job:{broken.id}", "data", b"\xff\xfe rubbish")
     worker = system.supervisor.pids["worker-0"]
-    (done,) = system.finish(system.submit(wanted()))
+    (done,) = system.finish(system.submit(wanted(seed=4)))
     assert done.state is State.SUCCEEDED
     assert not witness.exists()
     assert system.supervisor.pids["worker-0"] == worker, "the worker was not even restarted"
 
 
-def test_a_second_up_on_the_same_data_is_refused_and_says_by_whom(start: Start) -> None:
-    system = start()
+def test_a_second_up_on_the_same_data_is_refused_and_says_by_whom(system: System) -> None:
     second = Supervisor(Settings(data_dir=system.supervisor.settings.data_dir, port=0), api=False)
     with pytest.raises(BusyError, match=f"in use by process {os.getpid()}"):
         second.start()
     assert system.parts.queue.ping() >= 0, "the first goes on"
 
 
-def test_any_child_that_is_killed_is_started_again(start: Start) -> None:
-    system = start()
+def test_any_child_that_is_killed_is_started_again(system: System) -> None:
     for name in ("keeper", "worker-0", "redis"):
         pid = system.kill(name)
         system.until(lambda n=name, p=pid: system.supervisor.pids.get(n, p) != p, f"{name} is back")
     system.supervisor.wait_ready(PATIENCE_S)
-    (done,) = system.finish(system.submit(wanted()))
+    (done,) = system.finish(system.submit(wanted(seed=5)))
     assert done.state is State.SUCCEEDED
 
 

@@ -40,7 +40,7 @@ def test_a_worker_makes_room_after_so_many_tasks_and_no_task_is_disturbed(start:
 
 
 def test_a_worker_that_leaks_makes_room_before_it_holds_too_much(start: Start) -> None:
-    system = start(environment={"FAKE_LEAK_MB": "300"}, worker_max_memory_mb=500)
+    system = start(environment={"FAKE_LEAK_MB": "200"}, worker_max_memory_mb=450)
     (done,) = system.finish(system.submit(request(grasps=32 * 6)))
     assert done.state is State.SUCCEEDED
     assert len(makers(system)) >= 3, "the second task is one too many for each"
