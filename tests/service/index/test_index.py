@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -156,27 +157,26 @@ def test_jobs_are_found_by_state_hand_and_object(parts: Parts) -> None:
     assert parts.index.jobs.page(hand="other").items == []
 
 
-@pytest.mark.parametrize("descending", [True, False])
-@pytest.mark.parametrize("by", ["epsilon", "penetration_depth_mm", "created", "stability_loss"])
-def test_grasps_page_through_in_the_order_of_any_metric(parts: Parts, by: str, descending: bool) -> None:
+def test_grasps_page_through_in_the_order_of_any_metric(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request(grasps=70))
     run_all(parts, job.id)
-    with parts.index.database.writing() as connection:  # some without the metric
-        if by != "created":
-            connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(**{by: None}))
-    sort = GraspSort(by=by, descending=descending)  # type: ignore[arg-type]
-    seen: list[GraspView] = []
-    cursor = None
-    while True:
-        page = parts.index.grasps.page(sort=sort, limit=16, cursor=cursor)
-        seen += page.items
-        if (cursor := page.next) is None:
-            break
-    assert len({(g.shard_id, g.row) for g in seen}) == len(seen) == 70
-    values = [getattr(grasp, by) for grasp in seen]
-    known = [value for value in values if value is not None]
-    assert known == sorted(known, reverse=descending)
-    assert values[: len(known)] == known, "those without the metric come last"
+    metrics = ("epsilon", "penetration_depth_mm", "stability_loss")
+    with parts.index.database.writing() as connection:  # some without the metrics
+        connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(dict.fromkeys(metrics)))
+    for by, descending in itertools.product((*metrics, "created"), (True, False)):
+        sort = GraspSort(by=by, descending=descending)  # type: ignore[arg-type]
+        seen: list[GraspView] = []
+        cursor = None
+        while True:
+            page = parts.index.grasps.page(sort=sort, limit=16, cursor=cursor)
+            seen += page.items
+            if (cursor := page.next) is None:
+                break
+        assert len({(g.shard_id, g.row) for g in seen}) == len(seen) == 70, sort
+        values = [getattr(grasp, by) for grasp in seen]
+        known = [value for value in values if value is not None]
+        assert known == sorted(known, reverse=descending), sort
+        assert values[: len(known)] == known, f"{sort}: those without the metric come last"
 
 
 def test_grasps_are_filtered_by_every_condition_at_once(parts: Parts) -> None:
@@ -386,46 +386,42 @@ def test_a_pair_is_found_whichever_way_the_database_goes(
     assert parts.index.grasps.page(GraspFilter(hand="gripper", object="cube"), sort=sort).items == []
 
 
-@pytest.mark.parametrize("where", [
+#: What is searched for, and the ways of the search: what it sorts at once, and how many rows it looks at in turn.
+SEARCHED = [
     GraspFilter(valid=True, at_least={"epsilon": 0.2}, at_most={"penetration_depth_mm": 2.5}),
     GraspFilter(hand="gripper", valid=False, at_least={"contact_area_cm2": 0.5}),
     GraspFilter(object="ball", at_most={"epsilon": 0.4}, at_least={"wrench_volume": 0.6}),
     GraspFilter(valid=True, at_least={"epsilon": 0.97, "contact_area_cm2": 0.97}),
-])  # fmt: skip
-@pytest.mark.parametrize(("sorted_at_once", "looked_at"), [(1000, (8, 16)), (0, (8, 16)), (0, (1000,))])
+]
+WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1000,))]
+
+
 @pytest.mark.parametrize("sort", [GraspSort(), GraspSort(by="penetration_depth_mm", descending=False)])
-def test_every_way_of_searching_finds_the_same(
-    parts: Parts,
-    monkeypatch: pytest.MonkeyPatch,
-    where: GraspFilter,
-    sorted_at_once: int,
-    looked_at: tuple[int, ...],
-    sort: GraspSort,
-) -> None:
+def test_every_way_of_searching_finds_the_same(parts: Parts, monkeypatch: pytest.MonkeyPatch, sort: GraspSort) -> None:
     job, _ = job_actions.submit(parts, request(grasps=160))
     run_all(parts, job.id)
     everything = parts.index.grasps.page(sort=sort, limit=200).items
-    passing = [
-        grasp
-        for grasp in everything
-        if where.valid in (None, grasp.valid)
-        and all(getattr(grasp, name) >= bound for name, bound in where.at_least.items())
-        and all(getattr(grasp, name) <= bound for name, bound in where.at_most.items())
-    ]
-    monkeypatch.setattr("service.index.queries.grasp_search.SORTED_AT_ONCE", sorted_at_once)
-    monkeypatch.setattr("service.index.queries.grasp_search.LOOKED_AT", looked_at)
-    found: list[GraspView] = []
-    cursor = None
-    while True:
-        page = parts.index.grasps.page(where, sort=sort, limit=7, cursor=cursor)
-        found += page.items
-        if (cursor := page.next) is None:
-            break
-    assert found == passing
+    for where, (sorted_at_once, looked_at) in itertools.product(SEARCHED, WAYS):
+        passing = [
+            grasp
+            for grasp in everything
+            if where.valid in (None, grasp.valid)
+            and all(getattr(grasp, name) >= bound for name, bound in where.at_least.items())
+            and all(getattr(grasp, name) <= bound for name, bound in where.at_most.items())
+        ]
+        monkeypatch.setattr("service.index.queries.grasp_search.SORTED_AT_ONCE", sorted_at_once)
+        monkeypatch.setattr("service.index.queries.grasp_search.LOOKED_AT", looked_at)
+        found: list[GraspView] = []
+        cursor = None
+        while True:
+            page = parts.index.grasps.page(where, sort=sort, limit=7, cursor=cursor)
+            found += page.items
+            if (cursor := page.next) is None:
+                break
+        assert found == passing, (where, sorted_at_once, looked_at)
 
 
-@pytest.mark.parametrize("bucket_s", [1, 45, 60, 3600, 5400, 86400])
-def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts, bucket_s: int) -> None:
+def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts) -> None:
     job, _ = job_actions.submit(parts, request(grasps=96, scenes=1))
     run_all(parts, job.id)
     hour = "2026-05-01T{:02}:{:02}:{:02}.123Z"
@@ -434,10 +430,12 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(parts: Parts, bucket_s
         for number, shard in enumerate(parts.index.shards.page(job=job.id, limit=9).items):
             change = update(tables.shards).where(tables.shards.c.id == shard.id)
             connection.execute(change.values(created=times[number % 4]))
-    buckets = parts.index.overview.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
-    assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6)
-    starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
-    assert starts == sorted({t - t % bucket_s for t in (int(datetime.fromisoformat(x).timestamp()) for x in times)})
+    seconds = [int(datetime.fromisoformat(x).timestamp()) for x in times]
+    for bucket_s in (1, 45, 60, 3600, 5400, 86400):
+        buckets = parts.index.overview.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
+        assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6), bucket_s
+        starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
+        assert starts == sorted({t - t % bucket_s for t in seconds}), bucket_s
 
 
 def test_writers_at_once_leave_the_rows_that_follow_from_the_store(parts: Parts, index_url: str) -> None:
