@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
+import trimesh
 from starlette.testclient import TestClient
 
 from api.uploads import files_of_upload
@@ -30,21 +30,38 @@ def check(http: TestClient, parts: Parts, kind: AssetKind, file: tuple[str, byte
     return load_check(parts.store, kind, digest)
 
 
+def stl(*meshes: trimesh.Trimesh) -> bytes:
+    return bytes(trimesh.util.concatenate(meshes).export(file_type="stl"))
+
+
+def shell() -> bytes:
+    """A ball without its top."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    ball.update_faces(ball.triangles_center[:, 2] < 0.01)
+    return stl(ball)
+
+
+#: A brick in millimetres; a ball of 4 cm, as its triangles have it, beside a crumb; and the shell.
+BRICK = stl(trimesh.creation.box((60.0, 40.0, 30.0)))
+BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+TWO = stl(BALL, trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((0.1, 0, 0)))
+
+
 @pytest.mark.parametrize(
-    ("file", "options", "verdict", "volume"),
+    ("data", "options", "verdict", "volume"),
     [
-        ("banana_in_millimetres.stl", {"units": "mm", "density": 950.0}, "accept", 171.3e-6),
-        ("banana_in_millimetres.stl", {"scale_to": 0.1}, "accept", 171.3e-6 * (0.1 / 0.1785) ** 3),
-        ("two_components.stl", {"keep_largest": True, "mass": 0.2}, "repair", 0.2647e-3),
-        ("open_shell.stl", {"allow_open": True}, "accept", None),
-        ("open_shell.stl", {}, "refuse", None),
+        (BRICK, {"units": "mm", "density": 950.0}, "accept", 60e-3 * 40e-3 * 30e-3),
+        (BRICK, {"scale_to": 0.1}, "accept", 60e-3 * 40e-3 * 30e-3 * (0.1 / 0.06) ** 3),
+        (TWO, {"keep_largest": True, "mass": 0.2}, "repair", BALL.volume),
+        (shell(), {"allow_open": True}, "accept", None),
+        (shell(), {}, "refuse", None),
     ],
+    ids=["units", "scale", "largest", "open", "none"],
 )
 def test_an_option_of_an_object_decides_its_check(
-    http: TestClient, parts: Parts, shared_data: Path, file: str, options: dict[str, Any], verdict: str, volume: Any
+    http: TestClient, parts: Parts, data: bytes, options: dict[str, Any], verdict: str, volume: float | None
 ) -> None:
-    data = (shared_data / "bad" / file).read_bytes()
-    found = check(http, parts, AssetKind.OBJECT, (file, data), object_options(**options))
+    found = check(http, parts, AssetKind.OBJECT, ("thing.stl", data), object_options(**options))
     assert found["verdict"] == verdict, found["message"]
     facts = found["facts"]
     if volume is not None:
@@ -85,10 +102,8 @@ def test_options_that_are_no_json_object_are_refused(http: TestClient, options: 
     assert answer.status_code == 422 and "JSON object" in answer.json()["detail"]
 
 
-def test_what_was_refused_gets_in_under_its_name_with_the_mend(
-    http: TestClient, parts: Parts, shared_data: Path
-) -> None:
-    file = ("open_shell.stl", (shared_data / "bad" / "open_shell.stl").read_bytes())
+def test_what_was_refused_gets_in_under_its_name_with_the_mend(http: TestClient, parts: Parts) -> None:
+    file = ("open_shell.stl", shell())
     first = http.post("/v1/objects", files={"file": file}).json()
     asset = load_asset(parts.store, AssetKind.OBJECT, first["digest"])
     parts.index.write.add_asset(asset, check(http, parts, AssetKind.OBJECT, file, {}))

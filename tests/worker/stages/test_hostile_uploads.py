@@ -193,6 +193,7 @@ def test_an_archive_that_attacks_is_refused_at_the_door_and_reaches_no_worker(
     assert computed() - start < BOUND_S
 
 
+@cache
 def rough(segments: int) -> bytes:
     """A ball with noise on it: slow to simplify."""
     vertices, faces = sphere(0.04, segments)
