@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from service.index.index import Index
 from service.index.rebuild import differences
 from service.model import names
 from service.model.clock import timestamp
@@ -22,6 +21,7 @@ from service.pipeline.reaper import LOST_AFTER_S
 from service.queue.port import Event, EventKind
 from service.store.library import publish_asset, stored_assets
 from tests.fakes import HAND_FILES, fake_stages, make_shard, request
+from tests.indexes import empty_index
 from tests.memory_queue import Delivery, MemoryQueue
 from worker.process.runner import Runner
 from worker.stages.context import StopReason, TaskContext
@@ -334,7 +334,7 @@ def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.parts, request(grasps=64, scenes=1))
     bench.do(bench.take())
     bench.pass_time(1)
-    fresh = Index(f"sqlite:///{bench.parts.settings.data_dir / 'fresh.sqlite'}")
+    fresh = empty_index(f"sqlite:///{bench.parts.settings.data_dir / 'fresh.sqlite'}")
     bench = Bench(Parts(bench.parts.settings, bench.parts.store, fresh, bench.queue))
     bench.keeper.round()
     waiting = len(bench.queue.waiting())
@@ -443,6 +443,7 @@ def test_the_loop_outlives_parts_that_are_away_and_ends_when_told(
 
     keeper = Keeper(parts)
     monkeypatch.setattr(keeper, "round", failing)
-    monkeypatch.setattr(stop, "wait", lambda seconds: None)
+    # What goes on beside the rounds ends by it.
+    monkeypatch.setattr(stop, "wait", lambda seconds: stop.is_set())
     keeper.run(stop)
     assert rounds == 3
