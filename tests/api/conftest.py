@@ -17,6 +17,7 @@ from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.store import open_store
 from tests.api.factories import add_builtins
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.service.conftest import redis_server, rq_queue
 
@@ -31,7 +32,7 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with the built-in hands and objects in store and index; each test gets a copy."""
     folder = tmp_path_factory.mktemp("furnished") / "data"
     made = Settings(data_dir=folder)
-    opened = Parts(made, open_store(made.resolved_store_url), Index(made.resolved_index_url), MemoryQueue())
+    opened = Parts(made, open_store(made.resolved_store_url), empty_index(made.resolved_index_url), MemoryQueue())
     add_builtins(opened)
     opened.close()
     return folder

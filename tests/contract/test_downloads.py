@@ -12,11 +12,11 @@ import pytest
 from starlette.testclient import TestClient
 
 from api.app import create_app
-from service.index.index import Index
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, finish_all
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server
 
@@ -28,7 +28,7 @@ def front_door(folder: Path, url: str, endpoint: str | None) -> Iterator[tuple[T
     """An API on the S3 store; a shard's address and SHA-256."""
     settings = Settings(data_dir=folder, store_url=url, store_public_endpoint=endpoint)
     store = open_store(url, public_endpoint=endpoint)
-    parts = Parts(settings, store, Index(settings.resolved_index_url), MemoryQueue())
+    parts = Parts(settings, store, empty_index(settings.resolved_index_url), MemoryQueue())
     add_builtins(parts)
     shard = finish_all(parts, add_job(parts))[0]
     client = TestClient(create_app(settings, parts), base_url="http://127.0.0.1:8000")

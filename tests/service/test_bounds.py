@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.large_index import fill
-from service.index.index import Index
 from service.model.clock import timestamp
 from service.model.states import Lane
 from service.queue.port import Event, EventKind, Report
@@ -13,6 +12,7 @@ from service.queue.rq_queue import RqQueue, cancel_key
 from service.queue.streams import EVENTS, EVENTS_KEPT, NUMBER
 from service.store.store import open_store
 from tests.fakes import message_for
+from tests.indexes import empty_index
 
 #: Redis memory of a waiting task [bytes]; at most GRASPD_QUEUE_WINDOW of them wait in each lane.
 TASK_BYTES = 3000
@@ -59,7 +59,7 @@ def test_the_stream_of_events_takes_a_bounded_part_of_redis(rq_queue: RqQueue) -
 
 
 def test_an_index_grows_by_about_a_kilobyte_a_grasp(tmp_path: Path) -> None:
-    index = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     counts = fill(index, open_store("memory://"), grasps=16_000, jobs=20)
     index.close()
     assert (tmp_path / "index.sqlite").stat().st_size < counts["grasps"] * GRASP_BYTES

@@ -6,12 +6,12 @@ from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from api.app import create_app
-from service.index.index import Index
 from service.index.rebuild import rebuild
 from service.pipeline.backends import Parts
 from service.settings import Settings
 from tests.api.factories import add_job
 from tests.damage import overwrite
+from tests.indexes import empty_index
 
 
 def asked_anew(app: FastAPI) -> dict[str, object]:
@@ -23,7 +23,7 @@ def asked_anew(app: FastAPI) -> dict[str, object]:
 
 def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings, parts: Parts) -> None:
     record = add_job(parts)
-    fresh = Index(f"sqlite:///{settings.data_dir / 'fresh.sqlite'}")
+    fresh = empty_index(f"sqlite:///{settings.data_dir / 'fresh.sqlite'}")
     lost = Parts(settings, parts.store, fresh, parts.queue)
     app = create_app(settings, lost)
     fresh.write.add_job(record)

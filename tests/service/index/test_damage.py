@@ -50,7 +50,7 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
 
 def lost(parts: Parts) -> Parts:
     """The same service with an index that knows nothing."""
-    index = Index(f"sqlite:///{parts.settings.data_dir / 'fresh.sqlite'}")
+    index = empty_index(f"sqlite:///{parts.settings.data_dir / 'fresh.sqlite'}")
     return Parts(parts.settings, parts.store, index, MemoryQueue())
 
 

@@ -14,7 +14,6 @@ from sqlalchemy.dialects import sqlite
 from api.metrics import Metrics, Snapshot
 from service.index import at_scrape
 from service.index.damage import Damage
-from service.index.index import Index
 from service.model.messages import TaskMessage
 from service.model.states import Lane, Stage, State
 from service.pipeline.backends import Parts
@@ -24,6 +23,7 @@ from service.pipeline.tally import MOST_KINDS, OTHER_KIND, Tally, parse_field
 from service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import make_shard, message_for, request
+from tests.indexes import empty_index
 
 
 class Sums:
@@ -57,7 +57,7 @@ def tasks(count: int) -> list[TaskMessage]:
     ],
 )
 def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: Any) -> None:
-    index = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     text = str(query.compile(dialect=sqlite.dialect(), compile_kwargs={"literal_binds": True}))
     with index.database.reading() as connection:
         steps = [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from service.index.index import Index
 from service.model import names
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper
@@ -18,6 +17,7 @@ from service.store.manifests import ShardManifest
 from service.store.store import open_store
 from tests.damage import flip, overwrite, remove
 from tests.fakes import make_shard, message_for
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 
 WAIT_S = 30.0
@@ -150,7 +150,9 @@ def test_a_second_verify_is_refused(
 
     folder = tmp_path / "one"
     settings = Settings(data_dir=folder)
-    other = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue())
+    other = Parts(
+        settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), MemoryQueue()
+    )
     assert Turn(other, is_keeper=False).is_mine()
     command = ["store", "verify", "--data-dir", str(folder)]
     refused = CliRunner().invoke(app, command)

@@ -13,7 +13,6 @@ import pytest
 from rq.serializers import JSONSerializer
 
 from api.metrics import Metrics, Snapshot
-from service.index.index import Index
 from service.model.clock import timestamp
 from service.model.errors import UnavailableError
 from service.model.states import Stage, State
@@ -27,6 +26,7 @@ from service.queue.streams import EVENTS
 from service.settings import Settings
 from service.store.store import open_store
 from tests.fakes import add_assets, request
+from tests.indexes import empty_index
 
 WIP = "rq:wip:interactive-synthesize"
 WAITING = "rq:queue:interactive-synthesize"
@@ -84,7 +84,7 @@ FORGERIES: dict[str, Callable[[Any], object]] = {
 @pytest.fixture
 def parts(tmp_path: Path, rq_queue: RqQueue) -> Parts:
     settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0)
-    made = Parts(settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), rq_queue)
+    made = Parts(settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), rq_queue)
     add_assets(made)
     return made
 

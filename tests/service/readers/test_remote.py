@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.index.index import Index
 from service.model.records import JobRecord
 from service.pipeline.backends import Parts
 from service.readers import Grasps, Pictures, open_shards
 from service.settings import Settings
 from service.store.store import open_store
 from tests.api import factories
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.servers import S3Server
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.s3
 
 @pytest.fixture
 def remote(tmp_path: Path, s3_url: str) -> Iterator[Parts]:
-    index = Index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     made = Parts(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
     factories.add_builtins(made)
     yield made

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.index.index import Index
 from service.model import names
 from service.model.clock import timestamp
 from service.model.dataset_records import Snapshot
@@ -26,6 +25,7 @@ from service.store.records import put_record, read_record
 from service.store.shards import json_attribute
 from service.store.store import open_store
 from tests.api.factories import add_builtins, poses, scene_columns
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from tests.planning import plan_all
 from worker.stages.output import Output, shard_of
@@ -72,7 +72,7 @@ def dataset(
         options: of the jobs.
     """
     index = f"sqlite:///{folder / 'index.sqlite'}"
-    parts = Parts(Settings(data_dir=folder), open_store(url), Index(index), MemoryQueue())
+    parts = Parts(Settings(data_dir=folder), open_store(url), empty_index(index), MemoryQueue())
     add_builtins(parts)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, **options}
     wanted = DatasetRequest.model_validate(

@@ -18,6 +18,7 @@ from service.readers import Pictures, Shards, open_shards
 from service.settings import Settings
 from service.store.shards import Shard
 from service.store.store import open_store
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
 from worker.files.exchange import replicator, webdataset
 from worker.rendering.annotate import box_corners
@@ -97,11 +98,10 @@ def test_an_object_out_of_view_has_no_2d_box(views: Shard, tmp_path: Path) -> No
 @pytest.fixture
 def shards(tmp_path: Path) -> Shards:
     """A finished job with pictures."""
-    from service.index.index import Index
     from tests.api import factories
 
     settings = Settings(data_dir=tmp_path)
-    parts = Parts(settings, open_store("memory://"), Index(settings.resolved_index_url), MemoryQueue())
+    parts = Parts(settings, open_store("memory://"), empty_index(settings.resolved_index_url), MemoryQueue())
     factories.add_builtins(parts)
     record = factories.add_job(parts, scenes=2, views=2, width=W, height=H)
     factories.finish_all(parts, record)
