@@ -26,13 +26,9 @@ def kitchen(http: TestClient) -> dict[str, Any]:
     return answer.json()
 
 
-def carry_out(parts: Parts) -> None:
-    plan_all(parts)
-
-
 def finish_cells(parts: Parts, http: TestClient, count: int) -> None:
     """Do all tasks of the first cells."""
-    carry_out(parts)
+    plan_all(parts)
     for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
         finish_all(parts, read_record(JobRecord, parts.store, names.job_record(cell["job_id"])))
 
@@ -58,7 +54,7 @@ def test_a_dataset_that_is_done_is_found_again_with_200(
 def test_options_of_the_method_reach_the_jobs_of_the_cells(http: TestClient, parts: Parts) -> None:
     answer = http.post("/v1/datasets", json=WANTED | {"method": "graspit", "options": {"keep": 20}})
     assert answer.json()["options"]["options"] == {"keep": 20}
-    carry_out(parts)
+    plan_all(parts)
     cell = http.get("/v1/datasets/kitchen/cells").json()["items"][0]
     assert http.get(f"/v1/jobs/{cell['job_id']}").json()["request"]["options"] == {"keep": 20}
     assert "graspit keep=20" in http.get("/datasets/kitchen").text
@@ -142,14 +138,14 @@ def test_an_estimate_records_nothing(http: TestClient) -> None:
 
 
 def test_cancel_and_retry_are_accepted_once(http: TestClient, parts: Parts, kitchen: dict[str, Any]) -> None:
-    carry_out(parts)
+    plan_all(parts)
     assert http.post("/v1/datasets/kitchen/retry").status_code == 409
     assert http.post("/v1/datasets/kitchen/cancel").status_code == 202
     assert http.post("/v1/datasets/kitchen/cancel").status_code == 409
-    carry_out(parts)
+    plan_all(parts)
     assert http.get("/v1/datasets/kitchen").json()["state"] == "cancelled"
     assert http.post("/v1/datasets/kitchen/retry").status_code == 202
-    carry_out(parts)
+    plan_all(parts)
     assert http.get("/v1/datasets/kitchen").json()["state"] == "queued"
 
 

@@ -19,7 +19,7 @@ from service.model.states import AssetKind
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.run import ALONE, Run
-from worker.studies.stability.shapes import cube, refused, shape_cell
+from worker.studies.stability.shapes import BOUNDS, MEASURE, cube, refused, shape_cell
 
 Coupling = Literal["each joint", "distal follows", "a drive a finger", "one drive"]
 
@@ -119,8 +119,8 @@ def hand_map(
     return StabilityMap(
         "hands", f"{count} grasps of a cube of {CUBE_MM:g} mm in hands that are hard, {fidelity}",
         "the hand's parameter", "what a drive moves",
-        "share of tries that are valid: certified by the referee, and past the geometric gate",
-        "weak: under a half; broken: none, or a number that is none",
+        MEASURE,
+        BOUNDS,
         reachable(cells, lambda cell: True),
         "few or no valid grasps, and a low share in the hand's self-test",
         "a hand without two parts that oppose each other is refused; the self-test of a new hand says which share "

@@ -8,7 +8,7 @@ from typing import Final
 from service.model.stability import StabilityMap, reachable
 from worker.hands.model import HandModel
 from worker.run import ALONE, Run
-from worker.studies.stability.shapes import FAMILIES, shape_cell
+from worker.studies.stability.shapes import BOUNDS, FAMILIES, MEASURE, SHOWS, shape_cell
 
 #: Methods around a free object; the first is graspd's own.
 METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
@@ -39,10 +39,10 @@ def peer_map(
     return StabilityMap(
         "peers", f"{count} grasps of {hand.name} by each method on shapes that are hard", "the shape's parameter",
         "method",
-        "share of tries that are valid: certified by the referee, and past the geometric gate",
-        "weak: under a half; broken: none, or a number that is none",
+        MEASURE,
+        BOUNDS,
         reachable(cells, lambda cell: True),
-        "few or no valid grasps: a job ends with a note that its budget found fewer than asked for",
+        SHOWS,
         "what a method leaves in the object or the referee drops is never valid; a job that finds too few says so",
         "tests/worker/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
         reach="all: any job may name another method",

@@ -20,7 +20,7 @@ from worker.hands.model import HandModel
 from worker.run import ALONE, Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.simulation.surroundings import Scenes
-from worker.studies.stability.shapes import prepared
+from worker.studies.stability.shapes import prepared, refused
 
 Say = Callable[[str], None]
 Support = HalfSpace | Box
@@ -197,7 +197,7 @@ def _cell(
     try:
         found = planned(hand, sides, spec, fidelity, count, run)
     except GraspdError as error:
-        cell = MapCell(panel, x, y, float("nan"), "refused", str(error))
+        cell = refused(panel, x, y, error)
     else:
         cell = MapCell(panel, x, y, *_told(found))
     say(f"{panel} {x} {y}: {cell.outcome} {cell.note}")

@@ -20,6 +20,10 @@ from worker.objects.prepare import load_object
 from worker.run import ALONE, Run
 
 MILLIMETRES: Final = 1e-3
+#: What maps of raw grasps tell of a cell, from where on it is bad, and how a user sees it.
+MEASURE: Final = "share of tries that are valid: certified by the referee, and past the geometric gate"
+BOUNDS: Final = "weak: under a half; broken: none, or a number that is none"
+SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than asked for"
 
 
 def sheet(thickness_mm: float) -> Any:
@@ -108,10 +112,10 @@ def shape_map(
             cells.append(cell)
     return StabilityMap(
         "shapes", f"{count} grasps of {hand.name} on shapes that are hard", "the shape's parameter", "fidelity",
-        "share of tries that are valid: certified by the referee, and past the geometric gate",
-        "weak: under a half; broken: none, or a number that is none",
+        MEASURE,
+        BOUNDS,
         reachable(cells, lambda cell: True),
-        "few or no valid grasps: a job ends with a note that its budget found fewer than asked for",
+        SHOWS,
         "ingest refuses what has no inside and says `thin` where walls are; the gate and the referee flag grasps that "
         "sink in; a job that finds too few says so",
         "tests/worker/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
