@@ -85,13 +85,6 @@ STUDIES: Final = (
         stages=(),
     ),
     Study(
-        "bench-points", "the same with other numbers of hand points and faces", ("results/points/*",),
-        (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --points 500 --points 1000 "
-         "--points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 --out OUT/results/points",),
-        ("graspd bench --fidelity draft --batch 4 --threads 2 --repeats 1 --points 500 --out OUT/results/points",),
-        stages=(),
-    ),
-    Study(
         "chart", "speed against accuracy: methods, fidelities, knobs",
         ("results/chart.*", "results/sweeps.png"),
         (f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
