@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
@@ -13,6 +16,7 @@ class Launches:
     def __init__(self, device: str) -> None:
         self.device = device
         self._commands: list[tuple[str, Any]] = []
+        self._calls: list[Callable[[], object]] = []
         self._arguments: list[Any] = []
         self._graph: Any = None
 
@@ -20,6 +24,7 @@ class Launches:
         """Append a launch over `dim`; its arrays live as long as the list does."""
         command = wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device, record_cmd=True)
         self._commands.append((kernel.key.rpartition(".")[2], command))
+        self._calls.append(_packed(command))
         self._arguments.append((inputs, outputs))
         self._graph = None
 
@@ -29,7 +34,12 @@ class Launches:
 
     def run(self, times: int = 1) -> None:
         """Launch all, so many times, without waiting for the device."""
-        if wp.get_device(self.device).is_cuda and times > 2:
+        if not wp.get_device(self.device).is_cuda:
+            for _ in range(times):
+                for call in self._calls:
+                    call()
+            return
+        if times > 2:
             if self._graph is None:
                 with wp.ScopedCapture(device=self.device) as capture:
                     self._launch_all()
@@ -43,3 +53,21 @@ class Launches:
     def _launch_all(self) -> None:
         for _, command in self._commands:
             command.launch()
+
+
+def _packed(command: Any) -> Callable[[], object]:
+    """What runs a recorded launch on the CPU.
+
+    Warp packs the arguments anew each time, under the interpreter's lock: a twentieth of an iteration of a few hands,
+    for which other threads wait. They are packed here once, as `warp._src.context.invoke` does it."""
+    if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
+        return partial(command.launch)
+    bounds, *values = command.params
+    arguments = _arguments_of(tuple(type(value) for value in values))(*values)
+    return partial(command.hooks.forward, ctypes.byref(bounds), ctypes.byref(arguments))
+
+
+@cache
+def _arguments_of(types: tuple[type, ...]) -> type[ctypes.Structure]:
+    fields = [(f"argument{k}", kind) for k, kind in enumerate(types)]
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})

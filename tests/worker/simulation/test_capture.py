@@ -121,6 +121,7 @@ def test_nothing_on_the_host_is_touched_between_two_launches(monkeypatch: pytest
 
 
 def test_the_guard_notices_a_read_between_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    Graphs(monkeypatch)
     broken = forbid_the_host(monkeypatch)
     some = wp.zeros(1, dtype=wp.float32, device="cpu")
     monkeypatch.setattr(Launches, "_launch_all", lambda self: some.numpy())
