@@ -29,7 +29,8 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
         thresholds_m: (T,) [m].
     """
     near = np.abs(distance)
-    return np.stack([(near < t) @ area for t in thresholds_m], axis=-1) * 1e4
+    # Row by row: the rounding of a product of matrices depends on how many rows there are.
+    return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
 def choose_contacts(
