@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -9,6 +11,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.errors import InputError
@@ -36,6 +39,10 @@ DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
 #: Grasps a thread works on at a time: small enough to cancel soon, large enough to fill a kernel launch.
 CHUNK: Final = 16
+_pairs: LRUCache[str, _Pair] = LRUCache(4)
+_lock = threading.Lock()
+# Solids that outlive the interpreter are told as leaks by their library.
+atexit.register(_pairs.clear)
 
 
 def measure(
@@ -97,8 +104,12 @@ class _Terms:
 
     @cached_property
     def pair(self) -> _Pair:
-        """Kept with the terms, by a process of a pool too."""
-        return _Pair(self)
+        """Kept, since a batch is measured a few grasps at a time."""
+        content = content_of(self)
+        with _lock:
+            if content not in _pairs:
+                _pairs[content] = _Pair(self)
+            return _pairs[content]
 
     def empty(self) -> Columns:
         """Columns of no grasps."""
@@ -130,7 +141,7 @@ def _columns(terms: _Terms, posture: Posture) -> Columns:
 
 
 class _Pair:
-    """What the chunks of one table share."""
+    """What the chunks of tables of one pair share. Safe to use from several threads."""
 
     def __init__(self, terms: _Terms) -> None:
         hand, obj = terms.hand, terms.obj
