@@ -10,7 +10,7 @@ from worker.grasps import GraspSet
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fitting import fitting_pairs
-from worker.planners.port import Asked, Joined, Method, Options, Planner, Trial, Wanted
+from worker.planners.port import Asked, Joined, Method, NoPlace, Options, Planner, Trial, Wanted
 from worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
 from worker.run import ALONE, Run
 
@@ -20,6 +20,7 @@ __all__ = [
     "Asked",
     "Joined",
     "Method",
+    "NoPlace",
     "Options",
     "Planner",
     "Run",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from service.model.errors import InputError
 from service.model.fidelity import Fidelity
 from worker.grasps import GraspSet
 from worker.hands.model import HandModel
@@ -21,6 +22,10 @@ from worker.simulation.surroundings import Placed
 #: Scores (N,) of N grasps, in their scenes or around a free object (None): the smaller the better, below 1 good enough
 #: to look at no other candidate, from 2 on so bad that others are worth their time. Called by several threads at once.
 Trial = Callable[[GraspSet, Placed | None], NDArray[np.float64]]
+
+
+class NoPlace(InputError):
+    """No grasp of a batch finds where to start in its scenes."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,11 @@ class Wanted:
     """Their scenes: grasp i in scene `placed.index[i]`; None: around a free object."""
     trial: Trial | None = None
     """What several candidates of a grasp go through before one is chosen; None: the planner's own merit chooses."""
+    first: int = 0
+    """Number of the first grasp within its batch; above 0 for methods that make batches `in_parts` only."""
+    others_have_place: bool = False
+    """Whether grasps of the batch that are made elsewhere find where to start in their scenes: then these are made even
+    if none of them does, and end blocked."""
 
 
 class Planner(Protocol):
@@ -48,6 +58,7 @@ class Planner(Protocol):
     Raises:
         TaskCancelled: when `run.cancelled()` answers True.
         InputError: when the pair cannot be grasped at all, with the reason.
+        NoPlace: in scenes, when nowhere is a place to start, though `wanted.others_have_place` is not told.
     """
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> GraspSet: ...
@@ -92,6 +103,8 @@ class Method:
     """Whether it plans grasps for the scenes they are in, or around free objects only."""
     free: bool = True
     """Whether it plans around free objects."""
+    in_parts: bool = False
+    """Whether it makes the grasps of a batch from `Wanted.first` on without those before it."""
     options: type[Options] = Options
     """The options it takes."""
     uses: tuple[str, ...] = ()

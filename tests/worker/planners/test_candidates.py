@@ -175,8 +175,8 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
     attempts: list[int] = []
     set_out = planner._set_out
 
-    def counted(launch, rows, attempt: int = 0):
-        attempts.append(attempt)
+    def counted(launch, rows, attempt):
+        attempts.extend(attempt.tolist())
         return set_out(launch, rows, attempt)
 
     monkeypatch.setattr(planner, "_set_out", counted)
@@ -191,3 +191,21 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
     # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
     assert ATTEMPTS // 2 < len(scores) <= (1 + ATTEMPTS) * QUICK.starts // 2
     assert len(found) == 1
+
+
+def test_attempts_made_ahead_give_the_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, obj, wanted, _ = free
+
+    def picky(grasps: GraspSet, placed: Placed | None) -> np.ndarray:
+        """Takes a fifth of the hands, by where they are."""
+        assert placed is None
+        chance = np.modf(np.abs(grasps.grasp.hand_pose[:, 0]) * 1e4)[0]
+        return np.where(chance < 0.2, 0.5, 3.0 + chance)
+
+    found = {}
+    for ahead in (1, 4):
+        monkeypatch.setattr(planner, "AHEAD", ahead)
+        found[ahead] = synthesize(hand, obj, replace(wanted, trial=picky), Run(threads=2))
+    np.testing.assert_array_equal(found[4].grasp.hand_pose, found[1].grasp.hand_pose)
+    np.testing.assert_array_equal(found[4].squeeze.joint_positions, found[1].squeeze.joint_positions)
+    assert (picky(found[1], None) < 1).sum() > len(found[1].stability_loss) // 2

@@ -41,7 +41,7 @@ class Batches:
         counts = [one.count for one in wanted]
         self.owner = np.repeat(np.arange(len(asked)), counts)
         """(n,) the batch of each row."""
-        self.index = np.concatenate([np.arange(count) for count in counts])
+        self.index = np.concatenate([one.first + np.arange(one.count) for one in wanted])
         """(n,) number of each row within its batch."""
         self.opened = np.zeros(len(self.owner), bool)
         """(n,) whether hands of a row set out more open than their pre-shape: in that they had no place."""
@@ -105,13 +105,15 @@ class Batches:
         if len(self.errors) == len(self.asked):
             raise self.errors[min(self.errors)]
 
-    def generators(self, rows: Rows, attempt: int = 0) -> list[np.random.Generator]:
-        """Random numbers of the starts of these rows at an attempt, those of one grasp side by side."""
-        each = range(attempt * self.fidelity.starts, (attempt + 1) * self.fidelity.starts)
+    def generators(self, rows: Rows, attempt: Rows) -> list[np.random.Generator]:
+        """Random numbers of the starts of these rows at an attempt (n,) each, those of one grasp side by side."""
+        starts = self.fidelity.starts
         wanted = [self.asked[owner].wanted for owner in self.owner[rows].tolist()]
-        indices = self.index[rows].tolist()
+        numbers = zip(wanted, self.index[rows].tolist(), attempt.tolist(), strict=True)
         return [
-            start_generator(one.seed, one.batch, i, k) for one, i in zip(wanted, indices, strict=True) for k in each
+            start_generator(one.seed, one.batch, i, k)
+            for one, i, made in numbers
+            for k in range(made * starts, (made + 1) * starts)
         ]
 
     def trial(self, grasps: GraspSet, rows: Rows) -> Floats:

@@ -14,5 +14,6 @@ METHOD: Final = Method(
     planner=lambda options: plan,
     joined=lambda options: plan_joined,
     in_scenes=True,
+    in_parts=True,
     uses=tuple(name for name in Fidelity.model_fields if name != "name"),
 )

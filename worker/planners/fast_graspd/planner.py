@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Final
 
 import numpy as np
@@ -53,6 +54,8 @@ FAILED: Final = 2.0
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
 ATTEMPTS: Final = 10
+#: Attempts of one grasp that are made at once, at the most.
+AHEAD: Final = 4
 
 
 @dataclass
@@ -148,11 +151,17 @@ def optimise(pair: Pair, batches: Batches, run: Run, *, postures: bool = False) 
     begun = begun.take(np.flatnonzero(np.isin(begun.rows, rows)), batches.fidelity.starts)
 
     def work(which: range) -> Part:
-        part = _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
-        part = _tried_again(launch, part)
-        return _posed(launch, part) if postures and part.grasps is None else part
+        return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
 
-    return run_parts(cut(len(rows), run, least=PART), work)
+    parts = run_parts(cut(len(rows), run, least=PART), work)
+    if batches.placed is None:
+        parts = [_tried_again(launch, reduce(Part.followed_by, parts), run)]
+    if not postures or batches.has_trial:
+        return parts
+    whole = reduce(Part.followed_by, parts)
+    return run_parts(
+        cut(len(rows), run, least=PART), lambda which: _posed(launch, whole.take(np.arange(which.start, which.stop)))
+    )
 
 
 @dataclass(frozen=True)
@@ -209,7 +218,7 @@ def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
 
     def work(which: range) -> _Begun:
         some = rows[which.start : which.stop]
-        found = _set_out(launch, some)
+        found = _set_out(launch, some, np.zeros(len(some), int))
         launch.batches.step(some, 1, "starts")
         return found
 
@@ -221,8 +230,8 @@ def _begun(launch: _Launch, rows: Rows, run: Run) -> _Begun:
     return _Begun(np.concatenate([part.rows for part in parts]), _joined_states([p.state for p in parts]), depth, touch)
 
 
-def _set_out(launch: _Launch, rows: Rows, attempt: int = 0) -> _Begun:
-    """The starts of grasps at the first attempt or a later one."""
+def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
+    """The starts of grasps at the first attempt or a later one (n,); a grasp may be there at several."""
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
@@ -241,7 +250,7 @@ def _set_out(launch: _Launch, rows: Rows, attempt: int = 0) -> _Begun:
 def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     """Rows of the batches that found where to start.
 
-    Around a free object every grasp must, in scenes one of a batch."""
+    Around a free object every grasp must, in scenes one of a batch; of its others somebody else may know."""
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
     owners = batches.owner[begun.rows]
@@ -249,7 +258,7 @@ def _with_place(launch: _Launch, begun: _Begun) -> Rows:
         own = deep[owners == owner]
         if batches.placed is None and own.max() > NO_PLACE:
             batches.put_out(owner, starts.no_place(launch.coarse))
-        elif batches.placed is not None and own.min() > NO_PLACE:
+        elif batches.placed is not None and own.min() > NO_PLACE and not batches.asked[owner].wanted.others_have_place:
             batches.put_out(owner, scene_starts.no_place(launch.coarse))
     return batches.left()
 
@@ -286,23 +295,38 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     return Part(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
 
 
-def _tried_again(launch: _Launch, part: Part) -> Part:
-    """Grasps of free objects that balance poorly, or fail their trial, set out once more; the better one stays."""
-    if launch.batches.placed is not None:
-        return part
+def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
+    """Grasps of free objects that balance poorly, or fail their trial, set out again; the first good one stays, or else
+    the best.
+
+    The last few would leave cores idle, and a hand of a small launch costs half as much again: they make some attempts
+    ahead. Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
     limit, attempts = (FAILED, ATTEMPTS) if launch.batches.has_trial else (SET_OUT_AGAIN, 1)
-    for attempt in range(1, attempts + 1):
-        poor = np.flatnonzero(part.merit > limit)
-        if not len(poor):
-            break
-        begun = _set_out(launch, part.rows[poor], attempt)
-        again = _work(launch, begun)
-        lost = begun.depth.reshape(len(poor), -1).max(axis=1) > NO_PLACE
-        better = np.flatnonzero((again.merit < part.merit[poor]) & ~lost)
-        chosen = np.arange(len(part.rows))
-        chosen[poor[better]] = len(part.rows) + better
-        part = part.followed_by(again).take(chosen)
+    number = 1
+    while number <= attempts and len(poor := np.flatnonzero(part.merit > limit)):
+        ahead = int(np.clip(PART * run.cores // len(poor), 1, min(AHEAD, attempts + 1 - number)))
+        attempt = np.repeat(np.arange(number, number + ahead), len(poor))
+        again = _set_out_again(launch, np.tile(part.rows[poor], ahead), attempt, run)
+        merit, chosen = part.merit.copy(), np.arange(len(part.rows))
+        for made in np.split(np.arange(len(attempt)), ahead):
+            better = (merit[poor] > limit) & (again.merit[made] < merit[poor])
+            chosen[poor[better]] = len(part.rows) + made[better]
+            merit[poor[better]] = again.merit[made[better]]
+        part, number = part.followed_by(again).take(chosen), number + ahead
     return part
+
+
+def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: Run) -> Part:
+    """Later attempts (n,) of grasps; the merit of those without a place is inf."""
+
+    def work(which: range) -> Part:
+        some = slice(which.start, which.stop)
+        begun = _set_out(launch, rows[some], attempt[some])
+        made = _work(launch, begun)
+        lost = begun.depth.reshape(len(made.rows), -1).max(axis=1) > NO_PLACE
+        return replace(made, merit=np.where(lost, np.inf, made.merit))
+
+    return reduce(Part.followed_by, run_parts(cut(len(rows), run), work))
 
 
 def _posed(launch: _Launch, part: Part) -> Part:

@@ -21,6 +21,7 @@ from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
 from worker.planners.fast_graspd.outlines import spread_directions
 from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe
+from worker.planners.port import NoPlace
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import STANDOFF_M, Placed, Surroundings
@@ -85,10 +86,10 @@ def free_ways(scene: Surroundings, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
-def no_place(model: Model) -> InputError:
+def no_place(model: Model) -> NoPlace:
     """What to say of a batch none of whose starts is clear."""
     hand, obj = model.hand.model, model.obj.model
-    return InputError(
+    return NoPlace(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
         "around it leaves no room"
     )

@@ -57,6 +57,7 @@ METHOD: Final = Method(
     planner=Learned,
     joined=lambda options: Learned(options).joined,
     in_scenes=True,
+    in_parts=True,
     free=False,
     options=LearnedOptions,
     uses=tuple(name for name in Fidelity.model_fields if name not in ("name", "starts")),
