@@ -20,7 +20,7 @@ from benchmarks.chain import environment_of
 
 _PATIENCE_S: Final = 300.0
 #: Pause between two looks at a job [s]: each takes the API some milliseconds.
-_LOOK_S: Final = 0.5
+_LOOK_S: Final = 0.1
 
 
 @dataclass(frozen=True)

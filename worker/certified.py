@@ -18,12 +18,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.domain import BATCH_SIZE, JobOptions
+from service.model.domain import JobOptions
 from worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
-from worker.planners import Trial, Wanted, fitting_pairs, synthesize
+from worker.planners import NoPlace, Trial, Wanted, fitting_pairs, method, synthesize
 from worker.quality.diversity import POINTS, distinct, hand_points
 from worker.quality.gate import passes
 from worker.quality.referee.decomposition import ConvexPieces, decompose
@@ -36,19 +36,13 @@ from worker.quality.referee.protocol import DIRECTIONS
 from worker.quality.referee.robust import reaches, robust
 from worker.quality.referee.robustness import robustness
 from worker.quality.table import measure
+from worker.rounds import ROUND_STRIDE, Arrays, Round, enough, lanes_of, next_round, taken
 from worker.run import ALONE, Run
 from worker.scenes.trial import trial_on
 from worker.scenes.verdicts import lift_level, scene_verdicts
+from worker.side_by_side import side_by_side
 from worker.simulation.surroundings import Scenes
 
-Arrays = dict[str, NDArray[Any]]
-
-#: Rounds of one batch draw their grasps where no batch of a job does: a job has at most 31,250 batches.
-ROUND_STRIDE: Final = 1 << 20
-#: Fewest grasps worth a round.
-SMALLEST_ROUND: Final = 8
-#: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
-_LEAST_RATE: Final = 0.1
 #: Why a grasp is not kept: its hand is no number, something of its scene is in its way, the referee dropped it, it
 #: failed the geometric gate, holds in too few models around the nominal one, or is as good as the same as one kept.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "fragile", "alike")
@@ -82,18 +76,6 @@ class Certified:
         columns = {path: array if path == THRESHOLDS else array[kept] for path, array in self.columns.items()}
         rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + int((~kept).sum())}
         return replace(self, grasps=self.grasps.take(np.flatnonzero(kept)), columns=columns, rejected=rejected)
-
-
-@dataclass
-class _Round:
-    """Grasps of one round that are worth keeping."""
-
-    grasps: GraspSet
-    columns: Arrays
-    fates: NDArray[np.str_]
-    """What became of each grasp that was planned: kept, or one of `REJECTIONS`."""
-    in_scene: dict[str, int] = field(default_factory=dict)
-    """In scenes: how many were clear, lifted, lifted_hard."""
 
 
 def certified_grasps(
@@ -130,10 +112,9 @@ def certified_grasps(
     fitting_pairs(hand, obj)
     work = _Work(hand, obj, request, batch, run)
     work.scenes = scenes
-    with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
-        work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
-        rounds = work.until(count)
-    return work.finish(rounds, count)
+    with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
+        work.pieces = work.beside.submit(pieces, obj) if request.referee != "none" else None
+        return work.finish(work.until(count), count)
 
 
 def scored(
@@ -156,30 +137,10 @@ def scored(
     """
     work = _Work(hand, obj, request.model_copy(update={"want": "raw"}), 0, run)
     work.scenes = scenes
-    with ThreadPoolExecutor(1, thread_name_prefix="pieces") as pool:
-        work.pieces = pool.submit(pieces, obj) if request.referee != "none" else None
+    with ThreadPoolExecutor(1, thread_name_prefix="beside") as work.beside:
+        work.pieces = work.beside.submit(pieces, obj) if request.referee != "none" else None
         work.tried = len(grasps)
         return work.finish([work.score(grasps)], len(grasps))
-
-
-def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
-    """Grasps to plan next: as many as the rate so far promises to be enough, and a tenth more.
-
-    Args:
-        wanted: valid grasps wanted in all.
-        valid: found so far.
-        tried: planned so far.
-        budget: planned at most.
-
-    Returns:
-        0 when enough are found or the budget is used up.
-    """
-    if valid >= wanted or tried >= budget:
-        return 0
-    if tried == 0:
-        return min(wanted, budget)
-    need = 1.1 * (wanted - valid) / max(valid / tried, _LEAST_RATE)
-    return min(max(SMALLEST_ROUND, math.ceil(need)), BATCH_SIZE, budget - tried)
 
 
 class _Work:
@@ -187,30 +148,92 @@ class _Work:
 
     def __init__(self, hand: HandModel, obj: ObjectModel, request: JobOptions, batch: int, run: Run) -> None:
         self.hand, self.obj, self.request, self.batch = hand, obj, request, batch
+        self.beside: ThreadPoolExecutor
+        """A thread for what need not be waited for."""
         self.pieces: Future[ConvexPieces] | None = None
         self.scenes: Scenes | None = None
         self.tried = 0
         self._trials: Trial | None = None
+        self._audits: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
         self.seconds: dict[str, float] = {"planner": 0.0, "referee": 0.0, "quality": 0.0}
         self._run = run
-        self._round_run = run.part(0.0, 1.0)
 
-    def until(self, count: int) -> list[_Round]:
+    def until(self, count: int) -> list[Round]:
         """Rounds until `count` grasps are there or the budget is used up."""
         wish = self.request
         if wish.want == "raw":
-            return [self._round(0, count)]
-        budget = math.ceil(wish.budget * count)
-        rounds: list[_Round] = []
-        while size := next_round(count, valid := sum(len(part.grasps) for part in rounds), self.tried, budget):
-            # A round brings the batch as far as the rate so far lets hope.
-            begun = valid / count
-            self._round_run = self._run.part(begun, begun + (1 - begun) * min(1.0, size / max(1, count - valid)) * 0.9)
-            rounds.append(self._round(len(rounds), size))
-        return rounds
+            return [self._round(0, range(count), self._run)]
+        budget, number, valid = math.ceil(wish.budget * count), 0, 0
+        parts: list[Round] = []
+        while size := next_round(count, valid, self.tried, budget):
+            first = 0
+            while first < size and valid < count:
+                share = min(size - first, enough(count, valid, self.tried) if self._in_parts else size)
+                # It brings the batch as far as the rate so far lets hope.
+                begun = valid / count
+                run = self._run.part(begun, begun + (1 - begun) * min(1.0, share / (count - valid)) * 0.9)
+                parts.append(self._round(number, range(first, first + share), run))
+                first, valid = first + share, valid + len(parts[-1].grasps)
+            number += 1
+        return parts
 
-    def finish(self, rounds: list[_Round], count: int) -> Certified:
+    @property
+    def _in_parts(self) -> bool:
+        """Whether the grasps of a round may be made apart from each other: it ends as soon as enough are found, and has
+        several lanes. A GPU makes all of it at once, in the time of a few."""
+        return not self._run.device.startswith("cuda") and method(self.request.method).in_parts
+
+    def _round(self, number: int, rows: range, run: Run) -> Round:
+        """Some grasps of a round, planned, judged and measured."""
+        begun = self.tried - rows.start
+        apart = self._in_parts and run.meeting is None and run.pool is None
+        parts = lanes_of(rows, run.cores if apart else 1)
+        self._trial()  # once, and not by every lane
+        known = self.tried > 0
+
+        def lane(part: range, own: Run) -> Round | NoPlace:
+            try:
+                return self._lane(number, part, begun, known, own)
+            except NoPlace as error:
+                return error
+
+        found = side_by_side(parts, lane, run, size=len)
+        if len(refused := [one for one in found if isinstance(one, NoPlace)]) == len(found):
+            raise refused[0]
+        made = [
+            self._lane(number, part, begun, True, run.quiet()) if isinstance(one, NoPlace) else one
+            for part, one in zip(parts, found, strict=True)
+        ]
+        self.tried += len(rows)
+        for name in self.seconds:
+            self.seconds[name] += sum(lane.seconds[name] for lane in made) / len(made)
+        return self._without_alike(Round.joined(made))
+
+    def _lane(self, number: int, rows: range, begun: int, known: bool, run: Run) -> Round:
+        """The same by one lane: `begun` grasps were tried before the round; `known`: others have a place to start.
+
+        Raises:
+            NoPlace: in scenes, none of its grasps has.
+        """
+        request = self.request
+        index = None if self.scenes is None else (begun + np.array(rows)) % len(self.scenes.object_pose)
+        placed = self.scenes.placed(index) if self.scenes is not None and index is not None else None
+        number_of_batch = self.batch + number * ROUND_STRIDE
+        wanted = Wanted(
+            len(rows), request.knobs, request.seed, number_of_batch, placed, self._trial(), rows.start, known
+        )  # fmt: skip
+        planned = synthesize(
+            self.hand, self.obj, wanted, run.part(0.0, _PARTS[0]), method=request.method, options=request.options
+        )  # fmt: skip
+        # Verdicts and metrics are many short pieces of work: all cores may take them, whatever other lanes are at.
+        made = self._scored(replace(planned, scene=index), replace(run, lanes=None))
+        made.seconds["planner"] += planned.seconds
+        if number == 0 and rows.start == 0:
+            self._begin_audits(made)
+        return made
+
+    def finish(self, rounds: list[Round], count: int) -> Certified:
         """The rounds as one batch, cut to `count`, with audits and robustness."""
         grasps = joined([part.grasps for part in rounds])
         columns = joined_columns([part.columns for part in rounds])
@@ -218,7 +241,7 @@ class _Work:
         # The last round may find more than were missing: its tries count up to the last grasp that is kept, or else
         # the share of valid ones would look worse than it is.
         places = np.flatnonzero(fates == "kept")
-        tried = int(places[count - 1]) + 1 if len(places) > count else len(fates)
+        tried = int(places[count - 1]) + 1 if len(places) >= count else len(fates)
         absent = {"blocked"} if self.scenes is None else set()
         absent |= set() if self.request.robust else {"fragile"}
         reasons = [name for name in REJECTIONS if name not in absent]
@@ -241,7 +264,7 @@ class _Work:
         placed = self.scenes.placed(np.zeros(0, int))
         return lift_key(self.hand, self.obj, placed, lift_level(self.request.referee), False, pieces=pieces)
 
-    def _shares(self, rounds: list[_Round]) -> dict[str, float]:
+    def _shares(self, rounds: list[Round]) -> dict[str, float]:
         if self.scenes is None:
             return {}
         planned = max(1, sum(len(part.fates) for part in rounds))
@@ -261,40 +284,34 @@ class _Work:
             self._trials = trial_on(self._run, self.hand, self.obj, self.pieces.result, in_scenes=in_scenes)
         return self._trials
 
-    def _round(self, number: int, size: int) -> _Round:
-        request = self.request
-        index = None if self.scenes is None else (self.tried + np.arange(size)) % len(self.scenes.object_pose)
-        placed = self.scenes.placed(index) if self.scenes is not None and index is not None else None
-        number_of_batch = self.batch + number * ROUND_STRIDE
-        wanted = Wanted(size, request.knobs, request.seed, number_of_batch, placed, self._trial())
-        planned = synthesize(
-            self.hand, self.obj, wanted, self._part(0), method=request.method, options=request.options
-        )  # fmt: skip
-        planned = replace(planned, scene=index)
-        self.tried += size
-        self.seconds["planner"] += planned.seconds
-        return self.score(planned)
+    def score(self, planned: GraspSet) -> Round:
+        """Judge and measure grasps, and keep those that are wanted."""
+        made = self._scored(planned, self._run)
+        for name in self.seconds:
+            self.seconds[name] += made.seconds[name]
+        return self._without_alike(made)
 
-    def score(self, planned: GraspSet) -> _Round:
-        """Judge and measure grasps, and keep those that are wanted; a hand that is no number is never one of them."""
-        fates = np.where(planned.finite, "kept", "diverged")
+    def _scored(self, planned: GraspSet, run: Run) -> Round:
+        """Judge and measure grasps, and keep those that are wanted or like others; a hand that is no number is never
+        one of them."""
+        fates, seconds = np.where(planned.finite, "kept", "diverged"), dict.fromkeys(self.seconds, 0.0)
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "raw"
         if self.scenes is None:
-            columns, in_scene = self._judged(planned), dict[str, int]()
+            columns, in_scene = self._judged(planned, run, seconds), dict[str, int]()
         else:
-            planned, columns, in_scene = self._judged_in_scenes(planned, self.scenes)
+            planned, columns, in_scene = self._judged_in_scenes(planned, self.scenes, run, seconds)
             fates[finite[columns["quality/success"] < 0]] = "blocked"
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
-        columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps)
+        columns = {path: array[rows] for path, array in columns.items()} | self._measured(grasps, run, seconds)
         columns["quality/sound"] = passes(columns)
         sound = columns["quality/sound"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
         columns["quality/valid"] = (sound & held).astype(np.uint8)
         if self.request.models:
-            columns |= self._in_models(grasps, held if every else sound & held)
+            columns |= self._in_models(grasps, held if every else sound & held, run, seconds)
         if not every:
             wanted = sound if self.pieces is None else sound & held
             lost = np.delete(finite, rows)
@@ -304,41 +321,42 @@ class _Work:
                 enough = reaches(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "fragile"
                 wanted &= enough
-            alike = self._alike(grasps, wanted)
-            fates[finite[rows[alike]]] = "alike"
-            wanted &= ~alike
-            grasps = grasps.take(np.flatnonzero(wanted))
-            columns = {path: array if path == THRESHOLDS else array[wanted] for path, array in columns.items()}
-        return _Round(grasps, columns, fates, in_scene)
+            grasps, columns = taken(grasps, columns, wanted)
+        return Round(grasps, columns, fates, in_scene, seconds)
 
-    def _alike(self, grasps: GraspSet, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(N,) of those `wanted` the ones that are too near to a grasp of the batch that is kept."""
-        found, rows = np.zeros(len(grasps), bool), np.flatnonzero(wanted)
-        points = np.concatenate([self._kept, hand_points(self.hand, grasps.grasp.take(rows))])
+    def _without_alike(self, made: Round) -> Round:
+        """Without grasps that are too near to one of the batch that is kept."""
+        if self.request.want == "raw":
+            return made
+        points = np.concatenate([self._kept, hand_points(self.hand, made.grasps.grasp)])
         kept = distinct(points, self.request.min_distance, given=len(self._kept))
-        found[rows] = ~kept[len(self._kept) :]
-        self._kept = points[kept]
-        return found
+        wanted, self._kept = kept[len(self._kept) :], points[kept]
+        made.fates[np.flatnonzero(made.fates == "kept")[~wanted]] = "alike"
+        made.grasps, made.columns = taken(made.grasps, made.columns, wanted)
+        return made
 
-    def _judged_in_scenes(self, grasps: GraspSet, scenes: Scenes) -> tuple[GraspSet, Arrays, dict[str, int]]:
+    def _judged_in_scenes(
+        self, grasps: GraspSet, scenes: Scenes, run: Run, seconds: dict[str, float]
+    ) -> tuple[GraspSet, Arrays, dict[str, int]]:
         """The grasps with their ways, their verdicts, and how many were clear and lifted."""
         assert grasps.scene is not None
         pieces = None if self.pieces is None else self.pieces.result()
         began = time.perf_counter()
         grasps, columns, counts = scene_verdicts(
             self.hand, self.obj, grasps, scenes, level=lift_level(self.request.referee), pieces=pieces,
-            run=self._part(1),
+            run=run.part(*_PARTS[:2]),
         )  # fmt: skip
-        self.seconds["referee"] += time.perf_counter() - began
+        seconds["referee"] += time.perf_counter() - began
         return grasps, columns, counts
 
-    def _judged(self, grasps: GraspSet) -> Arrays:
+    def _judged(self, grasps: GraspSet, run: Run, seconds: dict[str, float]) -> Arrays:
         if self.pieces is None:
             return {}
         verdicts = judge(
-            self.hand, self.obj, grasps, level=self._level, pieces=self.pieces.result(), run=self._part(1)
+            self.hand, self.obj, grasps, level=self._level, pieces=self.pieces.result(),
+            run=run.part(*_PARTS[:2]),
         )  # fmt: skip
-        self.seconds["referee"] += verdicts.seconds
+        seconds["referee"] += verdicts.seconds
         return {
             "quality/success": verdicts.success,
             "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
@@ -346,7 +364,9 @@ class _Work:
             **({"quality/judged_by": verdicts.judged_by} if first_terms(self.hand, self._level, self._run) else {}),
         }
 
-    def _in_models(self, grasps: GraspSet, held: NDArray[np.bool_]) -> Arrays:
+    def _in_models(
+        self, grasps: GraspSet, held: NDArray[np.bool_], run: Run, seconds: dict[str, float]
+    ) -> Arrays:  # fmt: skip
         """Share of the models in which those that hold do, told whole of raw grasps, and what they fail first of."""
         assert self.pieces is not None
         wish, placed = self.request, None
@@ -356,15 +376,15 @@ class _Work:
         found = robust(
             self.hand, self.obj, grasps, held=held, placed=placed, level=lift_level(wish.referee), models=wish.models,
             seed=wish.seed, pieces=self.pieces.result(), wanted=wish.robust if wish.want == "valid" else 0,
-            run=self._round_run.quiet(),
+            run=run.quiet(),
         )  # fmt: skip
-        self.seconds["referee"] += found.seconds
+        seconds["referee"] += found.seconds
         return found.columns
 
-    def _measured(self, grasps: GraspSet) -> Arrays:
+    def _measured(self, grasps: GraspSet, run: Run, seconds: dict[str, float]) -> Arrays:
         began = time.perf_counter()
-        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=self._part(2))
-        self.seconds["quality"] += time.perf_counter() - began
+        columns = measure(self.hand, self.obj, grasps, friction=self.request.friction, run=run.part(*_PARTS[1:]))
+        seconds["quality"] += time.perf_counter() - began
         return dict(columns)
 
     def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
@@ -375,28 +395,40 @@ class _Work:
                 self.hand, self.obj, grasps.grasp, pieces=self.pieces.result(), run=self._run
             )
         }
-        common: dict[str, Any] = {"pieces": self.pieces.result(), "run": self._run.quiet()}
         began = time.perf_counter()
-        audited = np.flatnonzero(valid)[: self.request.audits_of(self.batch)]
-        audit = np.full(len(grasps), -1, np.int8)
-        if len(audited):
-            audit[audited] = self._audited(grasps.take(audited), common)
-        if self.request.audits_of(self.batch):
+        if count := self.request.audits_of(self.batch):
+            audited, audit = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
+            if len(audited):
+                known = self._audits.result() if self._audits is not None else self._audited(grasps.take(audited))
+                audit[audited] = known[: len(audited)]
             columns["quality/audit"] = audit
         if repeats := self.request.robustness:
             columns["quality/robustness"] = robustness(
-                self.hand, self.obj, grasps, held=valid, repeats=repeats, seed=self.request.seed, **common
-            )
+                self.hand, self.obj, grasps, held=valid, repeats=repeats, seed=self.request.seed,
+                pieces=self.pieces.result(), run=self._run.quiet(),
+            )  # fmt: skip
         self.seconds["referee"] += time.perf_counter() - began
         return columns
 
-    def _audited(self, grasps: GraspSet, common: dict[str, Any]) -> NDArray[np.int8]:
+    def _begin_audits(self, first: Round) -> None:
+        """Audits of the first grasps of a batch, which are its first ones whatever comes after them: they take one
+        thread, and the others wait for them at its end."""
+        count = self.request.audits_of(self.batch)
+        if self.pieces is None or not count:
+            return
+        valid = np.flatnonzero(first.columns["quality/valid"])
+        if self.request.want != "raw":
+            points = hand_points(self.hand, first.grasps.grasp.take(valid))
+            valid = valid[distinct(points, self.request.min_distance)]
+        if len(valid) >= count:
+            self._audits = self.beside.submit(self._audited, first.grasps.take(valid[:count]))
+
+    def _audited(self, grasps: GraspSet) -> NDArray[np.int8]:
+        """What the letter says of grasps."""
+        assert self.pieces is not None
+        run, pieces = self._run.quiet(), self.pieces.result()
         if self.scenes is None:
-            return judge(self.hand, self.obj, grasps, level="letter", **common).success
+            return judge(self.hand, self.obj, grasps, level="letter", pieces=pieces, run=run).success
         assert grasps.scene is not None
         placed = self.scenes.placed(grasps.scene)
-        return judge_lifts(self.hand, self.obj, grasps, placed, level="letter", **common).success
-
-    def _part(self, number: int) -> Run:
-        """The run of one part of the present round."""
-        return self._round_run.part((0.0, *_PARTS)[number], _PARTS[number])
+        return judge_lifts(self.hand, self.obj, grasps, placed, level="letter", pieces=pieces, run=run).success

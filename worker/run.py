@@ -9,6 +9,7 @@ from typing import Final, Literal
 
 from service.model.cores import available_cores
 from service.model.errors import TaskCancelled
+from worker.lanes import Lanes
 from worker.meeting import Meeting
 from worker.pool.pool import Pool
 
@@ -43,12 +44,16 @@ class Run:
     """Whether MuJoCo Warp gives the clear verdicts; auto: on a GPU, where it is installed."""
     pool: Pool | None = None
     """Processes that judge and measure; None: threads of this one."""
+    lanes: Lanes | None = None
+    """Those beside which it is one; None: all cores are its own."""
 
     @property
     def cores(self) -> int:
         """CPU threads, the default counted: a fair share of them where others work beside it."""
         every = self.threads or available_cores()
-        return max(1, every // max(1, self.meeting.members)) if self.meeting is not None else every
+        for others in (self.meeting, self.lanes):
+            every = max(1, every // max(1, others.members)) if others is not None else every
+        return every
 
     def apart(self) -> Run:
         """The same without the others: for what is done for all of them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,31 +18,12 @@ from worker.meeting import Meeting
 from worker.objects.model import ObjectModel
 from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
-from worker.run import ALONE, Progress, Run
+from worker.run import ALONE, Run
+from worker.side_by_side import Shares
 from worker.simulation.surroundings import Scenes
 
 #: Times that batches are made for grasps that were too like those of another batch.
 _REFILLS: Final = 3
-
-
-@dataclass
-class _Shares:
-    """How far all batches are, told in grasps."""
-
-    sizes: Sequence[int]
-    told: Progress
-    _done: dict[int, float] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def of(self, batch: int) -> Progress:
-        """What a batch tells its progress to."""
-
-        def tell(done: float, total: float, message: str) -> None:
-            with self._lock:
-                self._done[batch] = self.sizes[batch] * (done / total if total > 0 else 0.0)
-                self.told(sum(self._done.values()), sum(self.sizes), message)
-
-        return tell
 
 
 def certified_batches(
@@ -71,7 +52,7 @@ def certified_batches(
     Raises:
         Exception: what became of the first batch that failed; the others are stopped.
     """
-    shares = _Shares(sizes, run.progress)
+    shares = Shares(sizes, run.progress)
 
     def batch(number: int, own: Run) -> Certified:
         own = replace(own, progress=shares.of(number))

@@ -15,7 +15,7 @@ from service.model.states import Stage
 from service.store.attributes import Attribute
 from worker.certified import Certified, certified_grasps
 from worker.files.base_attributes import base_attributes
-from worker.planners import planner
+from worker.planners import NoPlace, planner
 from worker.scenes.beside import neighbour_of
 from worker.scenes.kinds import supports_of
 from worker.simulation.surroundings import Scenes
@@ -53,7 +53,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         )
     except InputError as error:
         # Of hand and object there are errors of their own; what is left is that no hand finds a way in.
-        if scenes is not None and type(error) is InputError:
+        if scenes is not None and type(error) in (InputError, NoPlace):
             raise SceneError(str(error)) from None
         raise
     if scenes is not None and message.batch == 0:

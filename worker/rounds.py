@@ -1,0 +1,87 @@
+"""Rounds of a batch: how many grasps each plans, and what came of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.domain import BATCH_SIZE
+from worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
+
+Arrays = dict[str, NDArray[Any]]
+
+#: Rounds of one batch draw their grasps where no batch of a job does: a job has at most 31,250 batches.
+ROUND_STRIDE: Final = 1 << 20
+#: Fewest grasps worth a round, and a lane.
+SMALLEST_ROUND: Final = 8
+LANE: Final = 8
+#: What a round expects to be valid at least, however bad the rounds before were: rounds stay finite and few.
+_LEAST_RATE: Final = 0.1
+
+
+@dataclass
+class Round:
+    """Grasps of one round that are worth keeping."""
+
+    grasps: GraspSet
+    columns: Arrays
+    fates: NDArray[np.str_]
+    """What became of each grasp that was planned: kept, or one of `REJECTIONS`."""
+    in_scene: dict[str, int]
+    """In scenes: how many were clear, lifted, lifted_hard."""
+    seconds: dict[str, float]
+    """Wall time of planning, judging and measuring [s]."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[Round]) -> Round:
+        """All grasps of several."""
+        in_scene = {name: sum(part.in_scene[name] for part in parts) for name in parts[0].in_scene}
+        seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
+        return cls(
+            joined([part.grasps for part in parts]), joined_columns([part.columns for part in parts]),
+            np.concatenate([part.fates for part in parts]), in_scene, seconds,
+        )  # fmt: skip
+
+
+def next_round(wanted: int, valid: int, tried: int, budget: int) -> int:
+    """Grasps to plan next: as many as the rate so far promises to be enough, and a tenth more.
+
+    Args:
+        wanted: valid grasps wanted in all.
+        valid: found so far.
+        tried: planned so far.
+        budget: planned at most.
+
+    Returns:
+        0 when enough are found or the budget is used up.
+    """
+    if valid >= wanted or tried >= budget:
+        return 0
+    if tried == 0:
+        return min(wanted, budget)
+    return min(max(SMALLEST_ROUND, enough(wanted, valid, tried)), BATCH_SIZE, budget - tried)
+
+
+def enough(wanted: int, valid: int, tried: int) -> int:
+    """Grasps that the rate so far promises to be enough, and a tenth more; see `next_round`."""
+    if tried == 0:
+        return wanted
+    return math.ceil(1.1 * (wanted - valid) / max(valid / tried, _LEAST_RATE))
+
+
+def lanes_of(rows: range, cores: int) -> list[range]:
+    """Rows of a round in contiguous, nearly equal parts: as many as there are cores, and of `LANE` grasps at least."""
+    bounds = np.linspace(rows.start, rows.stop, max(1, min(cores, len(rows) // LANE)) + 1).astype(int)
+    return [range(int(low), int(high)) for low, high in pairwise(bounds)]
+
+
+def taken(grasps: GraspSet, columns: Arrays, which: NDArray[np.bool_]) -> tuple[GraspSet, Arrays]:
+    """The grasps `which` (N,) with their columns."""
+    columns = {path: array if path == THRESHOLDS else array[which] for path, array in columns.items()}
+    return grasps.take(np.flatnonzero(which)), columns

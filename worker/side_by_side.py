@@ -1,0 +1,66 @@
+"""Parts of one piece of work side by side, each in a lane of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+from worker.lanes import Lanes
+from worker.run import Progress, Run
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass
+class Shares:
+    """How far all parts of a piece of work are, told in the unit of their sizes."""
+
+    sizes: Sequence[int]
+    told: Progress
+    _done: dict[int, float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def of(self, part: int) -> Progress:
+        """What a part tells its progress to."""
+
+        def tell(done: float, total: float, message: str) -> None:
+            with self._lock:
+                self._done[part] = self.sizes[part] * (done / total if total > 0 else 0.0)
+                self.told(sum(self._done.values()), sum(self.sizes), message)
+
+        return tell
+
+
+def side_by_side(parts: Sequence[T], work: Callable[[T, Run], R], run: Run, *, size: Callable[[T], int]) -> list[R]:
+    """`work` of every part, in order. Each is given a run of its own: its share of the cores, and of the progress by
+    `size`; the first that fails stops the others.
+
+    Raises:
+        Exception: what became of the first part that failed.
+    """
+    if len(parts) == 1:
+        return [work(parts[0], run)]
+    lanes, stop, shares = Lanes(len(parts)), threading.Event(), Shares([size(part) for part in parts], run.progress)
+
+    def lane(number: int) -> R:
+        own = replace(
+            run, lanes=lanes, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled()
+        )  # fmt: skip
+        try:
+            return work(parts[number], own)
+        finally:
+            lanes.leave()
+
+    with ThreadPoolExecutor(len(parts), thread_name_prefix="lane") as pool:
+        futures = [pool.submit(lane, number) for number in range(len(parts))]
+        done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        failed = [error for one in done if (error := one.exception()) is not None]
+        if failed:
+            stop.set()
+    if failed:
+        raise failed[0]
+    return [one.result() for one in futures]
