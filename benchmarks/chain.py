@@ -1,7 +1,7 @@
 """What a valid grasp costs from the planner to its row in the shard, of two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
-       python -m benchmarks.chain BEFORE AFTER --service [--grasps 256] [--pairs ...] [--json OUT]
+       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--grasps 256] [--pairs ...] [--json OUT]
 
 BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. Each stage is run by one thread and timed by processor
 time: other programs on the machine change the ratios little. Nothing is stored or sent: that part is in
@@ -9,7 +9,8 @@ docs/results/service.md.
 
 With --service a job of built-in hand and object goes through a whole service of each checkout: submitted over HTTP,
 planned, certified, measured, stored, indexed, after a small job that loads everything. Processor time is that of all
-processes of the service; beside it stands what BEFORE's planner alone takes for a raw grasp.
+processes of the service; beside it stands what BEFORE's planner alone takes for a raw grasp. With --pictures jobs are
+as examples/million/million.toml has them: for each batch six pictures of the object at rest on a table, eight audits.
 """
 
 from __future__ import annotations
@@ -67,6 +68,10 @@ print(json.dumps({"valid": valid, "raw": count // 32 * 32, "ms": {stage: 1e3 * s
 """
 
 
+#: What a job of the pilot asks for besides grasps.
+PILOT: Final = {"scenes": 2, "views": 3, "audits": 8, "budget": 4}
+
+
 def environment_of(root: Path) -> dict[str, str]:
     """The surroundings in which a program uses the code of a checkout, whatever is installed."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
@@ -107,14 +112,14 @@ def table(pair: str, before: dict[str, Any], after: dict[str, Any]) -> list[str]
     return [*lines, row("all but the planner", *rest), row("all", *totals), ""]
 
 
-def through_service(root: Path, hand: str, obj: str, grasps: int) -> dict[str, float]:
+def through_service(root: Path, hand: str, obj: str, grasps: int, wanted: dict[str, Any]) -> dict[str, float]:
     """A job of valid grasps: how many, and the wall and processor time of the service."""
     from benchmarks.service_of import service_of  # which uses this module
 
     with service_of(root) as service:
-        service.job(hand=hand, object=obj, grasps=8, seed=1)
+        service.job(hand=hand, object=obj, grasps=8, seed=1, **wanted)
         spent, began = service.processor_s(), time.perf_counter()
-        job = service.job(hand=hand, object=obj, grasps=grasps, seed=2)
+        job = service.job(hand=hand, object=obj, grasps=grasps, seed=2, **wanted)
         wall = time.perf_counter() - began
         return {"valid": job["valid"], "wall": wall, "processor": service.processor_s() - spent}
 
@@ -141,7 +146,9 @@ def compare_services(given: argparse.Namespace) -> dict[str, Any]:
         hand, obj = pair.split(":")
         roots = [root.resolve() for root in (given.before, given.after)]
         alone = run(roots[0], hand, obj, "64", str(100 + number))
-        both = [through_service(root, hand, obj, given.grasps or 256) for root in roots]
+        both = [
+            through_service(root, hand, obj, given.grasps or 256, PILOT if given.pictures else {}) for root in roots
+        ]
         found[pair] = dict(zip(("planner", "before", "after"), (alone, *both), strict=True))
         lines = service_table(pair, *both, raw_ms=alone["ms"]["planner"] / alone["raw"])
         sys.stdout.write("\n".join(lines) + "\n")
@@ -168,6 +175,7 @@ def main() -> None:
     parser.add_argument("after", type=Path)
     parser.add_argument("data", type=Path, nargs="?")
     parser.add_argument("--service", action="store_true", help="jobs through the whole service")
+    parser.add_argument("--pictures", action="store_true", help="with --service: and pictures, as the pilot has them")
     parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 raw, or 256 valid ones")
     parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
     parser.add_argument("--json", type=Path)
