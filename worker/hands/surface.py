@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from service.model.transforms import IDENTITY_POSE, apply, invert, quat_rotate
 from worker.hands import kinematics, primitives
 from worker.hands.kinematics import body_poses
 from worker.hands.model import ConvexPiece, Floats, HandModel, SurfacePoints
+from worker.objects.content import content_of
 from worker.objects.kept_arrays import arrays_kept_or_made
 
 #: Candidates per wanted point; thinning keeps the one in five that spreads most evenly.
@@ -38,7 +40,8 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     Raises:
         HandError: the hand has no outer surface.
     """
-    key = (hand.content, count, seed)
+    # Of a hand that is read one knows the shapes long before one knows how it closes.
+    key = (content_of(_Shapes(hand.pieces, _rest(hand))), count, seed)
     with _lock:
         if key not in _samples:
             code = (sys.modules[__name__], primitives, kinematics, transforms)
@@ -47,7 +50,21 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
         return _samples[key]
 
 
-_samples: LRUCache[tuple[str, int, int], SurfacePoints] = LRUCache(32)
+@dataclass(frozen=True)
+class _Shapes:
+    """All of a hand that its surface depends on."""
+
+    pieces: tuple[ConvexPiece, ...]
+    rest: Floats
+    """(L, 7) poses of its bodies."""
+
+
+def _rest(hand: HandModel) -> Floats:
+    """(L, 7) poses of a hand's bodies in its pre-shape."""
+    return body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
+
+
+_samples: LRUCache[tuple[str, int, int], SurfacePoints] = LRUCache(64)
 _lock = threading.Lock()
 
 
@@ -86,7 +103,7 @@ def _candidates(hand: HandModel, count: int, seed: int) -> SurfacePoints:
     rng = np.random.default_rng([seed, 0x5EED])
     shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])
     numbers = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 8)
-    rest = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
+    rest = _rest(hand)
     bodies, positions, normals, areas = [], [], [], []
     for i, (piece, number) in enumerate(zip(hand.pieces, numbers, strict=True)):
         local, direction = primitives.sample(

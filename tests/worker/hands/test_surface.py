@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -99,6 +101,14 @@ def test_the_same_seed_gives_the_same_points_and_another_seed_others() -> None:
     np.testing.assert_array_equal(a.position, b.position)
     np.testing.assert_array_equal(a.area, b.area)
     assert not np.array_equal(a.position, sample_surface(first, 500, seed=4).position)
+
+
+def test_a_surface_is_sampled_once_however_the_hand_is_said_to_close_and_anew_in_another_pre_shape() -> None:
+    hand = hand_from_path("allegro")
+    points = sample_surface(hand, 300)
+    assert sample_surface(replace(hand, closing=-hand.closing), 300) is points
+    bent = replace(hand, preshape=0.5 * (hand.lower + hand.upper))
+    assert sample_surface(bent, 300) is not points
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
