@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-JOBS ?= 2
+# Tests wait for processes a fifth of their time: three at once keep two cores busy.
+JOBS ?= 3
 
 .PHONY: clusters results docs-commands dist gpu-check help install demo test test-slow test-containers check format browser screenshots docs pins audit clean
 help: ## this list

@@ -85,6 +85,15 @@ STUDIES: Final = (
         stages=(),
     ),
     Study(
+        "bench-points", "grasps per second over hand points and faces", ("results/bench-points/bench.*",),
+        (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --batch 32 --threads 2 "
+         "--points 500 --points 1000 --points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 "
+         "--out OUT/results/bench-points",),
+        ("graspd bench --fidelity draft --batch 4 --threads 2 --points 300 --repeats 1 "
+         "--out OUT/results/bench-points",),
+        stages=(),
+    ),
+    Study(
         "chart", "speed against accuracy: methods, fidelities, knobs",
         ("results/chart.*", "results/sweeps.png"),
         (f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
