@@ -299,8 +299,8 @@ def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
     """Grasps of free objects that balance poorly, or fail their trial, set out again; the first good one stays, or else
     the best.
 
-    The last few would leave cores idle, and a hand of a small launch costs half as much again: they make some attempts
-    ahead. Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
+    The last few would leave cores idle, and a hand of a small launch costs a third more: they make some attempts ahead.
+    Those after a good one are forgotten, so a grasp is as if it had made one after the other."""
     limit, attempts = (FAILED, ATTEMPTS) if launch.batches.has_trial else (SET_OUT_AGAIN, 1)
     number = 1
     while number <= attempts and len(poor := np.flatnonzero(part.merit > limit)):
