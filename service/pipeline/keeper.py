@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -277,12 +277,13 @@ class Keeper:
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
         if self._shards.leads and (stray := self._parts.index.feed.cancelled(present)):
             self._parts.queue.discard(stray)
-        self._reaper.find_missing(present)
-        self._feed(present)
+        missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
+        self._feed(present, missing)
 
-    def _feed(self, present: set[str] | None = None) -> None:
+    def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue what is ready. Where nobody knows what is in the queue (`present`), the index's own marks say so, and
-        what the queue knows of a task keeps it from being queued twice."""
+        what the queue knows of a task keeps it from being queued twice: also one that its job queues at this moment.
+        Only those that are `missing` are queued whatever the queue knows of them."""
         depths = self._parts.queue.depths()
         now = time.time()
         # Every worker finds a task waiting when it ends one.
@@ -297,7 +298,9 @@ class Keeper:
             # After a rebuild the index does not know what is in the queue already.
             self._parts.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
             left = [task for task in ready if task.task.id not in present]
-            held |= queue_tasks(self._parts, left, again=True, routes=self._routes)
+            for again in (False, True):
+                if some := [task for task in left if (task.task.id in missing) == again]:
+                    held |= queue_tasks(self._parts, some, again=again, routes=self._routes)
         for why in sorted(held - self._held):
             log.warning("tasks are %s", why)
         self._held = held

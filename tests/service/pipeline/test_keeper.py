@@ -18,6 +18,7 @@ from service.pipeline import job_actions
 from service.pipeline.backends import Parts
 from service.pipeline.keeper import Keeper
 from service.pipeline.reaper import LOST_AFTER_S
+from service.pipeline.routes import Routes
 from service.queue.port import Event, EventKind
 from service.store.library import publish_asset, stored_assets
 from tests.fakes import HAND_FILES, fake_stages, make_shard, request
@@ -310,6 +311,30 @@ def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> N
     assert failed.state is State.FAILED
     assert key in (failed.reason or "")
     assert "remove it and retry its job" in (failed.reason or "")
+
+
+def test_tasks_that_their_job_queues_while_the_keeper_looks_are_queued_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The keeper has read the queue before, and the index before the job's tasks are marked there."""
+    with monkeypatch.context() as late:
+        late.setattr(job_actions, "queue_tasks", lambda *_, **__: set())
+        job, _ = job_actions.submit(bench.parts, request())
+    feed = type(bench.parts.index.feed)
+    ready = feed.ready_tasks
+
+    def beside(index: Any, *given: Any, **named: Any) -> Any:
+        seen = ready(index, *given, **named)
+        mine = bench.parts.index.feed.ready_of_job(job.id, limit=9)
+        job_actions.queue_tasks(bench.parts, mine, routes=Routes(bench.queue.workers()))
+        if bench.queue.waiting():
+            taken.append(bench.take())
+        return seen
+
+    taken: list[Delivery] = []
+    monkeypatch.setattr(feed, "ready_tasks", beside)
+    bench.keeper._look_after_queue()
+    assert len(taken) == 1 and bench.queue.waiting() == set(), "the worker's task waits a second time"
 
 
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
