@@ -305,12 +305,12 @@ class Keeper:
             log.warning("tasks are %s", why)
         self._held = held
         if self._shards.leads:
-            self._feed_checks(present, now)
+            self._feed_checks(present, missing, now)
 
     def _ready(self, lane: Lane, now: float, room: int) -> list[ReadyTask]:
         return self._parts.index.feed.ready_tasks(lane, self._turns, now=now, limit=room, shards=self._shards)
 
-    def _feed_checks(self, present: set[str] | None, now: float) -> None:
+    def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._parts.index.feed.ready_checks(now=now, limit=self._parts.settings.queue_window):
             self._parts.index.live.set_asset_waiting([check.digest], queued=True)
             if self._parts.store.exists(names.asset_check(check.kind, check.digest)):
@@ -328,7 +328,7 @@ class Keeper:
                 if place.held:
                     self._parts.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
                 else:
-                    again = present is not None
+                    again = message.task_id in missing
                     self._parts.queue.enqueue([message], Lane.INTERACTIVE, again=again, apart=place.apart)
 
 

@@ -337,6 +337,20 @@ def test_tasks_that_their_job_queues_while_the_keeper_looks_are_queued_once(
     assert len(taken) == 1 and bench.queue.waiting() == set(), "the worker's task waits a second time"
 
 
+def test_a_check_that_is_queued_while_the_keeper_looks_is_queued_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The keeper has read the queue before, and the index before the check is marked there."""
+    asset = publish_asset(bench.parts.store, AssetKind.HAND, "upload", HAND_FILES | {"extra": b"3"})
+    bench.parts.index.write.add_asset(asset, None)
+    bench.pass_time(1)
+    assert isinstance(bench.take().message, IngestMessage)
+    bench.parts.index.live.set_asset_waiting([asset.digest], queued=False)
+    monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
+    bench.keeper._look_after_queue()
+    assert bench.queue.waiting() == set(), "the worker's check waits a second time"
+
+
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
     job_actions.submit(bench.parts, request())
     delivery = bench.take()
