@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.domain import JobOptions
-from worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
+from worker.grasps import GraspSet, joined, joined_columns
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
 from worker.objects.model import ObjectModel
@@ -73,9 +73,9 @@ class Certified:
 
     def keeping(self, kept: NDArray[np.bool_]) -> Certified:
         """The same without the grasps that are not `kept` (N,): they were too like others."""
-        columns = {path: array if path == THRESHOLDS else array[kept] for path, array in self.columns.items()}
+        grasps, columns = taken(self.grasps, self.columns, np.flatnonzero(kept))
         rejected = {**self.rejected, "alike": self.rejected.get("alike", 0) + int((~kept).sum())}
-        return replace(self, grasps=self.grasps.take(np.flatnonzero(kept)), columns=columns, rejected=rejected)
+        return replace(self, grasps=grasps, columns=columns, rejected=rejected)
 
 
 def certified_grasps(
@@ -246,9 +246,7 @@ class _Work:
         absent |= set() if self.request.robust else {"fragile"}
         reasons = [name for name in REJECTIONS if name not in absent]
         rejected = {name: int(np.count_nonzero(fates[:tried] == name)) for name in reasons}
-        kept = np.arange(min(count, len(grasps)))
-        grasps = grasps.take(kept)
-        columns = {path: array if path == THRESHOLDS else array[kept] for path, array in columns.items()}
+        grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
         found = Certified(grasps, columns, tried, rejected, None, len(fates), self.seconds, self._shares(rounds))
         if self.pieces is None:
             return found
@@ -321,7 +319,7 @@ class _Work:
                 enough = reaches(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "fragile"
                 wanted &= enough
-            grasps, columns = taken(grasps, columns, wanted)
+            grasps, columns = taken(grasps, columns, np.flatnonzero(wanted))
         return Round(grasps, columns, fates, in_scene, seconds)
 
     def _without_alike(self, made: Round) -> Round:
@@ -332,7 +330,7 @@ class _Work:
         kept = distinct(points, self.request.min_distance, given=len(self._kept))
         wanted, self._kept = kept[len(self._kept) :], points[kept]
         made.fates[np.flatnonzero(made.fates == "kept")[~wanted]] = "alike"
-        made.grasps, made.columns = taken(made.grasps, made.columns, wanted)
+        made.grasps, made.columns = taken(made.grasps, made.columns, np.flatnonzero(wanted))
         return made
 
     def _judged_in_scenes(

@@ -81,7 +81,6 @@ def lanes_of(rows: range, cores: int) -> list[range]:
     return [range(int(low), int(high)) for low, high in pairwise(bounds)]
 
 
-def taken(grasps: GraspSet, columns: Arrays, which: NDArray[np.bool_]) -> tuple[GraspSet, Arrays]:
-    """The grasps `which` (N,) with their columns."""
-    columns = {path: array if path == THRESHOLDS else array[which] for path, array in columns.items()}
-    return grasps.take(np.flatnonzero(which)), columns
+def taken(grasps: GraspSet, columns: Arrays, rows: NDArray[np.intp]) -> tuple[GraspSet, Arrays]:
+    """Some of the grasps (K,) with their columns."""
+    return grasps.take(rows), {path: array if path == THRESHOLDS else array[rows] for path, array in columns.items()}
