@@ -85,7 +85,8 @@ STUDIES: Final = (
         stages=(),
     ),
     Study(
-        "bench-points", "grasps per second over hand points and faces", ("results/bench-points/bench.*",),
+        "bench-points", "grasps per second over hand points and faces",
+        ("results/bench-points/bench.json", "results/bench-points/bench.md"),
         (f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --batch 32 --threads 2 "
          "--points 500 --points 1000 --points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 "
          "--out OUT/results/bench-points",),
