@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from service.model.colours import Colour, hexadecimal, linear
-from worker.rendering.kernels import GRAIN, PLAIN, SPECKLE, TILES
+from worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
 from worker.rendering.scenery import Lamp, Look
 
 

@@ -119,8 +119,8 @@ class Setting:
 
     def shoot_with(self, drawn: DrawnHand, run: Run) -> Pictures:
         """The same pictures with a hand in them."""
-        key = (*self._key(), drawn.hand.content, len(self._poses), run.device)
-        stage = _kept(key, lambda: [*self._solids(), *hand_solids(drawn.hand)], len(self._poses), run.device)
+        key = (*self._key(), drawn.hand.content, run.device)
+        stage = _kept(key, lambda: [*self._solids(), *hand_solids(drawn.hand)], run.device)
         shown = hand_looks(drawn.hand)
         stage.place(
             np.concatenate([self._poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
@@ -129,7 +129,7 @@ class Setting:
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
         """The stage of these objects, kept for the next call with the same ones, with everything in its place."""
-        stage = _kept((*self._key(), len(self._poses), device), self._solids, len(self._poses), device)
+        stage = _kept((*self._key(), device), self._solids, device)
         stage.place(self._poses if poses is None else poses, self.looks)
         return stage
 
@@ -198,7 +198,7 @@ def _toward_lamp(rng: np.random.Generator) -> Floats:
     return np.array([np.cos(elevation), 0.0, np.sin(elevation)])
 
 
-def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], worlds: int, device: str) -> Tracer:
+def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], device: str) -> Tracer:
     if key not in _stages:
-        _stages[key] = Tracer(solids(), worlds, device)
+        _stages[key] = Tracer(solids(), device)
     return _stages[key]

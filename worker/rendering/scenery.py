@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from worker.rendering import kernels
 from worker.rendering.cameras import Floats
+from worker.rendering.kernels.shading import PLAIN
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Look:
 
     base: tuple[float, float, float]
     second: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    pattern: int = kernels.PLAIN
+    pattern: int = PLAIN
     scale: float = 1.0
     roughness: float = 0.5
     metalness: float = 0.0

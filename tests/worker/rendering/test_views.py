@@ -208,7 +208,7 @@ def test_a_scene_looks_the_same_whatever_other_scenes_are_rendered_with_it(mug, 
 
 
 def test_many_pictures_are_traced_in_parts_that_do_not_show(mug, mug_poses, mug_views, monkeypatch):
-    monkeypatch.setattr("worker.rendering.tracer.PIXELS_TOGETHER", 3 * SIZE[0] * SIZE[1])
+    monkeypatch.setattr("worker.rendering.tracer.PIXELS_OF_A_CORE", SIZE[0] * SIZE[1])
     again = shoot(mug, mug_poses)
     np.testing.assert_array_equal(mug_views["image/rgb"], again["image/rgb"])
     np.testing.assert_array_equal(mug_views["image/depth"], again["image/depth"])
@@ -235,7 +235,8 @@ def test_the_object_casts_a_shadow(ball, ball_views):
         assert np.percentile(table, 2) < 0.75 * np.median(table)
 
 
-def test_a_cancelled_render_stops_between_passes(ball):
+def test_a_cancelled_render_stops_between_launches(ball, monkeypatch):
+    monkeypatch.setattr("worker.rendering.tracer.PIXELS_OF_A_CORE", 1)
     answers = iter([False, True])
     with pytest.raises(TaskCancelled):
         shoot(ball, REST, run=Run(cancelled=lambda: next(answers)))

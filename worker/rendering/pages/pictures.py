@@ -15,7 +15,7 @@ from worker.hands.model import HandModel
 from worker.objects.model import Floats, ObjectModel
 from worker.rendering.cameras import Cameras, intrinsics, look_at
 from worker.rendering.hands import drawn_bodies, hand_looks, hand_solids
-from worker.rendering.kernels import CATCHER
+from worker.rendering.kernels.shading import CATCHER
 from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
 from worker.rendering.tracer import Tracer
 
@@ -75,20 +75,17 @@ def grasp_pictures(
     """
     hand_pose = np.atleast_2d(np.asarray(hand_pose, float))
     joints = np.atleast_2d(np.asarray(joint_positions, float))
-    stages: dict[int, Tracer] = {}
     solids: list[Solid | Box] = [
         Box(FLOOR_SIZE),
         Solid(obj.vertices, obj.faces, obj.corner_normals),
         *hand_solids(hand),
     ]
+    stage = Tracer(solids, run.device)
     shots = []
     for start in range(0, len(hand_pose), _TOGETHER):
         part = slice(start, start + _TOGETHER)
         bodies = body_poses(hand, hand_pose[part], joints[part])
-        worlds = len(bodies)
-        if worlds not in stages:
-            stages[worlds] = Tracer(solids, worlds, run.device)
-        shots.append(_shoot(stages[worlds], hand, obj, bodies, size, azimuths, samples, run))
+        shots.append(_shoot(stage, hand, obj, bodies, size, azimuths, samples, run))
     empty = np.zeros((0, len(azimuths), size[1], size[0], 3), np.uint8)
     return np.concatenate([empty, *shots])
 

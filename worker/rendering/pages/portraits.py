@@ -161,7 +161,7 @@ def _shoot(
     worlds, (width, height) = len(poses), SIZE
     floor = IDENTITY_POSE.copy()
     floor[2] = points[:, 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
-    stage = Tracer([Box(FLOOR_SIZE), *solids], worlds, device)
+    stage = Tracer([Box(FLOOR_SIZE), *solids], device)
     stage.place(np.concatenate([np.tile(floor, (worlds, 1, 1)), poses], axis=1), [[FLOOR, *looks]] * worlds)
     k = intrinsics(width, height, FIELD_OF_VIEW)
     shot = Shot(

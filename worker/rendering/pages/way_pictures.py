@@ -119,7 +119,7 @@ class _Stage:
         self.lamp = TOWARD_LAMP
         self.boxes = slabs(around.supports) or [Box(FLOOR_SIZE)]
         objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (obj, *self.others)]
-        self.tracer = Tracer([*self.boxes, *objects, *hand_solids(hand)], frames, run.device)
+        self.tracer = Tracer([*self.boxes, *objects, *hand_solids(hand)], run.device)
         planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [FLOOR]
         bodies = hand_looks(hand)
         self.looks = [*planes, OBJECT_LOOK, *(_BESIDE for _ in self.others), *bodies]

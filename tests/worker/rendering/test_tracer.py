@@ -1,0 +1,222 @@
+"""The tracer against another one, Newton's camera sensor, and against itself where it takes a short cut."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import newton
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from newton.sensors import SensorCamera
+
+from service.model.transforms import pose_from_matrix, quat_from_axis_angle, quat_rotate
+from worker.rendering.cameras import intrinsics, look_at
+from worker.rendering.kernels import rays, shading
+from worker.rendering.scenery import Box, Lamp, Look, Shot, Solid
+from worker.rendering.tracer import Tracer
+
+WIDTH, HEIGHT = 96, 72
+FLOOR, WALL = Box((0.8, 0.6, 0.1)), Box((0.3, 0.02, 0.2))
+WORLDS = 3
+TOWARD_LAMP = np.array([0.4, 0.3, 0.8]) / np.linalg.norm([0.4, 0.3, 0.8])
+#: Of outlines, where rounding decides what a ray meets: the share of pixels that two tracers may see otherwise.
+OUTLINE = 1e-3
+
+
+def solid(mesh: trimesh.Trimesh) -> Solid:
+    return Solid(mesh.vertices, mesh.faces, mesh.vertex_normals[mesh.faces])
+
+
+SOLIDS = [
+    FLOOR,
+    WALL,
+    solid(trimesh.creation.icosphere(subdivisions=3, radius=0.05)),
+    solid(trimesh.creation.annulus(r_min=0.03, r_max=0.05, height=0.08)),
+]
+LOOKS = [
+    Look((0.5, 0.4, 0.3), (0.3, 0.2, 0.1), shading.TILES, 2.0, roughness=0.4),
+    Look((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), shading.SPECKLE, 1.0, roughness=0.6),
+    Look((0.8, 0.2, 0.1), roughness=0.3),
+    Look((0.2, 0.3, 0.8), roughness=0.5, metalness=0.8),
+]
+
+
+@pytest.fixture(scope="module")
+def poses() -> np.ndarray:
+    """(worlds, P, 7): a floor and a wall that are turned, a ball and a ring that stand and float about."""
+    rng = np.random.default_rng(3)
+    poses = np.zeros((WORLDS, len(SOLIDS), 7))
+    poses[..., 3] = 1.0
+    poses[:, 0, 2] = -0.05
+    poses[:, 1, :3] = (0.0, 0.15, 0.1)
+    poses[:, 2:, :2] = rng.uniform(-0.1, 0.1, (WORLDS, 2, 2))
+    poses[:, 2:, 2] = rng.uniform(0.05, 0.2, (WORLDS, 2))
+    up = np.array([0.0, 0.0, 1.0])
+    poses[:, :2, 3:] = quat_from_axis_angle(up, rng.uniform(0, 6, (WORLDS, 1)))
+    axes = rng.normal(size=(WORLDS, 2, 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    poses[:, 2:, 3:] = quat_from_axis_angle(axes, rng.uniform(0, 3, (WORLDS, 2)))
+    return poses
+
+
+def shot(**changes: Any) -> Shot:
+    """Two cameras a world."""
+    eyes = [(0.5, -0.3, 0.4), (-0.2, -0.6, 0.25)]
+    cameras = np.stack([look_at(np.array(eye), np.array([0.0, 0.0, 0.05])) for eye in eyes])
+    made = Shot(
+        world=np.repeat(np.arange(WORLDS, dtype=np.int32), 2),
+        extrinsics=np.concatenate([cameras] * WORLDS),
+        intrinsics=intrinsics(WIDTH, HEIGHT),
+        width=WIDTH,
+        height=HEIGHT,
+        samples=1,
+        toward_lamp=TOWARD_LAMP,
+        turn=np.zeros(WORLDS),
+        lamps=[Lamp()] * WORLDS,
+        normals=True,
+    )
+    return replace(made, **changes)
+
+
+def traced(solids: list[Solid | Box], poses: np.ndarray, what: Shot) -> Any:
+    tracer = Tracer(solids, "cpu")
+    tracer.place(poses, [[*LOOKS, *[Look((1.0, 1.0, 1.0))] * (len(solids) - len(LOOKS))]] * len(poses))
+    return tracer.shoot(what)
+
+
+@wp.kernel(enable_backward=False)
+def _in_the_way(
+    placed_in: wp.array2d[rays.Placed], world_in: wp.array[wp.int32], point_in: wp.array[wp.vec3f],
+    toward: wp.vec3f, shadowed_out: wp.array[wp.int32],
+):  # fmt: skip
+    i = wp.tid()
+    shadowed_out[i] = wp.int32(rays.in_the_way(placed_in, world_in[i], point_in[i], toward))
+
+
+def by_newton(poses: np.ndarray, what: Shot) -> dict[str, np.ndarray]:
+    """Shapes, depth, normals and whether the lamp's centre is seen, by Newton's camera sensor."""
+    builder = newton.ModelBuilder()
+    config = newton.ModelBuilder.ShapeConfig(has_shape_collision=False, has_particle_collision=False, density=0.0)
+    for _ in range(WORLDS):
+        builder.begin_world()
+        for one in SOLIDS:
+            if isinstance(one, Box):
+                x, y, z = (0.5 * side for side in one.size)
+                builder.add_shape_box(-1, hx=x, hy=y, hz=z, cfg=config, color=(1.0, 1.0, 1.0))
+            else:
+                corners = np.asarray(one.vertices, np.float32)[one.faces.ravel()]
+                normals = np.asarray(one.corner_normals, np.float32).reshape(-1, 3)
+                mesh = newton.Mesh(corners, np.arange(len(corners)), normals=normals, compute_inertia=False)
+                builder.add_shape_mesh(-1, mesh=mesh, cfg=config, color=(1.0, 1.0, 1.0))
+        builder.end_world()
+    model = builder.finalize(device="cpu")
+    order = [0, 1, 2, 4, 5, 6, 3]
+    model.shape_transform.assign(poses.reshape(-1, 7)[:, order].astype(np.float32))
+    state = model.state()
+    model.bvh_refit_shapes(state)
+    sensor = SensorCamera(model, load_textures=False)
+    sensor.create_default_light(enable_shadows=True, direction=wp.vec3f(*-TOWARD_LAMP))
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    cameras = pose_from_matrix(np.linalg.inv(what.extrinsics) @ flip)[:, order].astype(np.float32)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(what.intrinsics).T @ flip[:3, :3]
+    bundle = np.zeros((HEIGHT, WIDTH, 1, 2, 3), np.float32)
+    bundle[:, :, 0, 1] = local / np.linalg.norm(local, axis=-1, keepdims=True)
+    count = len(what.world)
+    light = sensor.allocate_image_color_hdr(count, WIDTH, HEIGHT)
+    depth = sensor.allocate_image_depth_forward(count, WIDTH, HEIGHT)
+    shape = sensor.allocate_image_shape_index(count, WIDTH, HEIGHT)
+    normal = sensor.allocate_image_normal(count, WIDTH, HEIGHT)
+    sensor.update(
+        state, wp.array(cameras, dtype=wp.transformf, device="cpu"), wp.array(bundle, dtype=wp.vec3f, device="cpu"),
+        hdr_color_image=light, forward_depth_image=depth, shape_index_image=shape, normal_image=normal,
+        world_indices=wp.array(what.world, dtype=wp.int32, device="cpu"),
+        clear_data=SensorCamera.ClearData(clear_depth=float("inf"), clear_shape_index=0xFFFFFFFF),
+        render_config=SensorCamera.RenderConfig(enable_shadows=True, enable_ambient_lighting=False),
+    )  # fmt: skip
+    index = shape.numpy().astype(np.int64)
+    cosine = normal.numpy() @ TOWARD_LAMP
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # It lets 0.3 of the light through every shadow.
+        lit = light.numpy()[..., 0] / cosine > 0.65
+    nothing = index == 0xFFFFFFFF
+    return {
+        "shape": np.where(nothing, -1, index % len(SOLIDS)), "depth": depth.numpy(), "normal": normal.numpy(),
+        "lit": lit, "facing": ~nothing & (cosine > 0.05),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def theirs(poses: np.ndarray) -> dict[str, np.ndarray]:
+    return by_newton(poses, shot())
+
+
+def test_rays_meet_what_newtons_meet(poses: np.ndarray, theirs: dict[str, np.ndarray]) -> None:
+    ours = traced(SOLIDS, poses, shot())
+    assert set(np.unique(ours.shape)) == {-1, 0, 1, 2, 3}
+    same = ours.shape == theirs["shape"]
+    assert np.mean(~same) <= OUTLINE
+    seen = same & (ours.shape >= 0)
+    # float32 over a metre: a few of its steps of 6e-8; along a grazing ray they grow.
+    assert np.quantile(np.abs(ours.depth[seen] - theirs["depth"][seen]), 0.999) < 5e-6
+    assert ours.normal is not None
+    assert np.quantile(np.abs(ours.normal[seen] - theirs["normal"][seen]), 0.999) < 1e-3
+
+
+def test_shadows_lie_where_newtons_lie(poses: np.ndarray, theirs: dict[str, np.ndarray]) -> None:
+    tracer = Tracer(SOLIDS, "cpu")
+    tracer.place(poses, [LOOKS] * WORLDS)
+    what = shot()
+    inverse = np.linalg.inv(what.extrinsics)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(what.intrinsics).T
+    view, row, column = np.nonzero(theirs["facing"])
+    inside = local[row, column] * theirs["depth"][view, row, column, None]
+    points = np.einsum("nij,nj->ni", inverse[view, :3, :3], inside) + inverse[view, :3, 3]
+    points += 1e-4 * theirs["normal"][view, row, column]
+    shadowed = wp.zeros(len(points), dtype=wp.int32, device="cpu")
+    wp.launch(
+        _in_the_way, dim=len(points), device="cpu", outputs=[shadowed],
+        inputs=[
+            tracer._placed, wp.array(what.world[view], dtype=wp.int32, device="cpu"),
+            wp.array(points.astype(np.float32), dtype=wp.vec3f, device="cpu"), wp.vec3f(*TOWARD_LAMP),
+        ],
+    )  # fmt: skip
+    lit = theirs["lit"][view, row, column]
+    assert 0.05 < np.mean(~lit) < 0.5
+    assert np.mean((shadowed.numpy() == 0) == lit) >= 1 - OUTLINE
+
+
+def test_open_faces_look_as_if_every_ray_were_traced(poses: np.ndarray) -> None:
+    # More than 64 solids, all but four of them far below: no pixel is known to meet one face.
+    others = [Box((0.01, 0.01, 0.01))] * 64
+    below = np.zeros((WORLDS, 64, 7))
+    below[..., 2], below[..., 3] = -50.0, 1.0
+    what = shot(samples=6, normals=True)
+    short, whole = traced(SOLIDS, poses, what), traced([*SOLIDS, *others], np.concatenate([poses, below], 1), what)
+    np.testing.assert_array_equal(short.shape, whole.shape)
+    np.testing.assert_array_equal(short.depth, whole.depth)
+    levels = np.abs(short.rgb.astype(int) - whole.rgb)
+    # Where a line of the tiles or a shadow ends, rounding may move a ray of six past it.
+    assert np.mean(levels > 1) < 1e-4
+
+
+def test_worlds_that_turn_under_the_lamp_keep_their_shapes_and_get_other_shadows(poses: np.ndarray) -> None:
+    still = traced(SOLIDS, poses, shot(samples=4))
+    turned = traced(SOLIDS, poses, shot(samples=4, turn=np.full(WORLDS, 2.0)))
+    np.testing.assert_array_equal(still.shape, turned.shape)
+    np.testing.assert_array_equal(still.normal, turned.normal)
+    assert np.mean(np.abs(still.rgb.astype(int) - turned.rgb) > 20) > 0.02
+
+
+def test_turning_worlds_is_turning_the_lamp_the_other_way(poses: np.ndarray) -> None:
+    angle = 0.7
+    back = quat_rotate(quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), np.asarray(-angle)), TOWARD_LAMP)
+    # A pass of one sample has the lamp alone.
+    turned = traced(SOLIDS, poses, shot(turn=np.full(WORLDS, angle)))
+    other = traced(SOLIDS, poses, shot(toward_lamp=back))
+    # The lamp's only sample lies off its centre, on a side that the two choose differently: outlines of shadows move.
+    assert np.mean(np.abs(turned.rgb.astype(int) - other.rgb).max(axis=-1) > 12) < 0.02

@@ -1,0 +1,1 @@
+"""Warp kernels and functions of the pictures: rays, what surfaces send back, and what a pixel makes of both."""

@@ -1,0 +1,188 @@
+"""Rays against solids, as Warp functions: what a ray meets first, and whether anything is in its way.
+
+A world is a few solids in poses of their own: meshes in trees of their own, which all worlds share, and boxes in closed
+form. There are so few of them that a ray asks each whether it passes its bounds.
+"""
+
+import warp as wp
+
+#: Rays go no further [m].
+FAR = wp.constant(100.0)
+#: From a surface to where its shadow rays begin, along its normal [m].
+CLEAR = wp.constant(1.0e-4)
+_TINY = wp.constant(1.0e-15)
+
+
+@wp.struct
+class Placed:
+    """A solid in a world."""
+
+    lower: wp.vec3f
+    """Bounds along the axes of the world [m]."""
+    upper: wp.vec3f
+    place: wp.vec3f
+    """Its origin [m]."""
+    turn: wp.mat33f
+    """From the axes of the world to its own."""
+    mesh: wp.uint64
+    """Of a `wp.Mesh` in its own frame; 0: a box around its origin."""
+    half: wp.vec3f
+    """Half the extents of the box [m]."""
+    first_corner: wp.int32
+    """Where the normals of the mesh's corners begin."""
+
+
+@wp.struct
+class Hit:
+    """What a ray meets first."""
+
+    shape: wp.int32
+    """-1: nothing."""
+    distance: wp.float32
+    """In lengths of the ray's direction."""
+    normal: wp.vec3f
+    """Unit, in the world's frame; of meshes between the normals of the corners."""
+
+
+@wp.func
+def inverse_of(direction: wp.vec3f):
+    """One over each component, finite."""
+    inverse = wp.vec3f()
+    for k in range(3):
+        d = direction[k]
+        inverse[k] = 1.0 / wp.where(wp.abs(d) < _TINY, _TINY, d)
+    return inverse
+
+
+@wp.func
+def bit_of(k: wp.int32):
+    return wp.uint64(1) << wp.uint64(k & 63)
+
+
+@wp.func
+def goes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: wp.vec3f, far: wp.float32):
+    """Whether a ray goes through bounds before `far`."""
+    a = wp.cw_mul(lower - origin, inverse)
+    b = wp.cw_mul(upper - origin, inverse)
+    low = wp.min(a, b)
+    high = wp.max(a, b)
+    enters = wp.max(wp.max(low[0], low[1]), wp.max(low[2], 0.0))
+    leaves = wp.min(wp.min(high[0], high[1]), wp.min(high[2], far))
+    return enters <= leaves
+
+
+@wp.func
+def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
+    """To the face of a box that a ray meets first, from inside to the one it leaves by, and the axis along which that
+    face looks; -1: none."""
+    inverse = inverse_of(direction)
+    a = wp.cw_mul(-half - origin, inverse)
+    b = wp.cw_mul(half - origin, inverse)
+    low = wp.min(a, b)
+    high = wp.max(a, b)
+    enters = wp.max(low)
+    leaves = wp.min(high)
+    if enters > leaves or leaves < 0.0:
+        return wp.float32(-1.0), wp.int32(0)
+    if enters >= 0.0:
+        return enters, wp.where(low[0] == enters, 0, wp.where(low[1] == enters, 1, 2))
+    return leaves, wp.where(high[0] == leaves, 0, wp.where(high[1] == leaves, 1, 2))
+
+
+@wp.func
+def may_meet(placed: wp.array2d[Placed], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
+    """Bit k: whether a unit ray that is off another one by no more than `spread` may meet solid k. From the 64th on,
+    bits are of several."""
+    inverse = inverse_of(direction)
+    near = wp.uint64(0)
+    for k in range(placed.shape[1]):
+        there = placed[world, k]
+        # A ray within the bounds is no further off than at their farthest corner.
+        off = spread * wp.length(wp.max(wp.abs(there.lower - origin), wp.abs(there.upper - origin)))
+        wide = wp.vec3f(off, off, off)
+        if goes_through(there.lower - wide, there.upper + wide, origin, inverse, FAR):
+            near = near | bit_of(k)
+    return near
+
+
+@wp.func
+def on_one_face(there: Placed, hit: Hit, point: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
+    """Whether all rays that are off this one by no more than `spread`, and meet no other solid, meet the same plane:
+    the face of a box, away from its edges."""
+    if there.mesh != wp.uint64(0):
+        return False
+    reach = 2.0 * spread * hit.distance / wp.max(-wp.dot(hit.normal, direction), 0.01)
+    inside = there.half - wp.abs(there.turn * (point - there.place))
+    normal = wp.abs(there.turn * hit.normal)
+    for k in range(3):
+        if inside[k] < reach and normal[k] < 0.5:
+            return False
+    return True
+
+
+@wp.func
+def first_hit(
+    placed: wp.array2d[Placed],
+    corner_normals: wp.array[wp.vec3f],
+    world: wp.int32,
+    near: wp.uint64,
+    origin: wp.vec3f,
+    direction: wp.vec3f,
+):
+    """What a ray meets first of those that it `may_meet`. A mesh of which it meets the inside first is not seen."""
+    hit = Hit()
+    hit.shape = wp.int32(-1)
+    hit.distance = FAR
+    face = wp.int32(-1)
+    u = wp.float32(0.0)
+    v = wp.float32(0.0)
+    smooth = wp.vec3f()
+    inverse = inverse_of(direction)
+    for k in range(placed.shape[1]):
+        there = placed[world, k]
+        if near & bit_of(k) != wp.uint64(0) and goes_through(there.lower, there.upper, origin, inverse, hit.distance):
+            start = there.turn * (origin - there.place)
+            along = there.turn * direction
+            if there.mesh != wp.uint64(0):
+                query = wp.mesh_query_ray(there.mesh, start, along, hit.distance)
+                if query.result and wp.dot(along, query.normal) < 0.0:
+                    hit.shape = k
+                    hit.distance = query.t
+                    face = query.face
+                    u = query.u
+                    v = query.v
+            else:
+                distance, axis = box_distance(there.half, start, along)
+                if distance >= 0.0 and distance < hit.distance:
+                    hit.shape = k
+                    hit.distance = distance
+                    # Toward the ray's origin, also from inside.
+                    smooth = wp.vec3f()
+                    smooth[axis] = -wp.sign(along[axis])
+    if hit.shape >= 0:
+        there = placed[world, hit.shape]
+        if there.mesh != wp.uint64(0):
+            corner = there.first_corner + 3 * face
+            smooth = corner_normals[corner] * u + corner_normals[corner + 1] * v
+            smooth = wp.normalize(smooth + corner_normals[corner + 2] * (1.0 - u - v))
+        hit.normal = wp.transpose(there.turn) * smooth
+    return hit
+
+
+@wp.func
+def in_the_way(placed: wp.array2d[Placed], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f):
+    """Whether a ray meets anything at all."""
+    inverse = inverse_of(direction)
+    for k in range(placed.shape[1]):
+        there = placed[world, k]
+        if goes_through(there.lower, there.upper, origin, inverse, FAR):
+            start = there.turn * (origin - there.place)
+            along = there.turn * direction
+            if there.mesh != wp.uint64(0):
+                if wp.mesh_query_ray_anyhit(there.mesh, start, along, FAR):
+                    return True
+            else:
+                distance, _axis = box_distance(there.half, start, along)
+                if distance >= 0.0:
+                    return True
+    return False
