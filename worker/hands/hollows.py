@@ -7,7 +7,6 @@ what can be seen from outside lie no deeper. Insides of housings do not count.
 from __future__ import annotations
 
 import hashlib
-from importlib.metadata import version
 from typing import Final
 
 import fast_simplification
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.digests import digest_json
+from service.model.libraries import version_of
 from service.model.transforms import Floats, quat_to_matrix
 from worker.hands.primitives import hull, triangle_areas
 from worker.hands.robot import Ints
@@ -63,7 +63,7 @@ def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
     if _is_convex(vertices, faces):
         return whole
     shape = hashlib.sha256(np.ascontiguousarray(vertices).tobytes() + np.ascontiguousarray(faces).tobytes())
-    settings = [_COACD, list(_THRESHOLDS), MAX_ERROR_M, _POINTS, _FACES, version("coacd")]
+    settings = [_COACD, list(_THRESHOLDS), MAX_ERROR_M, _POINTS, _FACES, version_of("coacd")]
     file = default_cache() / f"hand-{digest_json({'shape': shape.hexdigest(), 'settings': settings})}.npz"
     kept = load_parts(file) if file.is_file() else None
     if kept:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from types import ModuleType
+from typing import Any, Final
 
 import numpy as np
 from cachetools import LRUCache
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from service.model import transforms
 from service.model.errors import HandError
 from service.model.transforms import IDENTITY_POSE, quat_rotate
-from worker.hands import jaws, kinematics, primitives, surface
+from worker.hands import guess, jaws, kinematics, primitives, surface
 from worker.hands import pads as pads_code
 from worker.hands.guess import posture
 from worker.hands.kinematics import body_poses
@@ -90,10 +92,14 @@ def oppositions_of(hand: HandModel) -> Oppositions:
     finger."""
     with _lock:
         if hand.content not in _known:
-            code = (sys.modules[__name__], jaws, kinematics, pads_code, primitives, surface, transforms)
-            made = arrays_kept_or_made("oppositions", (hand.content,), code, lambda: vars(_oppositions(hand)))
+            made = arrays_kept_or_made("oppositions", (hand.content,), _code(), lambda: vars(_oppositions(hand)))
             _known[hand.content] = Oppositions(**made)
         return _known[hand.content]
+
+
+def _code() -> tuple[ModuleType, ...]:
+    """Whose change would change what is kept of a hand."""
+    return (sys.modules[__name__], guess, jaws, kinematics, pads_code, primitives, surface, transforms)
 
 
 def _oppositions(hand: HandModel) -> Oppositions:
@@ -201,19 +207,26 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def require_opposing(hand: HandModel) -> None:
-    """Refuse a hand that can hold nothing, before any work; from memory where it was asked for before.
+    """Refuse a hand that can hold nothing, before any work; from memory or this machine's cache where it is known.
 
     Raises:
         HandError: no two of its surfaces face each other and close; the message says the mend.
     """
     with _lock:
         if hand.content not in _holding:
-            _holding[hand.content] = opposes(hand)
+            made = arrays_kept_or_made(
+                "opposing", (hand.content,), _code(), lambda: {"opposes": np.array(opposes(hand))}, fits=_is_one_answer
+            )
+            _holding[hand.content] = bool(made["opposes"])
         if not _holding[hand.content]:
             raise HandError(f"{hand.name}: {_why_not(hand)}")
 
 
 _holding: LRUCache[str, bool] = LRUCache(32)
+
+
+def _is_one_answer(kept: Mapping[str, NDArray[Any]]) -> bool:
+    return set(kept) == {"opposes"} and kept["opposes"].shape == () and kept["opposes"].dtype == bool
 
 
 def _why_not(hand: HandModel) -> str:

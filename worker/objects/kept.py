@@ -7,12 +7,12 @@ import platform
 import zipfile
 from collections.abc import Callable
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
 from service import user_cache
 from service.model.digests import digest_json
+from service.model.libraries import version_of
 from worker.objects.model import ObjectModel
 from worker.objects.packed import from_bytes, to_bytes
 
@@ -47,4 +47,4 @@ def revision() -> str:
     whole = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         whole.update(file.read_bytes())
-    return digest_json([whole.hexdigest(), *map(version, _LIBRARIES), platform.machine()])
+    return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])

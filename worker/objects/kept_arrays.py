@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from service import user_cache
 from service.model.digests import digest_json
+from service.model.libraries import version_of
 
 #: Libraries that go into the arrays.
 _LIBRARIES: Final = ("numpy", "scipy")
@@ -31,7 +31,12 @@ _recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", d
 
 
 def arrays_kept_or_made(
-    kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...], make: Callable[[], Arrays]
+    kind: str,
+    terms: tuple[str | int, ...],
+    code: tuple[ModuleType, ...],
+    make: Callable[[], Arrays],
+    *,
+    fits: Callable[[Arrays], bool] = lambda _: True,
 ) -> Arrays:
     """Arrays from the user's cache, else made and kept there; the same bit for bit.
 
@@ -40,9 +45,10 @@ def arrays_kept_or_made(
         terms: all that they follow from, besides the code.
         code: modules whose change would change them.
         make: computes them; what it raises is not kept.
+        fits: whether arrays that were read can be what is wanted; those that cannot are made again.
     """
     file = _file(kind, terms, code)
-    if (held := _read(file)) is not None:
+    if (held := _read(file)) is not None and fits(held):
         return held
     made = make()
     _write(file, made)
@@ -111,4 +117,4 @@ def _revision(files: tuple[str, ...]) -> str:
     whole = hashlib.sha256()
     for file in files:
         whole.update(Path(file).read_bytes())
-    return digest_json([whole.hexdigest(), *map(version, _LIBRARIES), platform.machine()])
+    return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])

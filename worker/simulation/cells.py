@@ -60,10 +60,11 @@ def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
     return total[group]
 
 
-def list_cells(obj: ObjectModel, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
-    """Lists for the cells of the grid `field`, whose first corner is `low`, that come within so much of the surface."""
+def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
+    """Lists of the `faces` of `faces_of` for the cells of the grid `field`, whose first corner is `low`, that come
+    within so much of the surface."""
     cells = nearest.Cells()
-    cells.faces = faces_of(obj)
+    cells.faces = faces
     shape = [n - 1 for n in field.shape]
     radius = wp.zeros(int(np.prod(shape)), dtype=wp.float32)
     count = wp.zeros(len(radius), dtype=wp.int32)

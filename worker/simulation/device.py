@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 from worker.hands.jaws import slides
 from worker.hands.model import ConvexPiece, HandModel
 from worker.objects.model import ObjectModel
-from worker.simulation.cells import faces_of, list_cells
+from worker.simulation.cells import faces_of
+from worker.simulation.grids import add_grid
 from worker.simulation.kernels import kinematics, nearest, pieces, surface
 
 Floats = NDArray[np.float64]
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-#: Distances farther than this from the surface are never asked for [m].
-FIELD_REACH: Final = 0.06
-#: Cells that come as near to the surface as this and the grid's error list their nearest faces [m].
-LISTED_M: Final = 0.004
 #: Cells that samples of the object are sorted by [m].
 SAMPLE_CELL_M: Final = 0.008
 #: Way of a sliding joint that moves a fingertip as a revolute joint of a finger does by one radian [m].
@@ -166,10 +163,7 @@ class DeviceObject:
             skin.cells = nearest.Cells()
             skin.cells.faces = faces_of(obj)
             if cell > 0:
-                _add_field(skin, obj, cell)
-                skin.cells = list_cells(
-                    obj, mesh, skin.field, skin.field_origin, skin.field_cell, LISTED_M + skin.field_error
-                )
+                add_grid(skin, obj, mesh, cell)
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             bvh = wp.Bvh(centred, centred)
             cells = sorted_samples(samples - obj.centre_of_mass)
@@ -201,18 +195,3 @@ def sorted_samples(samples: Floats, size: float = SAMPLE_CELL_M) -> Any:
     out.first = wp.array(np.searchsorted(index[order], np.arange(int(np.prod(shape)) + 1)), dtype=wp.int32)
     out.low, out.size, out.shape = wp.vec3(*low.tolist()), size, wp.vec3i(*shape.tolist())
     return out
-
-
-def _add_field(skin: Any, obj: ObjectModel, cell: float) -> None:
-    low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
-    high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
-    # At most 96 cells a side: a large object has a coarser grid, whose larger error is accounted for.
-    cell = max(cell, float((high - low).max()) / 96)
-    shape = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
-    field = wp.empty(shape, dtype=wp.float32)
-    wp.launch(surface.sample_field, dim=shape, inputs=[skin, wp.vec3(*low), cell, 4 * FIELD_REACH], outputs=[field])
-    skin.field = field
-    skin.field_origin = wp.vec3(*low)
-    skin.field_cell = cell
-    # A distance has slope at most 1: trilinear interpolation between corners is off by less than half a diagonal.
-    skin.field_error = 0.5 * cell

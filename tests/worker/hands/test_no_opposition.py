@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import trimesh
 
@@ -10,6 +12,7 @@ from service.model.errors import HandError
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh
 from worker.certified import certified_grasps
+from worker.hands import oppositions
 from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.hands.oppositions import require_opposing
@@ -40,3 +43,26 @@ def test_grasps_of_a_hand_without_opposing_digits_are_not_even_planned() -> None
 
 def test_a_gripper_opposes() -> None:
     require_opposing(gripper())
+
+
+def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    answer = oppositions.opposes
+
+    def opposes(hand: HandModel) -> bool:
+        asked.append(hand.name)
+        return answer(hand)
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(oppositions, "opposes", opposes)
+    for _ in range(2):
+        oppositions._holding.clear()  # as a process that begins
+        require_opposing(gripper())
+        with pytest.raises(HandError, match="no two opposing digits"):
+            require_opposing(pointer())
+    assert sorted(asked) == sorted([gripper().name, "pointer"])
+    for file in (tmp_path / "graspd" / "opposing").iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    oppositions._holding.clear()
+    require_opposing(gripper())
+    assert len(asked) == 3, "an entry that was cut off is none"

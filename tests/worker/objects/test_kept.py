@@ -71,7 +71,7 @@ def test_whatever_it_follows_from_makes_another_entry(made: list[float], monkeyp
 
 def test_the_revision_follows_the_code_and_the_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = kept.revision.__wrapped__()
-    monkeypatch.setattr(kept, "version", lambda name: f"0 of {name}")
+    monkeypatch.setattr(kept, "version_of", lambda name: f"0 of {name}")
     libraries = kept.revision.__wrapped__()
     read = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda file: read(file) + b"#" * (file.name == "repair.py"))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from service.model.digests import digest_json
 from service.model.errors import MeshError
+from service.model.libraries import version_of
 from worker.hands.primitives import triangle_areas
 from worker.objects.convex import coacd_parts, default_cache, keep_parts, load_parts, union_volume
 from worker.objects.model import ObjectModel
@@ -104,7 +104,7 @@ class _Key:
     def __init__(self, obj: ObjectModel) -> None:
         self.obj = obj
         shape = hashlib.sha256(obj.vertices.tobytes() + obj.faces.tobytes()).hexdigest()
-        settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version("coacd")]
+        settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]
         self.digest = digest_json({"shape": shape, "settings": settings})
 
     def __hash__(self) -> int:

@@ -1,0 +1,102 @@
+"""The distance grid of an object with the lists of near faces of its cells, kept on the machine.
+
+Both follow from the object alone and are a fifth of what the first grasp of a process takes, so a CPU's are read by
+later processes. A GPU makes them sooner than a file is read.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from worker.engines.binaries import binary_name
+from worker.objects.kept_arrays import arrays_kept_or_made
+from worker.objects.model import ObjectModel
+from worker.simulation import cells
+from worker.simulation.cells import list_cells
+from worker.simulation.kernels import nearest, surface
+
+Arrays = Mapping[str, NDArray[Any]]
+
+#: Distances farther than this from the surface are never asked for [m].
+FIELD_REACH: Final = 0.06
+#: Cells that come as near to the surface as this and the grid's error list their nearest faces [m].
+LISTED_M: Final = 0.004
+#: Cells a side at most: a large object has a coarser grid, whose larger error is accounted for.
+_MOST_CELLS: Final = 96
+
+
+def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
+    """Give a surface its distance grid and the lists of its cells, on the present Warp device.
+
+    Args:
+        skin: a `surface.Surface` without them, its `cells.faces` filled; written to.
+        obj: the object it is of.
+        mesh: its `warp.Mesh`, vertices about the centre of mass.
+        cell: cell size of the grid [m].
+    """
+    low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
+    high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
+    cell = max(cell, float((high - low).max()) / _MOST_CELLS)
+    shape = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
+    skin.field_origin = wp.vec3(*low)
+    skin.field_cell = cell
+    # A distance has slope at most 1: trilinear interpolation between corners is off by less than half a diagonal.
+    skin.field_error = 0.5 * cell
+    if not wp.get_device().is_cpu:
+        skin.field = _sampled(skin, shape)
+        _list(skin, obj, mesh)
+        return
+
+    def make() -> Arrays:
+        skin.field = _sampled(skin, shape)
+        _list(skin, obj, mesh)
+        return {"field": skin.field.numpy(), **{name: getattr(skin.cells, name).numpy() for name in _LISTS}}
+
+    def fits(kept: Arrays) -> bool:
+        return _fits(kept, shape, len(obj.faces))
+
+    terms = (obj.content, repr(cell), repr(float(skin.alpha)), *map(binary_name, (surface, nearest)))
+    kept = arrays_kept_or_made("object_grids", terms, (sys.modules[__name__], cells), make, fits=fits)
+    skin.field = wp.array(kept["field"], dtype=wp.float32)
+    for name, kind in _LISTS.items():
+        setattr(skin.cells, name, wp.array(kept[name], dtype=kind))
+
+
+#: What the lists of cells consist of, see `nearest.Cells`.
+_LISTS: Final = {"first": wp.int32, "face": wp.int32, "key": wp.float32}
+
+
+def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
+    """The distances at the corners of the grid."""
+    field = wp.empty(shape, dtype=wp.float32)
+    wp.launch(
+        surface.sample_field, dim=shape, inputs=[skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH],
+        outputs=[field],
+    )  # fmt: skip
+    return field
+
+
+def _list(skin: Any, obj: ObjectModel, mesh: Any) -> None:
+    skin.cells = list_cells(
+        skin.cells.faces, mesh, skin.field, skin.field_origin, skin.field_cell, LISTED_M + skin.field_error
+    )
+
+
+def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
+    """Whether arrays can be those of a grid of this shape over so many faces: kernels look nowhere else then."""
+    kinds = {"field": np.float32, "first": np.int32, "face": np.int32, "key": np.float32}
+    if set(kept) != set(kinds) or any(kept[name].dtype != kind for name, kind in kinds.items()):
+        return False
+    field, first, face, key = (kept[name] for name in kinds)
+    count = int(np.prod([n - 1 for n in shape]))
+    return bool(
+        field.shape == shape and first.shape == (count + 1,) and face.shape == key.shape == (int(first[-1]),)
+        and first[0] == 0 and (np.diff(first) >= 0).all()
+        and (len(face) == 0 or (face.min() >= 0 and face.max() < faces))
+    )  # fmt: skip
