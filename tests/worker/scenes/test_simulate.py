@@ -12,7 +12,7 @@ from service.model.errors import InputError, MeshError
 from service.model.transforms import apply, quat_rotate
 from tests.worker.models import object_from_mesh
 from worker.objects.model import ObjectModel
-from worker.scenes import drop
+from worker.scenes import drop, simulate
 from worker.scenes.rest import resting_faces
 from worker.scenes.simulate import REACH, _build
 
@@ -157,6 +157,50 @@ def test_convex_objects_rest_on_each_face_as_often_as_the_quasi_static_theory_sa
     assert agreement.max(axis=1).min() > 1 - 1e-6
     counts = np.bincount(np.argmax(agreement, axis=1), minlength=len(probability))
     assert chisquare(counts, 300 * probability / probability.sum()).pvalue > 0.01
+
+
+@pytest.fixture
+def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
+    """Keys of the drops that are simulated, in a cache of their own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    keys: list[tuple[int, int]] = []
+    whole = simulate._redo_until_rest
+
+    def counted(table, name, key):
+        keys.append(key)
+        return whole(table, name, key)
+
+    monkeypatch.setattr(simulate, "_redo_until_rest", counted)
+    return keys
+
+
+def next_process() -> None:
+    simulate._reference_faces.cache_clear()
+
+
+def test_reference_drops_are_simulated_once_on_a_machine(dropped):
+    next_process()
+    first = drop(bracket(), count=1, seed=5)
+    assert len(dropped) == 1 + simulate.REFERENCE_DROPS
+    next_process()
+    again = drop(bracket(), count=1, seed=5)
+    assert len(dropped) == 2 + simulate.REFERENCE_DROPS
+    np.testing.assert_array_equal(first["scene/rest_probability"], again["scene/rest_probability"])
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [{"face": np.full(64, 99)}, {"face": np.zeros(3, np.int64)}, {"face": np.zeros(64)}, {"other": np.zeros(64)}],
+)
+def test_kept_drops_that_cannot_be_those_of_the_object_are_simulated_again(dropped, tmp_path, harm):
+    next_process()
+    first = drop(bracket(), count=1, seed=5)
+    (file,) = tmp_path.rglob("drops/*.npz")
+    np.savez(file, **harm)
+    next_process()
+    again = drop(bracket(), count=1, seed=5)
+    assert len(dropped) == 2 * (1 + simulate.REFERENCE_DROPS)
+    np.testing.assert_array_equal(first["scene/rest_probability"], again["scene/rest_probability"])
 
 
 def test_no_scenes_give_empty_arrays():
