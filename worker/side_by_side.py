@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 from worker.lanes import Lanes
@@ -55,12 +56,21 @@ def side_by_side(parts: Sequence[T], work: Callable[[T, Run], R], run: Run, *, s
         finally:
             lanes.leave()
 
-    with ThreadPoolExecutor(len(parts), thread_name_prefix="lane") as pool:
-        futures = [pool.submit(lane, number) for number in range(len(parts))]
-        done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-        failed = [error for one in done if (error := one.exception()) is not None]
-        if failed:
+    return in_threads([partial(lane, number) for number in range(len(parts))], stop, "lane")
+
+
+def in_threads(works: Sequence[Callable[[], R]], stop: threading.Event, name: str) -> list[R]:
+    """What all works give, in order, each in a thread of its own; `stop` is set as soon as one fails, and at the end.
+
+    Raises:
+        Exception: what became of the first that failed, when all threads have ended.
+    """
+    with ThreadPoolExecutor(len(works), thread_name_prefix=name) as pool:
+        futures = [pool.submit(work) for work in works]
+        try:
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        finally:
             stop.set()
-    if failed:
+    if failed := [error for one in done if (error := one.exception()) is not None]:
         raise failed[0]
     return [one.result() for one in futures]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import Final
 
@@ -19,7 +18,7 @@ from worker.objects.model import ObjectModel
 from worker.quality.diversity import distinct, hand_points
 from worker.quality.referee.decomposition import ConvexPieces, decompose
 from worker.run import ALONE, Run
-from worker.side_by_side import Shares
+from worker.side_by_side import Shares, in_threads
 from worker.simulation.surroundings import Scenes
 
 #: Times that batches are made for grasps that were too like those of another batch.
@@ -114,13 +113,5 @@ def _together(work: Callable[[int, Run], Certified], count: int, join: int, run:
             finally:
                 meeting.leave()
 
-        try:
-            with ThreadPoolExecutor(members, thread_name_prefix="batch") as pool:
-                futures = [pool.submit(member) for _ in range(members)]
-                done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-                stop.set()
-        finally:
-            stop.set()
-    if failed := [error for one in done if (error := one.exception()) is not None]:
-        raise failed[0]
+        in_threads([member] * members, stop, "batch")
     return [found[number] for number in range(count)]
