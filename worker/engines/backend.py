@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from worker.engines import kept_hashes
 from worker.engines.baked import lay_out
 from worker.engines.kernel_cache import kernel_cache
 
@@ -61,5 +62,6 @@ def start() -> None:
                 if _HARMLESS not in line:
                     os.write(2, line)
         _default_of_each_thread()
+        kept_hashes.install()
         lay_out(Path(wp.config.kernel_cache_dir))
         _started = True
