@@ -174,4 +174,6 @@ def main() -> None:
     own_process()
     # No command draws with MuJoCo; at import it would look for GLFW with a process of its own.
     os.environ.setdefault("MUJOCO_GL", "disable")
+    # Pydantic would look through all installed packages for plugins of its own. Whoever wants them sets it to nothing.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     build()()

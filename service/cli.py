@@ -9,14 +9,16 @@ import os
 import stat
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any, NoReturn, ParamSpec, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TypeVar
 
 import typer
 from pydantic import BaseModel, ValidationError
 
-from service import logs
 from service.model.errors import GraspdError, InputError
-from service.settings import Settings
+
+if TYPE_CHECKING:
+    from service.settings import Settings
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -59,14 +61,35 @@ def emit(value: BaseModel | dict[str, Any]) -> None:
 
 def load_settings(**overrides: Any) -> Settings:
     """Settings of the environment, with those options of a command that were given; InputError for a bad value."""
+    from service.settings import Settings
+
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:
         raise InputError(validation_line(error)) from None
 
 
+@dataclass(frozen=True)
+class EngineSettings:
+    """The settings that a command follows which plans and judges itself, and their defaults."""
+
+    first_judge: Literal["auto", "on", "off"] = "auto"
+    processes: int = 0
+
+
+def engine_settings() -> EngineSettings:
+    """Those of the environment; InputError for a bad value. What reads settings is loaded only where one is set: it
+    takes as long as the hand and the object together."""
+    if not any(name.upper().startswith("GRASPD_") for name in os.environ):
+        return EngineSettings()
+    found = load_settings()
+    return EngineSettings(found.first_judge, found.processes)
+
+
 def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
     """Log lines of this process: JSON, or text on a terminal."""
+    from service import logs
+
     logs.set_up(settings, process)
 
 
@@ -86,6 +109,6 @@ def validation_line(error: ValidationError) -> str:
     """The first thing that is wrong with a model's input, in a line."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
-    if error.title == Settings.__name__:
+    if error.title == "Settings":
         where = f"GRASPD_{where.upper()}"
     return f"{where}: {first['msg']}" if where else first["msg"]

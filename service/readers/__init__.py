@@ -9,16 +9,36 @@
     pictures = Pictures(shards)                                            # a picture with the grasps of its scene
     clouds = pictures.clouds(points=1024, noise="stereo")                  # as a depth camera sees it, in points
 
-`service.readers.torch_data` wraps them for PyTorch; nothing here imports it.
+`service.readers.torch_data` wraps them for PyTorch; nothing here imports it. What is named here is imported when it is
+first used: most of those who look at a single shard need little of it.
 """
 
-from service.readers.cache import ShardCache
-from service.readers.clouds import Clouds
-from service.readers.depth_noise import DepthNoise
-from service.readers.files import ShardFile, Shards, open_shards
-from service.readers.grasps import Grasps
-from service.readers.pictures import Pictures
-from service.readers.prefetch import prefetched
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from service.readers.cache import ShardCache
+    from service.readers.clouds import Clouds
+    from service.readers.depth_noise import DepthNoise
+    from service.readers.files import ShardFile, Shards, open_shards
+    from service.readers.grasps import Grasps
+    from service.readers.pictures import Pictures
+    from service.readers.prefetch import prefetched
+
+#: Name, the module it lives in.
+_LIVES_IN: Final = {
+    "Clouds": "clouds",
+    "DepthNoise": "depth_noise",
+    "Grasps": "grasps",
+    "Pictures": "pictures",
+    "ShardCache": "cache",
+    "ShardFile": "files",
+    "Shards": "files",
+    "open_shards": "files",
+    "prefetched": "prefetch",
+}
 
 __all__ = [
     "Clouds",
@@ -31,3 +51,15 @@ __all__ = [
     "open_shards",
     "prefetched",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LIVES_IN:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_LIVES_IN[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,10 +11,8 @@ from typing import Annotated, Any, get_args
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from service.cli import JsonFlag, emit, load_settings, reporting_errors, validation_line
+from service.cli import JsonFlag, emit, engine_settings, reporting_errors, validation_line
 from service.model.diversity import CELLS, MIN_DISTANCE_M
 from service.model.domain import JobOptions
 from service.model.errors import InputError
@@ -106,7 +105,7 @@ def synth(
     )  # fmt: skip
     mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
     place = parse_scene(scene, faces=faces, touch=touch, beside=with_ or [])
-    settings = load_settings()
+    settings = engine_settings()
     with _bar(quiet=json) as progress:
         made = synthesized(
             hand, object_, request, place=place, scenes=scenes, mesh=mesh, device=device, threads=threads,
@@ -137,11 +136,17 @@ def _request(want: str, budget: float, referee: str, robust: float, models: int)
 
 @contextmanager
 def _bar(*, quiet: bool) -> Iterator[Report]:
-    """A progress bar; gives what is told of the grasps that are done."""
+    """A progress bar on a terminal; gives what is told of the grasps that are done."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, total, message: None
+        return
+    from rich.console import Console  # where nobody looks at a bar, what draws it need not be loaded
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     began = time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, rate="")
 
         def tell(done: float, total: float, message: str) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from typing import Final
 
-import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
@@ -185,6 +184,8 @@ def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     merged = trimesh.Trimesh(vertices, faces, process=True)
     points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
     if len(triangles) > _FACES:
+        import fast_simplification  # where something is new on the machine
+
         light, kept = fast_simplification.simplify(
             points.astype(np.float32), triangles, target_reduction=1 - _FACES / len(triangles)
         )

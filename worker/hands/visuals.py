@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
-import fast_simplification
 import numpy as np
 
 from service.model.errors import InputError
@@ -96,6 +95,8 @@ def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
     import trimesh
 
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    import fast_simplification  # where something is new on the machine
+
     points, triangles = fast_simplification.simplify(
         np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1 - 1 / times
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import fast_simplification
 import numpy as np
 
 from worker.objects import solid, topology
@@ -121,6 +120,8 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
         return None
     # Single precision inside: centred and scaled, so that it costs the least.
     middle, scale = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
+    import fast_simplification  # where something is new on the machine
+
     points, triangles = fast_simplification.simplify(
         ((vertices - middle) / scale).astype(np.float32), faces.astype(np.int32), target_count=target, agg=PATIENCE
     )[:2]

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
 
 from service.model.errors import InputError
 from service.model.imports import imports
 from worker.planners.port import Joined, Method, Options, Planner
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint, EntryPoints
 
 #: Entry-point group of planners of other packages.
 GROUP: Final = "graspd.planners"
@@ -107,6 +109,13 @@ def parsed_options(pairs: list[str]) -> dict[str, str]:
     if wrong := [pair for pair in pairs if "=" not in pair]:
         raise InputError(f"{wrong[0]!r} is no option; write it as name=value, for example steps=20000")
     return dict(pair.split("=", 1) for pair in pairs)
+
+
+def entry_points(group: str) -> EntryPoints:
+    """Entry points of the packages that are installed; the library that finds them is loaded for it."""
+    from importlib.metadata import entry_points as found
+
+    return found(group=group)
 
 
 def _offered() -> dict[str, EntryPoint]:

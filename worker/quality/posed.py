@@ -11,6 +11,7 @@ import warp as wp
 from cachetools import LRUCache
 from numpy.typing import NDArray
 
+from service.model.integers import distinct_values
 from worker.grasps import Posture
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -118,7 +119,7 @@ class Posing:
         found, body = np.zeros(len(posture), np.int32), self.points.body.numpy()
         for rows in self.parts(len(posture)):
             distance = self.touch(posture.take(rows), LINK_CONTACT_M)[1].distance.numpy()
-            least = [distance[:, body == link].min(axis=1) for link in np.unique(body)]
+            least = [distance[:, body == link].min(axis=1) for link in distinct_values(body)]
             found[rows] = contact_links(np.stack(least, axis=1))
         return found
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.diversity import GraspType
+from service.model.integers import distinct_values
 from worker.hands.model import HandModel, JointType
 from worker.quality.contact import LINK_CONTACT_M, finger_of_body
 from worker.quality.probe import Distances, Probe
@@ -39,8 +40,8 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M
-    digits = np.unique(finger[finger >= 0])
-    inner = np.setdiff1d(np.flatnonzero(finger >= 0), hand.fingertips)
+    digits = np.array(distinct_values(finger[finger >= 0]), finger.dtype)
+    inner = np.array([body for body in np.flatnonzero(finger >= 0) if body not in hand.fingertips], np.intp)
     palm = touching[:, finger < 0].any(axis=1)
     touches = np.stack([touching[:, finger == digit].any(axis=1) for digit in digits], axis=1)
     wraps = np.stack([touching[:, inner[finger[inner] == digit]].any(axis=1) for digit in digits], axis=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from service.model.errors import InputError, TaskCancelled
 from service.model.fidelity import Fidelity
+from service.model.integers import distinct_values
 from worker.grasps import GraspSet
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.scene_starts import free_ways
@@ -121,7 +122,7 @@ class Batches:
         is good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
-        for owner in np.unique(owners).tolist():
+        for owner in distinct_values(owners):
             trial, own = self.asked[owner].wanted.trial, np.flatnonzero(owners == owner)
             if trial is None or owner in self.errors:
                 continue

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from service.model.integers import distinct_values
 from worker.grasps import GraspSet, joined
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
@@ -254,7 +255,7 @@ def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
     owners = batches.owner[begun.rows]
-    for owner in np.unique(owners).tolist():
+    for owner in distinct_values(owners):
         own = deep[owners == owner]
         if batches.placed is None and own.max() > NO_PLACE:
             batches.put_out(owner, starts.no_place(launch.coarse))

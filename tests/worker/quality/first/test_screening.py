@@ -126,7 +126,7 @@ def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
     def full(*_: Any) -> Any:
         raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
 
-    monkeypatch.setattr(screening, "WorldPool", full)
+    monkeypatch.setattr(worlds, "WorldPool", full)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON)
     assert (found.judged_by == JudgedBy.MUJOCO).all()

@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,12 @@ from worker.grasps import GraspSet, joined
 from worker.hands.jaws import jaws_of
 from worker.hands.model import HandModel
 from worker.quality.referee.first.trials import AUDIT_ONE_IN, FirstTrials
-from worker.quality.referee.first.worlds import WorldPool
 from worker.quality.referee.model import Scene
 from worker.quality.referee.protocol import INTERVAL_S, JudgedBy, Outcome, Trial
 from worker.run import ALONE, Run
+
+if TYPE_CHECKING:
+    from worker.quality.referee.first.worlds import WorldPool
 
 log = logging.getLogger(__name__)
 
@@ -130,6 +132,8 @@ def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
     if key not in _pools:
         while len(_pools) >= _KEPT_POOLS:
             _pools.popitem(last=False)
+        from worker.quality.referee.first.worlds import WorldPool  # its kernels are read for those who ask it
+
         _pools[key] = WorldPool(scene, device, size)
     _pools.move_to_end(key)
     return _pools[key]

@@ -1,0 +1,13 @@
+"""Arrays of integers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def distinct_values(values: NDArray[np.integer[Any]]) -> list[int]:
+    """The values of an array of any shape, ascending, each once; NumPy's own `unique` would load its masked arrays."""
+    return sorted(set(values.ravel().tolist()))
