@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 ROOT: Final = Path("/")
+#: A quota that was read is that of so long [s].
+_LATELY_S: Final = 2.0
 #: Where systems mount the CPU controller of cgroup v1.
 _V1: Final = ("cpu", "cpu,cpuacct")
 
@@ -16,13 +20,20 @@ _V1: Final = ("cpu", "cpu,cpuacct")
 def available_cores(root: Path = ROOT) -> int:
     """Cores for threads of this process: its affinity, or the CPU quota of its control group where that is less.
 
-    A quota of one and a half cores gives 2: a thread that waits for its share costs less than half a core unused.
+    A quota of one and a half cores gives 2: a thread that waits for its share costs less than half a core unused. It is
+    asked for before each piece of work, and a quota that is changed meanwhile is heard of within seconds.
 
     Args:
         root: the folder that holds `proc` and `sys`.
     """
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min([given, *(math.ceil(quota) for quota in _quotas(root))]))
+    return max(1, min([given, *(math.ceil(quota) for quota in _lately(root, int(time.monotonic() / _LATELY_S)))]))
+
+
+@lru_cache(maxsize=1)
+def _lately(root: Path, moment: int) -> list[float]:
+    """The quotas as they were when somebody first asked in a moment; the files are read in milliseconds."""
+    return list(_quotas(root))
 
 
 def _quotas(root: Path) -> Iterator[float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -13,10 +15,12 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from service.model.transforms import compose, quat_to_matrix
+from worker.engines.binaries import binary_name
 from worker.grasps import Posture
 from worker.hands.kinematics import body_poses
 from worker.hands.model import HandModel, SurfacePoints
 from worker.hands.surface import sample_surface
+from worker.objects.kept_arrays import arrays_kept_or_made
 from worker.objects.model import ObjectModel
 from worker.simulation.device import DeviceHand, to_xyzw
 from worker.simulation.kernels import distance as kernels
@@ -118,8 +122,19 @@ class Probe:
             counts = [int(length / skin.spacing) + 2 for length in size]
             nodes = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1)
             points = low + skin.spacing * nodes + obj.centre_of_mass
-            coarse = self._query(points.reshape(-1, 3))[0].reshape(counts)
-            skin.coarse = wp.array(coarse, dtype=wp.float32)
+
+            def make() -> dict[str, NDArray[np.float32]]:
+                return {"coarse": self._query(points.reshape(-1, 3))[0].reshape(counts).astype(np.float32)}
+
+            if wp.get_device().is_cpu:
+                # Every process asks for it first of all, and it follows from the object alone.
+                terms = (obj.content, binary_name(kernels))
+                kept = arrays_kept_or_made(
+                    "coarse_grids", terms, (sys.modules[__name__],), make, fits=lambda kept: _is_grid(kept, counts)
+                )
+            else:
+                kept = make()
+            skin.coarse = wp.array(kept["coarse"], dtype=wp.float32)
         return skin
 
     @cached_property
@@ -264,6 +279,11 @@ def _kernel_frame(kind: str, pose: Floats, vertices: Floats) -> Floats:
         return pose
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     return np.concatenate([middle, [1.0, 0, 0, 0]])
+
+
+def _is_grid(kept: Mapping[str, NDArray[Any]], counts: Sequence[int]) -> bool:
+    """Whether what was kept can be the coarse grid of so many nodes a side."""
+    return set(kept) == {"coarse"} and kept["coarse"].shape == tuple(counts) and kept["coarse"].dtype == np.float32
 
 
 _probes: LRUCache[tuple[str, str, int, int, str], Probe] = LRUCache(8)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from service.model import cores
 from service.model.cores import available_cores
 
 MACHINE = 16
@@ -45,11 +46,11 @@ def test_a_system_without_affinity_gives_its_cores(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("limit", "cores"),
+    ("limit", "expected"),
     [("200000 100000", 2), ("150000 100000", 2), ("50000 100000", 1), ("max 100000", MACHINE), ("9900000 100000", 16)],
 )
-def test_the_quota_of_a_container_counts(tmp_path: Path, limit: str, cores: int) -> None:
-    assert available_cores(system(tmp_path, "0::/", cpu_max=limit)) == cores
+def test_the_quota_of_a_container_counts(tmp_path: Path, limit: str, expected: int) -> None:
+    assert available_cores(system(tmp_path, "0::/", cpu_max=limit)) == expected
 
 
 def test_the_least_quota_on_the_way_up_counts(tmp_path: Path) -> None:
@@ -86,3 +87,16 @@ def test_no_other_count_of_cores_is_asked_for() -> None:
         if any(word in file.read_text() for word in ("cpu_count(", "sched_getaffinity("))
     ]
     assert asking == ["service/model/cores.py"]
+
+
+def test_the_files_are_read_once_in_a_moment_and_a_changed_quota_is_heard_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(cores.time, "monotonic", lambda: now[0])
+    root = system(tmp_path, "0::/", cpu_max="300000 100000")
+    assert available_cores(root) == 3
+    system(tmp_path, "0::/", cpu_max="200000 100000")
+    assert available_cores(root) == 3
+    now[0] += 2
+    assert available_cores(root) == 2
