@@ -75,6 +75,8 @@ PILOT: Final = {"scenes": 2, "views": 3, "audits": 8, "budget": 4}
 def environment_of(root: Path) -> dict[str, str]:
     """The surroundings in which a program uses the code of a checkout, whatever is installed."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
+    # Where Python may keep no compiled modules each process compiles all of them, which no user's does.
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return environment | {"PYTHONPATH": str(root)}
 
 

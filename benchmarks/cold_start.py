@@ -1,9 +1,12 @@
 """How long the first grasps take: of a command, of a process that plans, of a service; prints Markdown.
 
-usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object mug] [--runs 3] [--no-service]
+usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object mug] [--runs 3] [--seeds 0 1 2 3]
+           [--no-service | --command]
 
 Kernels and what else the user's cache holds are there: one run before the timed ones fills it. Clock time says what a
-user waits for and depends on what else runs; processor time, of all processes together, does not.
+user waits for and depends on what else runs, so checkouts take turns and the least of their times is told besides the
+median; processor time, of all processes together, depends on it little. What a seed's first grasp costs depends on
+whether the first attempts hold.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -64,15 +67,18 @@ def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
     return {"clock": clock, "processor": spent, **laps}
 
 
-def first_command(root: Path, hand: str, obj: str) -> dict[str, float]:
-    """Seconds of `graspd synth -n 1`, from its start to its end."""
+def first_command(root: Path, hand: str, obj: str, seed: int) -> dict[str, float]:
+    """Seconds of `graspd synth -n 1`, from its start to its end; ends the program if it finds no valid grasp."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "graspd", "synth", "--hand", hand, "--object", obj, "-n", "1", "--seed", "3"]
-        subprocess.run(
-            [*command, "-o", f"{folder}/g.h5"], cwd=root, env=environment_of(root), check=True, capture_output=True
-        )
+        command = [sys.executable, "-m", "graspd", "synth", "--hand", hand, "--object", obj, "-n", "1"]
+        done = subprocess.run(
+            [*command, "--seed", str(seed), "-o", f"{folder}/g.h5", "--json"], cwd=root, env=environment_of(root),
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
     clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode or json.loads(done.stdout.splitlines()[-1])["valid"] != 1:
+        sys.exit(f"{root}: seed {seed}: {done.stderr[-2000:] or 'no valid grasp'}")
     return {
         "clock": clock,
         "processor, user": after.ru_utime - before.ru_utime,
@@ -113,19 +119,45 @@ def table(title: str, found: Mapping[str, list[dict[str, float]]]) -> list[str]:
     return [*lines, ""]
 
 
+def commands(roots: Sequence[Path], hand: str, obj: str, seeds: Sequence[int], runs: int) -> list[str]:
+    """What `graspd synth -n 1` takes with each seed, one column a checkout, which take turns."""
+    found: dict[tuple[int, Path], list[dict[str, float]]] = {(seed, root): [] for seed in seeds for root in roots}
+    for turn in range(runs + 1):
+        for (seed, root), timed in found.items():
+            one = first_command(root.resolve(), hand, obj, seed)
+            if turn:  # the first one fills the caches
+                timed.append(one)
+    lines = ["| `graspd synth -n 1`, s | " + " | ".join(map(str, roots)) + " | times |"]
+    lines.append("| --- |" + " --: |" * (len(roots) + 1))
+    for seed in (*seeds, None):
+        mine = [[run for (of, at), all_ in found.items() if at == root and seed in (of, None) for run in all_]
+                for root in roots]  # fmt: skip
+        name = "all seeds" if seed is None else f"seed {seed}"
+        for part, of, told in (
+            ("clock", median, "clock, median"), ("clock", min, "clock, least"), ("processor, user", median, "user"),
+            ("processor, system", median, "system"),
+        ):  # fmt: skip
+            values = [of(run[part] for run in each) for each in mine]
+            times = f"{values[0] / values[-1]:.2f}" if values[-1] > 0 else ""
+            lines.append(f"| {name}: {told} | " + " | ".join(f"{value:.2f}" for value in values) + f" | {times} |")
+    return [*lines, ""]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkouts", nargs="+", type=Path)
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--object", default="mug")
     parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3], help="of the command's grasps")
     parser.add_argument("--no-service", action="store_true", help="command and process alone")
+    parser.add_argument("--command", action="store_true", help="the command alone")
     given = parser.parse_args()
-    stages: list[tuple[str, Any]] = [
-        ("`graspd synth -n 1`, s", first_command),
-        ("first valid grasp of a process, s", first_grasp),
-    ]
-    if not given.no_service:
+    lines = commands(given.checkouts, given.hand, given.object, given.seeds, given.runs)
+    sys.stdout.write("\n".join(lines) + "\n")
+    sys.stdout.flush()
+    stages: list[tuple[str, Any]] = [] if given.command else [("first valid grasp of a process, s", first_grasp)]
+    if not given.no_service and not given.command:
         stages.append(("32 valid grasps, the first job of a service, s", first_job))
     for title, measure in stages:
         found: dict[str, list[dict[str, float]]] = {str(root): [] for root in given.checkouts}
