@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from worker.engines import kept_hashes
+from worker.engines import kept_hashes, late_parsing
 from worker.engines.baked import lay_out
 from worker.engines.kernel_cache import kernel_cache
 
@@ -63,5 +63,6 @@ def start() -> None:
                     os.write(2, line)
         _default_of_each_thread()
         kept_hashes.install()
+        late_parsing.install()
         lay_out(Path(wp.config.kernel_cache_dir))
         _started = True
