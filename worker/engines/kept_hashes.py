@@ -51,6 +51,7 @@ class KeptHasher(_WARPS):  # type: ignore[misc]
             super().__init__(kernels, options)
             return
         file = user_cache.folder("kernel_hashes") / f"{terms}.json"
+        self._file = file
         if (found := _read(file, kernels)) is not None:
             self._restore(kernels, options, found)
             return
@@ -81,7 +82,9 @@ class KeptHasher(_WARPS):  # type: ignore[misc]
             super().__init__(*self._given)
             self._whole = True
             if self.hash != kept:
-                raise RuntimeError(f"the kept hash of the kernels in {self._given[0][0].func.__module__} is another's")
+                # Files are named by the other hash already. The next process finds no entry, and hashes.
+                self._file.unlink(missing_ok=True)
+                raise RuntimeError(f"the kept hash of the kernels in {self._given[0][0].func.__module__} was another's")
         return super().get_unique_kernels()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -91,6 +92,17 @@ def test_an_entry_that_is_none_is_made_again(own_cache: Path, content: bytes) ->
     assert told(hashed(OPTIMIZERS)) == expected and file.read_bytes() == whole
     file.write_bytes(whole[:-1])
     assert told(hashed(OPTIMIZERS)) == expected and file.read_bytes() == whole
+
+
+def test_a_wrong_hash_is_found_out_before_anything_is_compiled_and_forgotten(own_cache: Path) -> None:
+    expected = told(hashed(OPTIMIZERS))
+    (file,) = own_cache.iterdir()
+    content = json.loads(user_cache.load(file) or b"")
+    user_cache.keep(file, json.dumps({**content, "module": "0" * 64}).encode())
+    wrong = hashed(OPTIMIZERS)
+    with pytest.raises(RuntimeError, match=OPTIMIZERS):
+        wrong.get_unique_kernels()
+    assert told(hashed(OPTIMIZERS)) == expected
 
 
 def test_kernels_made_in_a_function_are_left_to_warp(own_cache: Path) -> None:
