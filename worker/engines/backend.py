@@ -11,9 +11,12 @@ from typing import Any
 
 import warp as wp
 
-from worker.engines import kept_hashes, late_parsing
 from worker.engines.baked import lay_out
 from worker.engines.kernel_cache import kernel_cache
+
+#: The release of Warp within which `kept_hashes` and `late_parsing` work, as their tests say; another one hashes and
+#: parses its own way, which takes a tenth of a second longer.
+KNOWN_WARP = "1.19.0"
 
 _HARMLESS = b"Could not find or load the NVIDIA CUDA driver"
 _lock = threading.Lock()
@@ -39,6 +42,13 @@ def _default_of_each_thread() -> None:
     runtime.__class__ = Threaded
 
 
+def _start_sooner() -> None:
+    from worker.engines import kept_hashes, late_parsing
+
+    kept_hashes.install()
+    late_parsing.install()
+
+
 def start() -> None:
     """Initialise Warp once, warnings only; anything but the remark on the missing driver still reaches stderr."""
     global _started
@@ -62,7 +72,7 @@ def start() -> None:
                 if _HARMLESS not in line:
                     os.write(2, line)
         _default_of_each_thread()
-        kept_hashes.install()
-        late_parsing.install()
+        if wp.config.version == KNOWN_WARP:
+            _start_sooner()
         lay_out(Path(wp.config.kernel_cache_dir))
         _started = True

@@ -128,7 +128,8 @@ def _told(kernels: Sequence[Any], options: dict[str, Any]) -> Iterator[bytes]:
         yield f"{name}:{options[name]}".encode()
     places = dict[str, None]()
     for kernel in sorted(kernels, key=lambda kernel: str(kernel.key)):
-        if kernel.is_generic or kernel.return_annotation is not None:
+        ours = kernel.func.__module__.startswith(_OURS)
+        if not ours or kernel.is_generic or kernel.return_annotation is not None:
             raise _CannotTell
         yield f"{kernel.key} {sorted(kernel.options.items())}".encode()
         yield from _adjoint(kernel.adj)

@@ -19,6 +19,7 @@ from service import user_cache
 from worker.engines import backend, baked, kept_hashes
 from worker.simulation.kernels import optimizers, penalties, solids, wrenches
 
+pytestmark = pytest.mark.skipif(wp.config.version != backend.KNOWN_WARP, reason="it is for one release of Warp")
 OPTIMIZERS = optimizers.__name__
 
 
@@ -116,6 +117,17 @@ def test_kernels_made_in_a_function_are_left_to_warp(own_cache: Path) -> None:
         out = wp.zeros(2)
         wp.launch(scaled, 2, outputs=[out])
     assert out.numpy().tolist() == [3.0, 3.0] and not own_cache.exists()
+
+
+def test_modules_of_others_are_left_to_warp(own_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Without a function in it nothing else would tell it from one of ours.
+    (tmp_path / "others.py").write_text(
+        "import warp as wp\n\n@wp.kernel\ndef one(out: wp.array(dtype=float)):\n    out[wp.tid()] = 1.0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    import_module("others")
+    hashed("others")
+    assert hashed("others")._whole and not own_cache.exists()
 
 
 LAUNCHED = f"""

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import warp as wp
 from warp._src import context
 from warp._src.codegen import Adjoint
 
 from service import user_cache
 from worker.engines import backend, baked, late_parsing
 
+pytestmark = pytest.mark.skipif(wp.config.version != backend.KNOWN_WARP, reason="it is for one release of Warp")
 MODULE = "worker.simulation.kernels.penalties"
 DECLARED = f"""
 import ast, sys
