@@ -108,27 +108,36 @@ def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
         return {"until a worker waits": service.ready_s, "job": clock, "processor": service.processor_s() - spent}
 
 
+def head(title: str, names: Sequence[str]) -> list[str]:
+    """The first two lines of a table with one column a checkout and, of several, one for their quotient."""
+    cells = [title, *names, *(["times"] if len(names) > 1 else [])]
+    return [f"| {' | '.join(cells)} |", "| --- |" + " --: |" * (len(cells) - 1)]
+
+
+def row(name: str, values: Sequence[float]) -> str:
+    """A line of it; the quotient is the first checkout's value over the last one's."""
+    cells = [name, *(f"{value:.2f}" for value in values)]
+    if len(values) > 1:
+        cells.append(f"{values[0] / values[-1]:.2f}" if values[-1] > 0 else "")
+    return f"| {' | '.join(cells)} |"
+
+
 def table(title: str, found: Mapping[str, list[dict[str, float]]]) -> list[str]:
-    """Medians, one column a checkout; the last column is the first checkout's over the last one's."""
-    names = list(found)
-    lines = [f"| {title} | " + " | ".join(names) + " | times |", "| --- |" + " --: |" * (len(names) + 1)]
-    for part in next(iter(found.values()))[0]:
-        middle = [median(run[part] for run in runs) for runs in found.values()]
-        times = f"{middle[0] / middle[-1]:.2f}" if middle[-1] > 0 else ""
-        lines.append(f"| {part} | " + " | ".join(f"{value:.2f}" for value in middle) + f" | {times} |")
-    return [*lines, ""]
+    """Medians of each part."""
+    parts = next(iter(found.values()))[0]
+    rows = [row(part, [median(run[part] for run in runs) for runs in found.values()]) for part in parts]
+    return [*head(title, list(found)), *rows, ""]
 
 
 def commands(roots: Sequence[Path], hand: str, obj: str, seeds: Sequence[int], runs: int) -> list[str]:
-    """What `graspd synth -n 1` takes with each seed, one column a checkout, which take turns."""
+    """What `graspd synth -n 1` takes with each seed; checkouts take turns."""
     found: dict[tuple[int, Path], list[dict[str, float]]] = {(seed, root): [] for seed in seeds for root in roots}
     for turn in range(runs + 1):
         for (seed, root), timed in found.items():
             one = first_command(root.resolve(), hand, obj, seed)
             if turn:  # the first one fills the caches
                 timed.append(one)
-    lines = ["| `graspd synth -n 1`, s | " + " | ".join(map(str, roots)) + " | times |"]
-    lines.append("| --- |" + " --: |" * (len(roots) + 1))
+    lines = head("`graspd synth -n 1`, s", [str(root) for root in roots])
     for seed in (*seeds, None):
         mine = [[run for (of, at), all_ in found.items() if at == root and seed in (of, None) for run in all_]
                 for root in roots]  # fmt: skip
@@ -137,9 +146,7 @@ def commands(roots: Sequence[Path], hand: str, obj: str, seeds: Sequence[int], r
             ("clock", median, "clock, median"), ("clock", min, "clock, least"), ("processor, user", median, "user"),
             ("processor, system", median, "system"),
         ):  # fmt: skip
-            values = [of(run[part] for run in each) for each in mine]
-            times = f"{values[0] / values[-1]:.2f}" if values[-1] > 0 else ""
-            lines.append(f"| {name}: {told} | " + " | ".join(f"{value:.2f}" for value in values) + f" | {times} |")
+            lines.append(row(f"{name}: {told}", [of(run[part] for run in each) for each in mine]))
     return [*lines, ""]
 
 

@@ -64,18 +64,18 @@ class Work:
 class Measured:
     """Inputs that were measured; `docs/scaling.md` says with which commands."""
 
-    core_s_per_grasp: float = 0.31
+    core_s_per_grasp: float = 0.194
     """A worker's time on one core for a valid grasp, standard fidelity: plan, judge, postures, quality [core s]."""
-    core_s_per_scene: float = 0.18
+    core_s_per_scene: float = 0.073
     """The same of a scene with the grasps of its batch [core s]."""
-    core_s_per_picture: float = 0.56
+    core_s_per_picture: float = 0.186
     """The same of a picture 320 x 240 with all channels [core s]."""
     busy: float = 0.9
     """Share of a worker's time in which it computes: the rest is starts, ends of jobs, waiting."""
     base_bytes_per_grasp: float = 1496.0
     scene_bytes: float = 7837.0
     """Of one scene with the grasps of its batch."""
-    picture_bytes: float = 111_034.0
+    picture_bytes: float = 106_246.0
     manifest_bytes: float = 6000.0
     """Mean over the manifests of the stages."""
     index_bytes_per_grasp: float = 869.0
