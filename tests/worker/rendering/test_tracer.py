@@ -220,3 +220,32 @@ def test_turning_worlds_is_turning_the_lamp_the_other_way(poses: np.ndarray) -> 
     other = traced(SOLIDS, poses, shot(toward_lamp=back))
     # The lamp's only sample lies off its centre, on a side that the two choose differently: outlines of shadows move.
     assert np.mean(np.abs(turned.rgb.astype(int) - other.rgb).max(axis=-1) > 12) < 0.02
+
+
+def test_a_pixel_on_an_outline_has_the_colours_of_both_sides() -> None:
+    red, green = Look((0.6, 0.0, 0.0), roughness=1.0), Look((0.0, 0.6, 0.0), roughness=1.0)
+    poses = np.array([[[0, 0, -0.05, 1, 0, 0, 0], [0, 0, 0.05, 1, 0, 0, 0.0]]])
+    tracer = Tracer([FLOOR, SOLIDS[2]], "cpu")
+    tracer.place(poses, [[red, green]])
+    camera = look_at(np.array([0.3, -0.2, 0.3]), np.array([0.0, 0.0, 0.05]))
+    one = shot(world=np.zeros(1, np.int32), extrinsics=camera[None], turn=np.zeros(1), lamps=[Lamp()], samples=12)
+    seen = tracer.shoot(one)
+    floor, ball = seen.shape[0] == 0, seen.shape[0] == 1
+    beside = floor & (np.roll(ball, 1, axis=1) | np.roll(ball, -1, axis=1))
+    assert beside.sum() > 10
+    greener = seen.rgb[0, ..., 1].astype(int) - seen.rgb[0, ..., 0]
+    assert np.median(greener[floor]) < -50 < 50 < np.median(greener[ball])
+    # Rays through such a pixel's other half meet the ball: in one of them at least by a third.
+    assert greener[beside].max() > 0
+
+
+def test_a_mesh_is_not_seen_from_inside() -> None:
+    around = solid(trimesh.creation.icosphere(subdivisions=3, radius=2.0))
+    poses = np.zeros((1, 2, 7))
+    poses[..., 3] = 1.0
+    poses[0, 0, 2] = -0.05
+    tracer = Tracer([FLOOR, around], "cpu")
+    tracer.place(poses, [LOOKS[:2]])
+    one = shot(turn=np.zeros(1), lamps=[Lamp()])
+    seen = tracer.shoot(replace(one, world=np.zeros(len(one.world), np.int32)))
+    assert set(np.unique(seen.shape)) == {-1, 0}
