@@ -249,3 +249,18 @@ def test_a_mesh_is_not_seen_from_inside() -> None:
     one = shot(turn=np.zeros(1), lamps=[Lamp()])
     seen = tracer.shoot(replace(one, world=np.zeros(len(one.world), np.int32)))
     assert set(np.unique(seen.shape)) == {-1, 0}
+
+
+def test_lines_of_tiles_that_are_thinner_than_a_pixel_darken_it_a_little() -> None:
+    tracer = Tracer([FLOOR], "cpu")
+    tracer.place(np.array([[[0, 0, -0.05, 1, 0, 0, 0.0]]]), [[Look((0.8,) * 3, (0.0,) * 3, shading.TILES, 2.0)]])
+    camera = look_at(np.array([1.5, -1.0, 2.0]), np.zeros(3))
+    one = shot(world=np.zeros(1, np.int32), extrinsics=camera[None], turn=np.zeros(1), lamps=[Lamp()], samples=12)
+    seen = tracer.shoot(one)
+    inside = seen.shape[0] == 0
+    for axis in (0, 1):
+        inside &= np.roll(inside, 1, axis) & np.roll(inside, -1, axis)
+    brightness = seen.rgb[0].mean(axis=-1)[inside]
+    assert len(brightness) > 100
+    # The lines take a twentieth of the floor; through a pixel's centre alone every twentieth pixel would be black.
+    assert brightness.min() > 0.6 * np.median(brightness)
