@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 
 from service.model.transforms import apply, pose_from_matrix, quat_from_axis_angle, quat_rotate, quat_to_matrix
 from worker.engines import backend
+from worker.rendering.annotate import box_corners
 from worker.rendering.cameras import Floats
-from worker.rendering.kernels import rays
-from worker.rendering.kernels.exposure import LightPass as Pass
-from worker.rendering.kernels.exposure import expose
+from worker.rendering.kernels import exposure, rays
 from worker.rendering.kernels.shading import Light, Material
-from worker.rendering.passes import LightPass, light_passes
-from worker.rendering.scenery import Box, Lamp, Look, Pictures, Shot, Solid
+from worker.rendering.passes import light_passes
+from worker.rendering.scenery import Box, Look, Pictures, Shot, Solid
 from worker.run import ALONE, Run
 
 #: Pixels between two looks at whether to stop: what a core traces in a fifth of a second, and what a GPU holds at once.
@@ -84,8 +83,8 @@ class Tracer:
         placed["place"], placed["turn"] = poses[..., :3], np.swapaxes(quat_to_matrix(poses[..., 3:]), -1, -2)
         placed["lower"], placed["upper"] = corners.min(axis=2) - _SLACK_M, corners.max(axis=2) + _SLACK_M
         self._placed = wp.array(placed, dtype=_PLACED, device=self.device)
-        materials = [[_material(look).numpy_value() for look in world] for world in looks]
-        self._materials = _structs(materials, Material, self.device)
+        every = _structs([look for world in looks for look in world], Material, self.device)
+        self._materials = every.reshape(poses.shape[:2])
 
     def shoot(
         self,
@@ -122,12 +121,11 @@ class _Film:
     def __init__(self, tracer: Tracer, shot: Shot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
-        self._passes = _structs([_pass(one).numpy_value() for one in passes], Pass, device)
+        self._passes = _structs(passes, exposure.LightPass, device)
         # Worlds turn under the lamp: seen from them, lamp and sky turn the other way.
         back = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
         self._toward = wp.array(toward, dtype=wp.vec3f, device=device)
-        self._lights = [_light(lamp).numpy_value() for lamp in shot.lamps]
         self._cameras = _xyzw(pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64)))
 
     def expose(
@@ -144,13 +142,13 @@ class _Film:
             tracer._placed, tracer._corner_normals, tracer._materials,
             wp.array(world, dtype=wp.int32, device=device),
             wp.array(self._cameras[views], dtype=wp.transformf, device=device),
-            _structs([self._lights[w] for w in world], Light, device),
+            _structs([shot.lamps[w] for w in world], Light, device),
             wp.vec2f(k[0, 0], k[1, 1]), wp.vec2f(k[0, 2], k[1, 2]), self._passes, self._toward, shot.shaded, threads,
         ]  # fmt: skip
 
         def rows(first: int) -> None:
             wp.launch(
-                expose,
+                exposure.expose,
                 dim=(size[0], len(range(first, size[1], threads)), size[2]),
                 inputs=[*inputs, first],
                 outputs=[rgb, depth, shape, normal],
@@ -168,38 +166,17 @@ def _mesh(solid: Solid, device: str) -> Any:
 
 def _corners(solid: Solid | Box) -> Floats:
     if isinstance(solid, Box):
-        upper = 0.5 * np.asarray(solid.size)
-        lower = -upper
-    else:
-        lower, upper = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
-    signs = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-    return np.asarray(np.where(signs == 1, upper, lower), float)
+        half = 0.5 * np.asarray(solid.size)
+        return box_corners(np.stack([-half, half]))
+    return box_corners(solid.vertices)
 
 
-def _structs(values: Sequence[Any], dtype: Any, device: str) -> Any:
-    return wp.array(np.array(values, dtype.numpy_dtype()), dtype=dtype, device=device)
+def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
+    """An array of Warp structs with what each thing holds under the names of their fields."""
+    kind = np.dtype(struct.numpy_dtype())
+    rows = [tuple(getattr(thing, name) for name in kind.names or ()) for thing in things]
+    return wp.array(np.array(rows, kind), dtype=struct, device=device)
 
 
 def _xyzw(poses: Floats) -> NDArray[np.float32]:
     return np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
-
-
-def _material(look: Look) -> Any:
-    material = Material()
-    material.base, material.second = wp.vec3f(*look.base), wp.vec3f(*look.second)
-    material.pattern, material.scale = look.pattern, look.scale
-    material.roughness, material.metalness = look.roughness, look.metalness
-    return material
-
-
-def _light(lamp: Lamp) -> Any:
-    light = Light()
-    for name in ("key", "sky", "ground", "backdrop_low", "backdrop_high"):
-        setattr(light, name, wp.vec3f(*getattr(lamp, name)))
-    return light
-
-
-def _pass(one: LightPass) -> Any:
-    made = Pass()
-    made.shift, made.lamp_weight, made.sky_weight = wp.vec2f(*one.shift), one.lamp_weight, one.sky_weight
-    return made
