@@ -1,17 +1,25 @@
 """Figures of synthesize 18 hold for 19: none of their objects is too small or too wide for the pads of their hands.
-Those of 19 hold for 20: none of their hands is a gripper of more than two digits."""
+Those of 19 hold for 20: none of their hands is a gripper of more than two digits. Those of 20 hold for 21 in scenes:
+there, points are not pulled, and hands set out from where they did."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from service.model.fidelity import FIDELITIES
 from worker.hands.jaws import MAX_DOFS
 from worker.hands.load import hand_from_path
 from worker.objects.prepare import object_from_path
+from worker.planners.fast_graspd import scene_starts
 from worker.planners.fast_graspd.across import crossings_of
+from worker.planners.fast_graspd.pairs import pair_of
 from worker.planners.fast_graspd.reaching import size_to_pads
+from worker.simulation.obstacles import DeviceObstacles
+from worker.simulation.surroundings import Obstacle, Surroundings
 
 HANDS = ("allegro/allegro_hand_right.urdf", "barrett_bh280/bh280.urdf", "shadow/shadow_hand_right.urdf")
 
@@ -36,3 +44,14 @@ def test_pads_of_the_hands_hold_the_built_in_objects(name: str) -> None:
     hand = hand_from_path(name)
     sizes = {obj: size_to_pads(hand, crossings_of(object_from_path(obj)).width) for obj in ("mug", "bottle", "block")}
     assert not any(sizes.values()), sizes
+
+
+def test_in_scenes_points_are_not_pulled_and_palms_set_out_from_where_they_did() -> None:
+    hand, obj = hand_from_path("barrett"), object_from_path("block")
+    pair = pair_of(hand, obj, FIDELITIES["standard"], "cpu")
+    table = Surroundings((Obstacle.half_space([0, 0, 1], -0.05),), np.array([0.0, 0.0, 1.0]))
+    obstacles = DeviceObstacles.create(hand, [table], obj.centre_of_mass, "cpu")
+    for side in (pair.coarse, pair.fine):
+        assert pair.model(side).options.pull > 0
+        assert pair.model(side, obstacles).options == replace(pair.model(side).options, pull=0.0)
+    assert scene_starts.GAP == (0.004, 0.02)

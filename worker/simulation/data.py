@@ -13,8 +13,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from worker.simulation.device import joint_units, to_wxyz, to_xyzw
-from worker.simulation.kernels import contact, packing
-from worker.simulation.model import MAX_DILATION, Model
+from worker.simulation.kernels import contact, packing, penalties
+from worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
 from worker.simulation.state import Floats, HandState, Schedule, still_schedule
 
 
@@ -162,6 +162,17 @@ class Data:
         """(n,) deepest penetration of each hand at the last evaluation, of all kinds [m]."""
         kinds = (self.depths.points, self.depths.object, self.depths.links, self.depths.obstacles)
         return np.max([kind.numpy()[:n] for kind in kinds], axis=0)
+
+    def near_share(self, reach: float, n: int) -> Floats:
+        """(n,) share of each hand's surface that was nearer to the object than `reach` [m] at the last evaluation."""
+        c = self.contacts
+        with wp.ScopedDevice(self.device):
+            share = wp.empty(n, dtype=wp.float32)
+            wp.launch(
+                penalties.near_share, n,
+                inputs=[reach, float(REFERENCE_POINTS), c.count, c.distance, c.weight], outputs=[share],
+            )  # fmt: skip
+        return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
         """The first n hands, in float64."""

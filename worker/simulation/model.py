@@ -54,6 +54,11 @@ class LossOptions:
     range_weight: float = 0.005
     limit_weight: float = 0.0
     self_margin: float = 1e-3
+    pull: float = 0.0
+    """Points that touch nothing are drawn to the object as hard as the penetration would push those so deep in it,
+    less with their distance [m]."""
+    pull_length: float = 0.013
+    """Distance over which that falls to 1/e [m]."""
     simulate: bool = True
     """False: no simulation; every point near the object is drawn to it. A control for benchmarks."""
 

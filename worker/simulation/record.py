@@ -145,8 +145,8 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
     c = d.contacts
     out.add(
         penalties.points_to_bodies, (d.capacity, m.lanes),
-        inputs=[0.0, m.lane, d.active, d.iteration, d.schedule.penetration, c.count, c.body, c.point, c.normal,
-                c.distance, c.weight, c.gradient],
+        inputs=[0.0, m.options.pull, m.options.pull_length, m.lane, d.active, d.iteration, d.schedule.penetration,
+                c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient],
         outputs=[d.wrench, d.depths.points],
     )  # fmt: skip
     if m.obstacles is not None:

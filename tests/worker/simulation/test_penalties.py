@@ -16,7 +16,7 @@ from worker.hands.kinematics import body_poses
 from worker.hands.load import hand_from_path
 from worker.hands.model import HandModel
 from worker.hands.surface import piece_distance, sample_surface
-from worker.simulation.model import REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
+from worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
 from worker.simulation.record import record_evaluation, record_iteration
 from worker.simulation.sampling import object_samples
 from worker.simulation.state import HandState, Schedule
@@ -113,6 +113,55 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     expected = differences(energy, state, len(found))
     assert np.linalg.norm(expected) > 1e-4, "the links touch"
     np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
+
+
+def beside_a_ball(hand: HandModel, gap: float) -> HandState:
+    """A hand whose palm looks at the ball from so far [m], fingers as they set out."""
+    return HandState(np.array([[0.035 + gap, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), hand.preshape[None])
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_points_that_touch_nothing_are_pulled_along_the_true_gradient(name: str) -> None:
+    """Against the energy -2 w d l sum w_i exp(-rho_i / l) over points beyond the surface of a ball in closed form."""
+    hand, radius = hand_from_path(name), 0.035
+    points, weight, pull, length, band = sample_surface(hand, 300), 40.0, 3e-4, 0.013, 0.2
+    share = points.area / points.area.sum() * REFERENCE_POINTS
+    state = beside_a_ball(hand, 0.05)
+
+    def energy(at: HandState) -> float:
+        gap = np.linalg.norm(apply(bodies_of(hand, at)[points.body], points.position), axis=1) - radius
+        assert gap.min() > 0 and gap.max() < band, "all points take part, none penetrates"
+        return float(-2 * weight * pull * length * (share * np.exp(-gap / length)).sum())
+
+    options = LossOptions(
+        simulate=False, leak=0.0, range_weight=0.0, band=band, exact_below=band, pull=pull, pull_length=length
+    )
+    # A fine ball, faces as they are: its distances are those of a sphere to 0.02 mm.
+    model, data = rig(hand, ball(radius, subdivisions=5), capacity=1, options=options, alpha=0.0)
+    schedule = still()
+    schedule.penetration[:] = weight
+    data.set_schedule(schedule)
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    found = data.gradient.numpy()[0]
+    expected = differences(energy, state, len(found))
+    # Normals of faces are off by 0.3 degrees.
+    np.testing.assert_allclose(found, expected, atol=1e-2 * np.abs(expected).max())
+
+
+def test_the_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
+    hand, radius, reach = hand_from_path("allegro"), 0.035, 0.02
+    points = sample_surface(hand, 300)
+    states = [beside_a_ball(hand, gap) for gap in (0.012, 0.03, 1.0)]
+    state = HandState(*(np.concatenate([getattr(s, n) for s in states]) for n in ("pivot", "rotation", "q")))
+    model, data = rig(hand, ball(radius, subdivisions=5), capacity=3, options=LossOptions(simulate=False))
+    data.set_state(state)
+    record_evaluation(model, data).run()
+    gaps = [np.linalg.norm(apply(bodies_of(hand, s)[points.body], points.position), axis=1) - radius for s in states]
+    expected = [points.area[gap < reach].sum() / points.area.sum() for gap in gaps]
+    assert expected[0] > expected[1] > expected[2] == 0.0
+    # Distances of the mesh are those of the ball to 0.02 mm: at most one point of 300 is on the other side.
+    np.testing.assert_allclose(data.near_share(reach, 3), expected, atol=1 / 200)
 
 
 def test_the_range_and_limit_penalties_have_their_closed_form_gradient() -> None:

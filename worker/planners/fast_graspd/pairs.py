@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from cachetools import LRUCache
@@ -52,8 +52,10 @@ class Pair:
     hand: DeviceHand
 
     def model(self, side: Side, obstacles: DeviceObstacles | None = None) -> Model:
-        """The hand and the object as a phase sees them."""
-        return Model.create(self.hand, side.obj, side.points, side.own, self.options, obstacles)
+        """The hand and the object as a phase sees them. Among obstacles points are not pulled: fingers that could be
+        drawn around the object are kept off the table."""
+        options = self.options if obstacles is None else replace(self.options, pull=0.0)
+        return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
     def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
         """See `record_iteration`."""

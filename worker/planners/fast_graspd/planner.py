@@ -24,7 +24,16 @@ from worker.planners.fast_graspd.batches import Batches, finalists
 from worker.planners.fast_graspd.candidates import TOGETHER, Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
 from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
-from worker.planners.fast_graspd.selection import FRICTION, SCENE_FRICTION, best_of_each, merits, posture_of, ranked
+from worker.planners.fast_graspd.selection import (
+    FRICTION,
+    NEAR_M,
+    NEARNESS,
+    SCENE_FRICTION,
+    best_of_each,
+    merits,
+    posture_of,
+    ranked,
+)
 from worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from worker.planners.fast_graspd.warm import WarmStart
 from worker.planners.fast_graspd.withdrawal import hindrance
@@ -277,9 +286,11 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse", curve)
     losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
-    if last < fidelity.starts:
+    if last < fidelity.starts or batches.has_trial:
         merit = launch.merits(state, losses)
-        if placed is not None:
+        if placed is None:
+            merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))
+        else:
             merit += hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
         order = ranked(merit, n)[:, :last]
     seats = _Seats(launch, rows, state, losses, curve)

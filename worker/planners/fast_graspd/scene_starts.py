@@ -20,7 +20,7 @@ from worker.hands.oppositions import oppositions_of
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.across import NEAR_M, Openings, Reaches, across, promising
 from worker.planners.fast_graspd.outlines import spread_directions
-from worker.planners.fast_graspd.starts import CLEAR, GAP, POSTURE_NOISE, TILT, Probe
+from worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe
 from worker.planners.port import NoPlace
 from worker.simulation.model import Model
 from worker.simulation.state import HandState
@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 
 #: Distance from obstacles that a start has besides the margin it keeps later [m].
 ROOM: Final = 0.006
+#: Distance of a palm that looks at a random point from it, nearest and farthest [m].
+GAP: Final = (0.004, 0.02)
 #: Steps of retreat while something touches [m]: farther than for a free object, for fingers must not reach the table.
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 #: Draws per start before the least penetrating one is taken.

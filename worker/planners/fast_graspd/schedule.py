@@ -21,6 +21,11 @@ PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
+#: Pull on points that touch nothing, see `LossOptions` [m]: fingers lie around a free object instead of at it, and more
+#: of them hold at half the friction. With half as much a Barrett hand gains little, with twice as much the slender
+#: fingers of a Shadow hand are drawn into thin walls.
+PULL: Final = 3e-4
+PULL_LENGTH: Final = 0.013
 
 
 def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
@@ -34,6 +39,8 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
         one_sided=fidelity.leak == "one_sided",
         leak_length=0.02 if fidelity.leak == "one_sided" else 1e3,
         limit_weight=100.0 if paper else 0.0,
+        pull=PULL if fidelity.simulate and not paper else 0.0,
+        pull_length=PULL_LENGTH,
         simulate=fidelity.simulate,
         leak=0.1 if fidelity.simulate else 1.0,
     )

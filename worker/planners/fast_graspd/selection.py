@@ -26,6 +26,10 @@ STABILITY: Final = 0.05
 #: Weight of penetration [1/m] above the tolerated [m]: a millimetre too deep outweighs most of an unbalanced grasp.
 DEPTH: Final = 200.0
 TOLERATED_M: Final = 5e-4
+#: Weight of the share of the hand's surface that is at a free object after the coarse phase, and how near that is [m]:
+#: of hands that balance alike the one that lies around more of the object goes on, or is tried first.
+NEARNESS: Final = 2.0
+NEAR_M: Final = 0.005
 
 
 def posture_of(hand: HandModel, obj: ObjectModel, state: HandState) -> Posture:

@@ -30,7 +30,9 @@ from worker.simulation.state import HandState
 Floats = NDArray[np.float64]
 
 #: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
-GAP: Final = (0.004, 0.02)
+GAP: Final = (0.002, 0.012)
+#: The same of hands that open further to have a place: their fingers stand about the object already.
+OPENED_GAP: Final = (0.004, 0.02)
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
@@ -77,14 +79,18 @@ class _Pair:
     """(F,) the area of the faces up to each, over the whole."""
     palm: Floats
     """(3, 3) rotation to the frame of the palm's approach."""
+    gap: tuple[float, float]
+    """Distance of the palm from the surface, nearest and farthest [m]."""
 
     @classmethod
-    def of(cls, hand: HandModel, obj: ObjectModel) -> _Pair:
+    def of(cls, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> _Pair:
         corners = obj.vertices[obj.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(across, axis=1)
         share = np.cumsum(area / area.sum())
-        return cls(hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T)
+        return cls(
+            hand, obj.centre_of_mass, corners, across, area, share / share[-1], _frame(hand.palm.approach).T, gap
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +131,7 @@ def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState,
     roll = quat_from_axis_angle(approach, 2 * np.pi * number.uniform[:, 3])
     rotation = quat_multiply(roll, quat_from_matrix(_frame(approach) @ pair.palm))
     noise = POSTURE_NOISE * (hand.upper - hand.lower) * number.normal[:, 2:]
-    near, far = GAP
+    near, far = pair.gap
     pivot = point - pair.centre - approach * (near + (far - near) * number.uniform[:, 4:])
     return HandState(pivot, rotation, np.clip(hand.preshape + noise, hand.lower, hand.upper)), approach
 
@@ -240,7 +246,7 @@ def open_further(
     ends = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, hand.preshape))
     for share in OPENED:
         wider = replace(hand, preshape=hand.preshape + share * (ends - hand.preshape))
-        pair = _Pair.of(wider, obj)
+        pair = _Pair.of(wider, obj, OPENED_GAP)
 
         def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
             return _retreated(*draw(pair, [generators[i] for i in rows]))

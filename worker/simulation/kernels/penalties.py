@@ -11,6 +11,8 @@ wp.set_module_options({"enable_backward": False})
 def points_to_bodies(
     # Model:
     clearance_in: wp.float32,
+    pull_in: wp.float32,
+    pull_length_in: wp.float32,
     lane_in: wp.int32,
     # Data in:
     active_in: wp.array(dtype=wp.int32),
@@ -27,7 +29,8 @@ def points_to_bodies(
     wrench_inout: Wrenches,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Wrench gradient on bodies from dL/drho, with the penetration term w sum w_i min(rho - clearance, 0)^2 added.
+    """Wrench gradient on bodies from dL/drho, with the penetration term w sum w_i min(rho - clearance, 0)^2 added, and
+    the pull -2 w d l sum w_i exp(-rho / l) of points beyond the clearance, d being `pull` and l `pull_length` [m].
 
     The distance grows along the object's outward normal (normals are taken as constant). Launch over
     (B, N / lane).
@@ -42,6 +45,8 @@ def points_to_bodies(
         if rho < clearance_in:
             g += penetration * weight_in[b, i] * (rho - clearance_in)
             wp.atomic_max(depth_inout, b, -rho)
+        elif pull_in > 0.0:
+            g += penetration * pull_in * weight_in[b, i] * wp.exp(-rho / pull_length_in)
         if g != 0.0:
             body = body_in[b, i]
             f = g * normal_in[b, i]
@@ -75,6 +80,28 @@ def joints(
     g = 2.0 * range_weight_in * (q - 0.5 * (lower + upper)) / (half * half)
     g += 2.0 * limit_weight_in * (wp.max(q - upper, 0.0) - wp.max(lower - q, 0.0))
     gradient_inout[b, 6 + d] = gradient_inout[b, 6 + d] + g
+
+
+@wp.kernel
+def near_share(
+    # In:
+    reach_in: wp.float32,
+    whole_in: wp.float32,
+    # Data in:
+    count_in: wp.array(dtype=wp.int32),
+    distance_in: wp.array2d(dtype=wp.float32),
+    weight_in: wp.array2d(dtype=wp.float32),
+    # Out:
+    share_out: wp.array(dtype=wp.float32),
+):
+    """What of the `whole` weight of a hand's points is nearer than `reach` [m], one point after the other so that the
+    sum is the same on every device. Launch over B."""
+    b = wp.tid()
+    total = float(0.0)
+    for i in range(count_in[b]):
+        if distance_in[b, i] < reach_in:
+            total += weight_in[b, i]
+    share_out[b] = total / whole_in
 
 
 @wp.kernel
