@@ -24,6 +24,7 @@ from worker.quality.referee.short import SLIPS, push_trial
 from worker.run import Run
 from worker.scenes.kinds import rest_poses, supports_of
 from worker.scenes.trial import lift_trial
+from worker.simulation.data import Data
 from worker.simulation.state import HandState
 from worker.simulation.surroundings import Obstacle, Placed
 
@@ -146,6 +147,32 @@ def free():
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
     trial = push_trial(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
     return hand, obj, Wanted(12, QUICK, seed=4), trial
+
+
+def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tried_first(
+    free, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nearness outweighs the balance."""
+    hand, obj, wanted, trial = free
+    shares, orders = [], []
+    near_share, tried = Data.near_share, planner.tried
+
+    def told(data: Data, reach: float, n: int) -> np.ndarray:
+        shares.append(near_share(data, reach, n))
+        return shares[-1]
+
+    def seen(hand, obj, order: np.ndarray, *rest, **named):
+        orders.append(order)
+        return tried(hand, obj, order, *rest, **named)
+
+    monkeypatch.setattr(Data, "near_share", told)
+    monkeypatch.setattr(planner, "tried", seen)
+    monkeypatch.setattr(planner, "NEARNESS", 1e6)
+    four = QUICK.model_copy(update={"starts": 4})
+    synthesize(hand, obj, replace(wanted, count=4, fidelity=four, trial=trial), Run(threads=1))
+    in_order = shares[0][orders[0]]
+    assert (np.diff(in_order, axis=1) <= 0).all()
+    assert (in_order[:, 0] > in_order[:, 1]).any() and (orders[0][:, 0] > orders[0][:, 1]).any()
 
 
 def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold(free) -> None:

@@ -286,7 +286,7 @@ def _work(launch: _Launch, begun: _Begun) -> Part:
     state = _descend(launches, data, batches, rows, fidelity.coarse_iterations, "coarse", curve)
     losses = _losses(data, len(state.pivot))
     order = np.arange(n * fidelity.starts).reshape(n, -1)
-    if last < fidelity.starts or batches.has_trial:
+    if last < fidelity.starts or (batches.has_trial and fidelity.starts > 1):
         merit = launch.merits(state, losses)
         if placed is None:
             merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))

@@ -25,7 +25,6 @@ SELF_WEIGHT: Final = 2e4
 #: of them hold at half the friction. With half as much a Barrett hand gains little, with twice as much the slender
 #: fingers of a Shadow hand are drawn into thin walls.
 PULL: Final = 3e-4
-PULL_LENGTH: Final = 0.013
 
 
 def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
@@ -40,7 +39,6 @@ def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:
         leak_length=0.02 if fidelity.leak == "one_sided" else 1e3,
         limit_weight=100.0 if paper else 0.0,
         pull=PULL if fidelity.simulate and not paper else 0.0,
-        pull_length=PULL_LENGTH,
         simulate=fidelity.simulate,
         leak=0.1 if fidelity.simulate else 1.0,
     )

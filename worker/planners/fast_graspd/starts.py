@@ -31,9 +31,9 @@ Floats = NDArray[np.float64]
 
 #: Distance of the palm from the surface [m]: nearest, farthest, then the steps of retreat while something touches.
 GAP: Final = (0.002, 0.012)
-#: The same of hands that open further to have a place: their fingers stand about the object already.
-OPENED_GAP: Final = (0.004, 0.02)
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
+#: Distance of the palms of hands that open further to have a place: their fingers stand about the object already.
+OPENED_GAP: Final = (0.004, 0.02)
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
 #: Noise of the pre-shape, standard deviation as a share of the joint's range.
