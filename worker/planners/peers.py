@@ -31,7 +31,9 @@ Floats = NDArray[np.float64]
 T = TypeVar("T")
 
 #: How finely peers see hand and object where their source does not say.
-GROUND: Final = Fidelity(name="peers", coarse_points=400, fine_points=1000, object_points=4000, phong_alpha=0.0)
+GROUND: Final = Fidelity(
+    name="peers", coarse_points=400, fine_points=1000, object_points=4000, polish_iterations=0, phong_alpha=0.0
+)
 
 _lock = threading.Lock()
 

@@ -16,6 +16,9 @@ Floats = NDArray[np.float64]
 
 #: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))
+#: Random points among which each sample is the farthest, and how many do where they are more than so many in all: what
+#: that takes grows with the product of candidates and samples.
+CANDIDATES, FEWER_CANDIDATES, AMPLE = 6, 3, 24_000
 
 
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
@@ -29,11 +32,12 @@ def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
 
 def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
     rng = np.random.default_rng(seed)
+    candidates = max(min(CANDIDATES * count, AMPLE), FEWER_CANDIDATES * count)
     corners = obj.vertices[obj.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
-    faces = rng.choice(len(area), size=6 * count, p=area / area.sum())
-    u, v = rng.random((2, 6 * count))
+    faces = rng.choice(len(area), size=candidates, p=area / area.sum())
+    u, v = rng.random((2, candidates))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     a, b, c = (corners[faces, k] for k in range(3))

@@ -28,6 +28,9 @@ FIELD_CELL: Final = 0.005
 COARSE_SELF_POINTS: Final = 400
 FINE_SELF_POINTS: Final = 1000
 COARSE_SAMPLES: Final = 1500
+#: So many times the object samples of the fidelity, up to so many in all, are tested around a free object: what enters
+#: a link between two samples is not seen, and with as few as the fidelity says that is .2 mm at the median.
+DENSER, DENSEST = 3, 12_000
 #: Pairs kept on the device.
 KEPT: Final = 4
 
@@ -62,18 +65,24 @@ class Pair:
         return record_iteration(model, data, optimizer, patience=patience)
 
 
-_pairs: LRUCache[tuple[str, str, str, str], Pair] = LRUCache(KEPT)
+_pairs: LRUCache[tuple[str, str, str, int, str], Pair] = LRUCache(KEPT)
 _lock = threading.Lock()
 
 
-def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> Pair:
-    """The pair, from memory where it was used lately."""
-    key = (hand.content, obj.content, fidelity.model_dump_json(), device)
+def pair_of(
+    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False
+) -> Pair:  # fmt: skip
+    """The pair, from memory where it was used lately. Where nothing projects hands out of a free object, it has the
+    samples of the fidelity, too."""
+    count = fidelity.object_points
+    if fidelity.polish_iterations and not in_scenes:
+        count = max(count, min(DENSER * count, DENSEST))
+    key = (hand.content, obj.content, fidelity.model_dump_json(), count, device)
     with _lock:
         if key in _pairs:
             return _pairs[key]
         kernels.load(device)
-        samples = object_samples(obj, fidelity.object_points)
+        samples = object_samples(obj, count)
         whole = DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL)
         pair = Pair(
             coarse=Side(

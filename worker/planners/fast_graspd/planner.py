@@ -23,7 +23,7 @@ from worker.planners.fast_graspd import scene_starts, starts
 from worker.planners.fast_graspd.batches import Batches, finalists
 from worker.planners.fast_graspd.candidates import TOGETHER, Seated, tried, with_postures
 from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import DILATION, coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.schedule import AROUND, DILATION, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import (
     FRICTION,
     NEAR_M,
@@ -118,7 +118,7 @@ def plan_joined(
     batches = Batches(asked, obj, warm)
     run = asked[0].run.apart()
     try:
-        parts = optimise(pair_of(hand, obj, asked[0].wanted.fidelity, run.device), batches, run, postures=True)
+        parts = optimise(_pair(hand, obj, asked[0].wanted, run), batches, run, postures=True)
     except Exception:
         if len(batches.errors) < len(asked):
             raise
@@ -135,9 +135,13 @@ def plan_joined(
     return found
 
 
+def _pair(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> Pair:
+    return pair_of(hand, obj, wanted.fidelity, run.device, in_scenes=wanted.placed is not None)
+
+
 def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: Wanted, run: Run) -> list[Part]:
     """Starts, optimisation and projection of a batch, without the postures around each grasp."""
-    return optimise_pair(pair_of(hand, obj, wanted.fidelity, run.device), wanted, run)
+    return optimise_pair(_pair(hand, obj, wanted, run), wanted, run)
 
 
 def optimise_pair(pair: Pair, wanted: Wanted, run: Run) -> list[Part]:
@@ -373,7 +377,8 @@ class _Seats:
         if fidelity.fine_iterations:
             losses = _losses(data, len(flat))
         # Without iterations this only tells how deep each hand is.
-        state, depths = Projection(launch.fine, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
+        options = AROUND if launch.batches.placed is None else ProjectionOptions()
+        state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
         return Seated(state, losses, merit, launch.unsound(state, depths))
 

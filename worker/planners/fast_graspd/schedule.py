@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from service.model.fidelity import Fidelity
 from worker.simulation.model import LossOptions
+from worker.simulation.projection import ProjectionOptions
 from worker.simulation.state import Schedule
 
 Floats = NDArray[np.float64]
@@ -25,6 +26,9 @@ SELF_WEIGHT: Final = 2e4
 #: of them hold at half the friction. With half as much a Barrett hand gains little, with twice as much the slender
 #: fingers of a Shadow hand are drawn into thin walls.
 PULL: Final = 3e-4
+#: The projection of hands around a free object: it draws in what is farther off than among obstacles, so more of the
+#: hand comes to lie at the object. Hands would end deeper by as much as the samples of `pairs.DENSER` save.
+AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
 def loss_options(fidelity: Fidelity, *, friction: float = 0.8) -> LossOptions:

@@ -15,11 +15,11 @@ from service.model.transforms import quat_rotate
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.fast_graspd.pairs import Pair, pair_of
-from worker.planners.fast_graspd.schedule import coarse_schedule, fine_schedule
+from worker.planners.fast_graspd.schedule import AROUND, coarse_schedule, fine_schedule
 from worker.planners.fast_graspd.selection import merits
 from worker.planners.fast_graspd.starts import sample_starts
 from worker.simulation.data import Data
-from worker.simulation.projection import Projection, ProjectionOptions
+from worker.simulation.projection import Projection
 from worker.simulation.record import record_iteration
 from worker.simulation.state import HandState, Schedule
 
@@ -81,8 +81,8 @@ def descend(
     # The projection divides quaternions by their length: what the descent did to it is told before.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     # No steps: this only tells how deep each hand is.
-    _, depths = Projection(model, data, ProjectionOptions()).run(state, 0)
-    state, _ = Projection(model, data, ProjectionOptions()).run(state, fidelity.polish_iterations)
+    _, depths = Projection(model, data, AROUND).run(state, 0)
+    state, _ = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
     return Descent(state, depths, drift)
 
 
