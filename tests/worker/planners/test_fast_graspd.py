@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_grasps_touch_with_several_links_and_hardly_penetrate(hand: str, obj: st
     assert np.mean(quality["quality/epsilon"][:, column] > 0.02) > 0.5
 
 
-def measured(name: str, hand: str, obj: str) -> dict[str, NDArray[np.generic]]:
+def measured(name: str, hand: str, obj: str) -> dict[str, NDArray[Any]]:
     """24 hands without a trial; pairs are kept by the name of their fidelity, too."""
     fidelity = FIDELITIES["standard"].model_copy(update={"name": name})
     found = grasps(24, hand=hand, obj=obj, fidelity=fidelity, threads=2, seed=5)
