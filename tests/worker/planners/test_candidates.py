@@ -141,12 +141,16 @@ def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> 
     assert (held >= before).all()
 
 
-@pytest.fixture(scope="module")
-def free():
+def free_case(name: str):
     """A hand, an object, what is wanted of them, and the trial of free grasps."""
-    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
+    hand, obj = hand_from_path(name), object_from_path("block", face_error_m=QUICK.face_error_m)
     trial = push_trial(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
     return hand, obj, Wanted(12, QUICK, seed=4), trial
+
+
+@pytest.fixture(scope="module")
+def free():
+    return free_case("barrett")
 
 
 def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tried_first(
@@ -175,8 +179,9 @@ def test_of_a_grasps_hands_the_one_that_lies_around_more_of_a_free_object_is_tri
     assert (in_order[:, 0] > in_order[:, 1]).any() and (orders[0][:, 0] > orders[0][:, 1]).any()
 
 
-def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold(free) -> None:
-    hand, obj, wanted, trial = free
+def test_free_grasps_that_fail_their_trial_set_out_again_and_more_of_them_hold() -> None:
+    """Slender fingers: 3, 4 and 8 of 12 hold without a trial with three seeds; with one 7, 8 and 9."""
+    hand, obj, wanted, trial = free_case("shadow")
     plain = synthesize(hand, obj, wanted, Run(threads=1))
     tried = synthesize(hand, obj, replace(wanted, trial=trial), Run(threads=1))
     before, after = trial(plain, None) < 1.0 + SLIPS, trial(tried, None) < 1.0 + SLIPS
