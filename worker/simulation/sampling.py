@@ -16,9 +16,9 @@ Floats = NDArray[np.float64]
 
 #: Edges between faces that turn by more than this carry samples of their own: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))
-#: Random points among which each sample is the farthest, and how many do where they are more than so many in all: what
-#: that takes grows with the product of candidates and samples.
-CANDIDATES, FEWER_CANDIDATES, AMPLE = 6, 3, 24_000
+#: Random points for each sample that is chosen of them, and how many do for more than so many samples: what that takes
+#: grows with the product of both.
+CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 
 
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
@@ -32,7 +32,7 @@ def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
 
 def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
     rng = np.random.default_rng(seed)
-    candidates = max(min(CANDIDATES * count, AMPLE), FEWER_CANDIDATES * count)
+    candidates = (CANDIDATES if count <= MANY else FEWER_CANDIDATES) * count
     corners = obj.vertices[obj.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)

@@ -27,7 +27,7 @@ SELF_WEIGHT: Final = 2e4
 #: fingers of a Shadow hand are drawn into thin walls.
 PULL: Final = 3e-4
 #: The projection of hands around a free object: it draws in what is farther off than among obstacles, so more of the
-#: hand comes to lie at the object. Hands would end deeper by as much as the samples of `pairs.DENSER` save.
+#: hand comes to lie at the object. It costs about half of the depth that the samples of `pairs.DENSER` save.
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
