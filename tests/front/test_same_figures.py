@@ -1,7 +1,7 @@
 """Figures of synthesize 18 hold for 19: none of their objects is too small or too wide for the pads of their hands.
 Those of 19 hold for 20: none of their hands is a gripper of more than two digits. Those of 20 hold for 21 in scenes:
 there, points are not pulled, and hands set out from where they did. So do those of 21 for 22: there, objects have the
-samples they had, and the projection is the same."""
+samples they had, and the projection is the same. So do those of 22 for 23: there, no grasp sets out again."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from worker.planners import Wanted, synthesize
 from worker.planners.fast_graspd import candidates, planner
 from worker.planners.fast_graspd.candidates import Seated
 from worker.planners.fast_graspd.planner import ATTEMPTS
+from worker.planners.fast_graspd.schedule import PULL
 from worker.quality.referee.decomposition import ConvexPieces
 from worker.quality.referee.short import SLIPS, push_trial
 from worker.run import Run
@@ -141,6 +142,21 @@ def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> 
     assert (held >= before).all()
 
 
+def test_in_scenes_no_grasp_sets_out_again(scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, obj, placed = scene
+    attempts: list[int] = []
+    set_out = planner._set_out
+
+    def counted(launch, rows, attempt):
+        attempts.extend(attempt.tolist())
+        return set_out(launch, rows, attempt)
+
+    monkeypatch.setattr(planner, "_set_out", counted)
+    never = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, _: np.full(len(grasps), 9.0))
+    synthesize(hand, obj, never, Run(threads=1))
+    assert attempts == [0] * 4
+
+
 def free_case(name: str):
     """A hand, an object, what is wanted of them, and the trial of free grasps."""
     hand, obj = hand_from_path(name), object_from_path("block", face_error_m=QUICK.face_error_m)
@@ -221,6 +237,26 @@ def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad
     # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
     assert ATTEMPTS // 2 < len(scores) <= (1 + ATTEMPTS) * QUICK.starts // 2
     assert len(found) == 1
+
+
+def test_hands_are_drawn_to_a_free_object_when_they_first_set_out_and_not_again(
+    free, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand, obj, wanted, _ = free
+    pulls: list[tuple[float, float]] = []
+    work = planner._work
+
+    def watched(launch, begun):
+        pulls.append((launch.coarse.options.pull, launch.fine.options.pull))
+        return work(launch, begun)
+
+    monkeypatch.setattr(planner, "_work", watched)
+    monkeypatch.setattr(planner, "ATTEMPTS", 2)
+    never = replace(wanted, count=1, trial=lambda grasps, placed: np.full(len(grasps), 9.0))
+    synthesize(hand, obj, never, Run(threads=1))
+    assert pulls[0] == (PULL, PULL)
+    assert len(pulls) > 1
+    assert set(pulls[1:]) == {(0.0, 0.0)}
 
 
 def test_attempts_made_ahead_give_the_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,10 +54,10 @@ class Pair:
     options: LossOptions
     hand: DeviceHand
 
-    def model(self, side: Side, obstacles: DeviceObstacles | None = None) -> Model:
+    def model(self, side: Side, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
         """The hand and the object as a phase sees them. Among obstacles points are not pulled: fingers that could be
         drawn around the object are kept off the table."""
-        options = self.options if obstacles is None else replace(self.options, pull=0.0)
+        options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
     def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:

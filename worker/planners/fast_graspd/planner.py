@@ -63,7 +63,7 @@ SET_OUT_AGAIN: Final = 0.05
 FAILED: Final = 2.0
 #: How often grasps whose hands are tried may set out again. One more attempt finds what the first ones found, so valid
 #: grasps a second hardly depend on it, and fewer grasps of a hard pair are left that hold nothing.
-ATTEMPTS: Final = 10
+ATTEMPTS: Final = 20
 #: Attempts of one grasp that are made at once, at the most.
 AHEAD: Final = 4
 
@@ -184,13 +184,15 @@ class _Launch:
 
     pair: Pair
     batches: Batches
+    pulled: bool = True
+    """Whether points are drawn to a free object."""
     coarse: Model = field(init=False)
     fine: Model = field(init=False)
 
     def __post_init__(self) -> None:
         obstacles = _obstacles(self.pair, self.batches.placed)
-        object.__setattr__(self, "coarse", self.pair.model(self.pair.coarse, obstacles))
-        object.__setattr__(self, "fine", self.pair.model(self.pair.fine, obstacles))
+        object.__setattr__(self, "coarse", self.pair.model(self.pair.coarse, obstacles, pulled=self.pulled))
+        object.__setattr__(self, "fine", self.pair.model(self.pair.fine, obstacles, pulled=self.pulled))
 
     def placed(self, rows: Rows) -> Placed | None:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
@@ -333,7 +335,9 @@ def _tried_again(launch: _Launch, part: Part, run: Run) -> Part:
 
 
 def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, run: Run) -> Part:
-    """Later attempts (n,) of grasps; the merit of those without a place is inf."""
+    """Later attempts (n,) of grasps; the merit of those without a place is inf. Their hands are not pulled: on a bowl's
+    wall half as many hold that are."""
+    launch = replace(launch, pulled=False)
 
     def work(which: range) -> Part:
         some = slice(which.start, which.stop)
