@@ -136,7 +136,7 @@ def main() -> None:
     lines = [
         "# The failures left\n",
         f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, judged at level `certificate` (revision "
-        f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand the {WORST} objects on which least hold, of "
+        f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand the {WORST} objects on which least hold, if some do not, of "
         f"{len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
         "margin is the worst motion over its limit. The pictures show the moment of contact: up to three that fail, "
         "then one that holds. What is said of a pair are medians over its lost grasps.\n",
@@ -164,6 +164,8 @@ def main() -> None:
         lines.append("")
         for at in order[:WORST]:
             cell, found = every[at], figures[at]
+            if all(found["success"]):
+                break
             name = f"failures/{hand}-{cell.object_name}.png"
             picture(cell, found, args.out / name)
             drawn.add(args.out / name)
