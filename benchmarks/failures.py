@@ -136,8 +136,8 @@ def main() -> None:
     lines = [
         "# The failures left\n",
         f"Raw `standard` grasps, seed {SEED}, {args.grasps} on each object, judged at level `certificate` (revision "
-        f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand the {WORST} objects on which least hold, if some do "
-        f"not, of {len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
+        f"{STAGE_REVISIONS['synthesize']} of synthesize). Of each hand up to {WORST} objects on which most are lost, "
+        f"of {len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA --objects ...`; a "
         "margin is the worst motion over its limit. The pictures show the moment of contact: up to three that fail, "
         "then one that holds. What is said of a pair are medians over its lost grasps.\n",
     ]
