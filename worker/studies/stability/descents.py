@@ -47,7 +47,8 @@ class Descent:
 
     state: HandState
     depths: Floats
-    """Deepest penetration before the projection (n,) [m]."""
+    """Deepest penetration after the projection (n,) [m], as a job has it: hands that are pulled around the object stand
+    millimetres deep in it before."""
     drift: float
     """Largest departure of a quaternion's length from 1 before the projection, which makes them whole again."""
 
@@ -80,9 +81,7 @@ def descend(
         state = data.state(n)
     # The projection divides quaternions by their length: what the descent did to it is told before.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
-    # No steps: this only tells how deep each hand is.
-    _, depths = Projection(model, data, AROUND).run(state, 0)
-    state, _ = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
+    state, depths = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
     return Descent(state, depths, drift)
 
 
