@@ -142,16 +142,22 @@ def test_a_trial_keeps_what_holds_and_finds_more_whatever_the_threads(scene) -> 
     assert (held >= before).all()
 
 
-def test_in_scenes_no_grasp_sets_out_again(scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    hand, obj, placed = scene
-    attempts: list[int] = []
+@pytest.fixture
+def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by the number of each attempt that is made."""
+    made: list[int] = []
     set_out = planner._set_out
 
     def counted(launch, rows, attempt):
-        attempts.extend(attempt.tolist())
+        made.extend(attempt.tolist())
         return set_out(launch, rows, attempt)
 
     monkeypatch.setattr(planner, "_set_out", counted)
+    return made
+
+
+def test_in_scenes_no_grasp_sets_out_again(scene, attempts: list[int]) -> None:
+    hand, obj, placed = scene
     never = Wanted(4, QUICK, seed=4, placed=placed, trial=lambda grasps, _: np.full(len(grasps), 9.0))
     synthesize(hand, obj, never, Run(threads=1))
     assert attempts == [0] * 4
@@ -214,18 +220,10 @@ def test_what_a_trial_chooses_of_a_free_grasp_depends_on_no_other_grasp_and_no_t
 
 
 def test_a_grasp_that_nobody_holds_sets_out_as_often_as_it_may_and_the_least_bad_hand_stays(
-    free, monkeypatch: pytest.MonkeyPatch
+    free, attempts: list[int]
 ) -> None:
     hand, obj, wanted, _ = free
     scores: list[float] = []
-    attempts: list[int] = []
-    set_out = planner._set_out
-
-    def counted(launch, rows, attempt):
-        attempts.extend(attempt.tolist())
-        return set_out(launch, rows, attempt)
-
-    monkeypatch.setattr(planner, "_set_out", counted)
 
     def never(grasps: GraspSet, placed: Placed | None) -> np.ndarray:
         assert placed is None
