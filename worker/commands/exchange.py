@@ -14,6 +14,7 @@ from service.model.errors import InputError
 from service.store import standing
 from service.store.shards import read_shard
 from worker.files.choice import EveryOption, UnjudgedOption, choose
+from worker.files.exchange.opening import opened
 from worker.run import Run
 
 app = typer.Typer(no_args_is_help=True)
@@ -67,23 +68,25 @@ def export(
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
     notes: list[str] = []
-    if format_ in ROBOTS:
-        from worker.files.robot_export import Wishes, export_grasps
+    with opened(output):
+        if format_ in ROBOTS:
+            from worker.files.robot_export import Wishes, export_grasps
 
-        wishes = Wishes(hand, object_, unjudged, every, best, tool, speed, arm, mount, base, mount_pose)
-        done = export_grasps(source, format_, wishes, output)
-        written, notes = done.counts, done.notes
-    elif format_ in TRAINING:
-        from worker.files.training_export import TrainingWishes, export_training
+            wishes = Wishes(hand, object_, unjudged, every, best, tool, speed, arm, mount, base, mount_pose)
+            done = export_grasps(source, format_, wishes, output)
+            written, notes = done.counts, done.notes
+        elif format_ in TRAINING:
+            from worker.files.training_export import TrainingWishes, export_training
 
-        done = export_training(source, format_, TrainingWishes(hand, object_, unjudged, every, held_out, noise), output)
-        written, notes = done.counts, done.notes
-    elif format_ == "webdataset":
-        written = _webdataset(source, output, unjudged=unjudged, every=every)
-    elif format_ == "dexgraspbench":
-        written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
-    else:
-        written = _pictures(source, format_, depth, output)
+            training = TrainingWishes(hand, object_, unjudged, every, held_out, noise)
+            done = export_training(source, format_, training, output)
+            written, notes = done.counts, done.notes
+        elif format_ == "webdataset":
+            written = _webdataset(source, output, unjudged=unjudged, every=every)
+        elif format_ == "dexgraspbench":
+            written = _bench(source, hand, object_, output, unjudged=unjudged, every=every)
+        else:
+            written = _pictures(source, format_, depth, output)
     if json:
         emit({"folder": str(output), "format": format_, **written, **({"notes": notes} if notes else {})})
         return

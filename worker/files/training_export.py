@@ -16,8 +16,8 @@ from service.store import standing
 from service.store.shards import Shard, read_shard
 from worker.files.cases import load_case
 from worker.files.choice import choose
-from worker.files.exchange.imported import plain_name
 from worker.files.exchange.lots import Lot, held_out
+from worker.files.exchange.names import plain_name
 from worker.files.exchange.written import Written
 from worker.objects.families import families
 

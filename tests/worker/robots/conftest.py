@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.worker.robots.shards import FREE, TABLE, make
+from tests.worker.robots.shards import CLUTTER, FREE, PRESSING, TABLE, make
 from worker.engines import backend
 
 
@@ -25,3 +25,15 @@ def free_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def table_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Barrett grasps of a bottle that lies on tables, as they come."""
     return make(TABLE, tmp_path_factory.mktemp("table") / "grasps.h5")
+
+
+@pytest.fixture(scope="session")
+def pressing_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Barrett grasps of a bottle, whose fingertips may press into the table."""
+    return make(PRESSING, tmp_path_factory.mktemp("pressing") / "grasps.h5")
+
+
+@pytest.fixture(scope="session")
+def clutter_shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Barrett grasps of a bottle with a block beside it."""
+    return make(CLUTTER, tmp_path_factory.mktemp("clutter") / "grasps.h5")

@@ -16,6 +16,8 @@ TABLE = [
     *("--hand", "barrett", "--object", "bottle", "--scene", "table", "--scenes", "2", "-n", "6", "--referee", "none"),
     *COMMON,
 ]
+PRESSING = [*TABLE, "--touch", "-1"]
+CLUTTER = [*TABLE, "--with", "block"]
 
 
 def run(*arguments: Any) -> Result:

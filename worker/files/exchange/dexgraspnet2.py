@@ -35,8 +35,9 @@ from service.readers import DepthNoise, Pictures
 from service.readers.cloud_views import CloudView
 from worker.files.exchange.archives import load_npz
 from worker.files.exchange.dexgraspnet2_graspness import SceneGraspness, surface_samples
-from worker.files.exchange.imported import Imported, completed, joints_by_name, plain_name, verdicts
+from worker.files.exchange.imported import Imported, completed, joints_by_name, verdicts
 from worker.files.exchange.lots import Look, Lot, by_scene, looks
+from worker.files.exchange.names import plain_name
 from worker.files.exchange.objects import scaled_object
 from worker.files.exchange.written import Written
 from worker.grasps import GraspSet, Posture

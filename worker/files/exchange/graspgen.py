@@ -28,8 +28,9 @@ from service.model.errors import InputError
 from service.model.transforms import pose_from_matrix, pose_to_matrix, quat_from_matrix
 from service.store import standing
 from worker.files.exchange.closing import closed_at
-from worker.files.exchange.imported import Imported, completed, joints_by_name, plain_name
+from worker.files.exchange.imported import Imported, completed, joints_by_name
 from worker.files.exchange.lots import Lot
+from worker.files.exchange.names import plain_name
 from worker.files.exchange.objects import mesh_file, scaled_object
 from worker.files.exchange.written import Written
 from worker.grasps import GraspSet, Posture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -77,8 +76,3 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
     out = np.tile(middle, (len(given), 1))
     out[:, order] = given
     return out
-
-
-def plain_name(name: str) -> str:
-    """A name fit for files and addresses."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:64] or "unnamed"

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.store.shards import Shard
+from worker.files.exchange.names import prim_name
 from worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 from worker.rendering.export import export_images
 
@@ -111,7 +112,7 @@ def _annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]
         np.save(folder / f"{what}_{view:04}.npy", rows)
         written.append(folder / f"{what}_{view:04}.npy")
         written.append(_json(folder / f"{what}_labels_{view:04}.json", {"0": {"class": name}}))
-        written.append(_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{name}"] * len(rows)))
+        written.append(_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{prim_name(name)}"] * len(rows)))
     labels = {BACKGROUND: "BACKGROUND", TABLE: "table", OBJECT: name}
     said = {str(label): {"class": word} for label, word in labels.items()}
     written.append(_json(folder / f"semantic_segmentation_labels_{view:04}.json", said))

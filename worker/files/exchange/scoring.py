@@ -15,7 +15,8 @@ from service.store.attributes import Attribute
 from service.store.shards import json_attribute, write_shard
 from worker.certified import scored
 from worker.files.base_attributes import base_attributes
-from worker.files.exchange.imported import Imported, Origin, plain_name
+from worker.files.exchange.imported import Imported, Origin
+from worker.files.exchange.names import plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.objects.prepare import files_from_path
 from worker.run import ALONE, Run

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from service.model.transforms import compose, invert
-from worker.files.exchange.imported import plain_name
+from worker.files.exchange.names import plain_name, prim_names
 from worker.hands.description import Description
 from worker.hands.model import Floats
 from worker.robots.arm import Arm
@@ -56,6 +56,12 @@ class Bundle:
     def seen_tool(self, root_pose: Floats) -> Floats:
         """Poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
         return self.seen(compose(root_pose, self.found.tool.pose))
+
+    @property
+    def prims(self) -> tuple[str, str]:
+        """Names of the object's and the hand's prims below `/World`, beside `scene`."""
+        _, thing, hand = prim_names(["scene", self.found.obj.name, self.found.hand.name])
+        return thing, hand
 
     def name(self, row: int) -> str:
         """Name of a grasp, after its row in the shard."""

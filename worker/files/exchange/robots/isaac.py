@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.transforms import compose, invert
-from worker.files.exchange.imported import plain_name
+from worker.files.exchange.names import plain_name, prim_name
 from worker.files.exchange.robots.bundle import Bundle, dump_yaml, numbers
 
 FORMAT: Final = {"format": "isaac_grasp", "format_version": "1.0"}
@@ -24,7 +24,8 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     """Write `HAND_OBJECT.yaml`."""
     found = bundle.found
     folder.mkdir(parents=True, exist_ok=True)
-    thing, tool = f"/World/{plain_name(found.obj.name)}", f"/World/{plain_name(found.hand.name)}/{found.tool.name}"
+    thing, hand = (f"/World/{name}" for name in bundle.prims)
+    tool = f"{hand}/{prim_name(found.tool.name)}"
     document = {
         **FORMAT,
         "object_frame_link": thing, "gripper_frame_link": tool, "object_frame": thing, "gripper_frame": tool,

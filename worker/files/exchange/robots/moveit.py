@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.errors import InputError
-from worker.files.exchange.imported import plain_name
+from worker.files.exchange.names import plain_name
 from worker.files.exchange.objects import mesh_file
 from worker.files.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from worker.hands.model import Floats

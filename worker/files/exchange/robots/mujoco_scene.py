@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
@@ -15,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from service.model.transforms import compose
-from worker.files.exchange.imported import plain_name
+from worker.files.exchange.names import plain_name
 from worker.files.exchange.robots.bundle import Bundle
 from worker.hands.model import HandModel
 from worker.quality.referee.decomposition import ConvexPieces
@@ -24,9 +25,10 @@ from worker.robots.execution import POSTURES, Executions
 
 #: As the lift test pulls: a force of 1 N on 0.1 kg [m/s^2].
 GRAVITY: Final = 10.0
-_COLOURS: Final = {"hand": "0.36 0.45 0.58 1", "object": "0.87 0.45 0.2 1", "support": "0.75 0.75 0.72 1"}
-#: Attributes that name bodies, joints or actuators.
-_NAMING: Final = ("name", "body1", "body2", "joint", "joint1", "joint2", "target")
+#: Of the hand, the object, and all else.
+_COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
+#: Attributes of MJCF that the specification knows by another name.
+_SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
 def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
@@ -39,16 +41,20 @@ def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
     """
     found = bundle.found
     folder.mkdir(parents=True, exist_ok=True)
-    supports = () if found.placed is None else found.placed.supports
+    around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)
     physics = MujocoOptions()
-    scene = build(found.hand, found.obj, pieces, physics, supports)
-    spec = scene_spec(found.hand, found.obj, pieces, physics, supports)
+    scene = build(found.hand, found.obj, pieces, physics, *around)
+    spec = scene_spec(found.hand, found.obj, pieces, physics, *around)
     spec.modelname = f"{plain_name(found.hand.name)} and {plain_name(found.obj.name)}"
     tree = ElementTree.fromstring(spec.to_xml())
+    _restore_digits(tree, spec)
+    for geom in tree.iter("geom"):
+        number = scene.model.geom(geom.attrib["name"]).id
+        geom.set("user", element_text([scene.tip_geoms[number], scene.pressing[number]]))
     site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
     SubElement(one(tree, ".//body[@name='object']"), "site", site)
     _settle(tree, found)
-    dress(tree, found, ("body0", "object", "supports"))
+    dress(tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours)))))
     _add_keys(tree, bundle, scene)
     rename(tree, _names(found.hand))
     ElementTree.indent(tree)
@@ -56,6 +62,20 @@ def write(bundle: Bundle, folder: Path, pieces: ConvexPieces) -> list[Path]:
     file.write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
     script.write_text(Path(__file__).with_name("replay.py").read_text())
     return [file, script]
+
+
+def _restore_digits(tree: Element, spec: Any) -> None:
+    """Numbers with all their digits: MuJoCo writes six, and contacts that decide a verdict are told apart by less."""
+    for tag in ("body", "joint", "geom", "mesh"):
+        for element in tree.iter(tag):
+            source = getattr(spec, tag)(element.get("name")) if element.get("name") else None
+            for key, text in element.attrib.items():
+                values = getattr(source, _SPEC_NAMES.get(key, key), None)
+                if not isinstance(values, str) and np.ndim(values) == 1:
+                    written = text.split()
+                    exact = np.asarray(values, float)[: len(written)]
+                    if np.allclose(exact, np.array(written, float), rtol=1e-5, atol=1e-9):
+                        element.set(key, element_text(exact))
 
 
 def _settle(tree: Element, found: Executions) -> None:
@@ -76,11 +96,11 @@ def _settle(tree: Element, found: Executions) -> None:
 
 
 def dress(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
-    """Colours of hand, object and supports (bodies of these names), light and a camera: nothing of it moves a body."""
-    for name, colour in zip(names, _COLOURS, strict=False):
+    """Colours of hand, object and what stands around (bodies of these names), light and a camera: none moves a body."""
+    for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):
-                geom.set("rgba", _COLOURS[colour])
+                geom.set("rgba", colour)
     world, size = one(tree, "worldbody"), 2 * found.obj.radius + 0.3
     middle = found.object_pose[0, :3]
     world.insert(
@@ -113,6 +133,10 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
     qpos[scene.root_qpos : scene.root_qpos + 7] = pose
     at = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
     qpos[scene.object_qpos : scene.object_qpos + 7] = compose(at, np.array([*scene.centre, 1, 0, 0, 0]))
+    for k, free in enumerate(scene.neighbours):
+        assert found.placed is not None and found.placed.neighbour_pose is not None
+        rest = found.placed.neighbour_pose[found.scene_index[row], k]
+        qpos[free.qpos : free.qpos + 7] = compose(rest, np.array([*free.centre, 1, 0, 0, 0]))
     control = scene.controls(command.joint_positions[row])
     return {
         "qpos": element_text(qpos),
@@ -133,13 +157,10 @@ def _names(hand: HandModel) -> Mapping[str, str]:
 
 
 def rename(tree: Element, names: Mapping[str, str]) -> None:
-    """Give bodies, joints and actuators other names, wherever they are named."""
+    """Give bodies, joints, tendons and actuators other names, wherever they are named."""
     for element in tree.iter():
-        if element.tag in ("mesh", "geom", "key", "site"):
-            continue
-        for attribute in _NAMING:
-            if element.get(attribute) in names:
-                element.set(attribute, names[element.attrib[attribute]])
+        if element.tag not in ("mesh", "geom", "key", "site"):
+            element.attrib.update({key: names[text] for key, text in element.attrib.items() if text in names})
 
 
 def one(tree: Element, path: str) -> Element:
@@ -151,4 +172,4 @@ def one(tree: Element, path: str) -> Element:
 
 def element_text(values: Any) -> str:
     """Numbers as MJCF has them."""
-    return " ".join(f"{float(value):.12g}" for value in np.ravel(values))
+    return " ".join(f"{float(value):.17g}" for value in np.ravel(values))

@@ -21,7 +21,8 @@ import numpy as np
 
 STAGES, STAGE_S, HOLD_S, FIRST_LOOK_S, LOOK_S, SURE = 10, 0.04, 2.0, 0.08, 0.04, 0.5
 MAX_MOVED_M, MAX_TURNED = 0.05, math.radians(15)
-MAX_DEPTH_M, OVERHANG_M, LOOKS = 0.010, 0.002, 20
+MAX_DEPTH_M, OVERHANG_M, WAY_LOOKS, CLOSING_LOOKS = 0.010, 0.002, 20, 4
+NEIGHBOUR_MOVED_M = 0.02
 PUSHES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
 
@@ -37,6 +38,11 @@ class Replay:
         owner = self.model.body_rootid[self.model.geom_bodyid]
         self.of_object = owner == self.object
         self.of_hand = owner == self.model.jnt_bodyid[self.model.joint("root").id]
+        self.neighbours = [
+            int(self.model.jnt_qposadr[self.model.body(body).jntadr[0]])
+            for body in range(self.model.nbody)
+            if self.model.body(body).name.startswith("neighbour") and self.model.body(body).jntnum[0] == 1
+        ]
         self.falls = bool(np.linalg.norm(self.model.opt.gravity) > 0)
         self.grasps: list[str] = []
         for number in range(self.model.nkey):
@@ -66,7 +72,8 @@ class Replay:
             self.move(grasp, "squeeze", "lift")
             goal = start.copy()
             goal[:3] += self.key(grasp, "lift").mpos[:3] - self.key(grasp, "squeeze").mpos[:3]
-            return self.hold(goal)
+            found = self.hold(goal)
+            return "moved a neighbour" if found == "held" and self.moved_neighbour(grasp) else found
         size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION)
         closed = np.empty(size)
         mujoco.mj_getState(self.model, self.data, closed, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -77,6 +84,19 @@ class Replay:
             if (found := self.hold(start)) != "held":
                 return f"{found} under a push {push}"
         return "held"
+
+    def moved_neighbour(self, grasp: str) -> bool:
+        """Whether a neighbour is not where it stood, or has toppled; it may turn about the vertical."""
+        up = np.array([0.0, 0.0, 1.0])
+        for at in self.neighbours:
+            then, now = self.key(grasp, "pregrasp").qpos[at : at + 7], self.data.qpos[at : at + 7]
+            inverse, local, standing = np.empty(4), np.empty(3), np.empty(3)
+            mujoco.mju_negQuat(inverse, then[3:])
+            mujoco.mju_rotVecQuat(local, up, inverse)
+            mujoco.mju_rotVecQuat(standing, local, now[3:])
+            if np.linalg.norm(now[:3] - then[:3]) > NEIGHBOUR_MOVED_M or standing @ up < math.cos(MAX_TURNED):
+                return True
+        return False
 
     def move(self, grasp: str, a: str, b: str) -> None:
         """Command the way from one key frame's targets to another's."""
@@ -135,10 +155,10 @@ class Replay:
 
     def touches(self, grasp: str) -> bool:
         """Whether the open hand on its way reaches into the object or anything else."""
-        for a, b in (("standoff", "arrival"), ("arrival", "pregrasp")):
+        for a, b, looks in (("standoff", "arrival", WAY_LOOKS), ("arrival", "pregrasp", CLOSING_LOOKS)):
             first, last = self.key(grasp, a), self.key(grasp, b)
-            for look in range(LOOKS):
-                share = look / LOOKS
+            for look in range(looks):
+                share = look / looks
                 qpos = (1 - share) * first.qpos + share * last.qpos
                 root = self.model.jnt_qposadr[self.model.joint("root").id]
                 qpos[root + 3 : root + 7] = slerp(
@@ -153,10 +173,16 @@ class Replay:
                     ours = self.of_hand[contact.geom]
                     if not ours.any() or ours.all():
                         continue
-                    allowed = OVERHANG_M if self.of_object[contact.geom].any() else 0.0
-                    if contact.dist < -allowed:
+                    if contact.dist < -self.allowed(contact.geom):
                         return True
         return False
+
+    def allowed(self, pair: Any) -> float:
+        """How deep the coming hand may be in the other of two geoms [m]; fingertips may press into some supports."""
+        if self.of_object[pair].any():
+            return OVERHANG_M
+        tips, pressing = self.model.geom_user[pair].T
+        return float(pressing.max()) if tips.any() else 0.0
 
 
 def slerp(a: Any, b: Any, share: float) -> Any:

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from worker.files.exchange.imported import plain_name
+from worker.files.exchange.names import plain_name
 from worker.hands.model import Floats, HandModel
 from worker.hands.primitives import hull
 from worker.hands.robot import Ints

@@ -13,7 +13,7 @@ import numpy as np
 
 from service.model.errors import InputError
 from service.model.transforms import pose_to_matrix
-from worker.files.exchange.imported import plain_name
+from worker.files.exchange.names import prim_names
 from worker.files.exchange.robots.bundle import Bundle
 from worker.files.exchange.robots.solids import Solid, hand_meshes, object_mesh, support_meshes
 from worker.hands.kinematics import body_poses
@@ -47,17 +47,17 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
         stage.SetStartTimeCode(0.0)
         stage.SetEndTimeCode(RATE * float(trajectory.time[-1]))
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
-        root = f"/World/{_name(found.hand.name)}"
+        object_prim, hand_prim = bundle.prims
+        root = f"/World/{hand_prim}"
         UsdGeom.Xform.Define(stage, root)
         bodies, times = _bodies(found, trajectory), RATE * trajectory.time
         at_grasp = posed_bodies(found, "grasp", row)
-        for solid in moving:
-            path = f"{root}/{_name(solid.name)}"
-            _add(stage, path, solid, at_grasp[solid.body], bodies[:, solid.body], times)
+        for solid, name in zip(moving, prim_names([solid.name for solid in moving]), strict=True):
+            _add(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
         pose = found.object_pose[row]
-        _add(stage, f"/World/{_name(thing.name)}", thing, pose, _object_poses(found, row, trajectory), times)
+        _add(stage, f"/World/{object_prim}", thing, pose, _object_poses(found, row, trajectory), times)
         for solid in standing:
-            _add(stage, f"/World/scene/{_name(solid.name)}", solid)
+            _add(stage, f"/World/scene/{solid.name}", solid)
         stage.Save()
     return written
 
@@ -97,9 +97,3 @@ def _add(
     mesh.CreateDisplayColorAttr([Gf.Vec3f(*solid.colour)])
     low, high = (np.asarray(bound(solid.vertices, axis=0), float) for bound in (np.min, np.max))
     mesh.CreateExtentAttr([Gf.Vec3f(*map(float, low)), Gf.Vec3f(*map(float, high))])
-
-
-def _name(name: str) -> str:
-    """A name as USD allows it: letters, digits and underscores, no digit first."""
-    plain = plain_name(name).replace("-", "_").replace(".", "_")
-    return f"_{plain}" if plain[:1].isdigit() else plain
