@@ -20,6 +20,7 @@ from service.store.asset_options import (
     AllowOpenOption,
     ApproachOption,
     ClosingOption,
+    CompoundOption,
     DensityOption,
     DropOption,
     FingertipsOption,
@@ -93,6 +94,7 @@ def add_object(
     units: UnitsOption = None,
     scale_to: ScaleSweepOption = None,
     keep_largest: KeepLargestOption = False,
+    compound: CompoundOption = False,
     allow_open: AllowOpenOption = False,
     density: DensityOption = None,
     mass: MassOption = None,
@@ -107,7 +109,13 @@ def add_object(
     sizes = sizes_of(scale_to)
     one_size = sizes[0] if len(sizes) == 1 else None
     options = object_options(
-        units=units, scale_to=one_size, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
+        units=units,
+        scale_to=one_size,
+        keep_largest=keep_largest,
+        compound=compound,
+        allow_open=allow_open,
+        density=density,
+        mass=mass,
     )
     options |= provenance(licence, source)
     if len(sizes) > 1:

@@ -29,7 +29,8 @@ exit codes and HTTP statuses; `slug` names the problem type (RFC 9457).
 from __future__ import annotations
 
 import re
-from typing import ClassVar, Final
+from collections.abc import Mapping
+from typing import Any, ClassVar, Final
 
 #: Line breaks with the space around them, all that `str.splitlines` knows; control characters.
 _BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
@@ -75,6 +76,11 @@ class MeshError(InputError):
     """An object mesh that cannot be read or used."""
 
     slug, title = "bad-mesh", "The mesh cannot be used"
+
+    def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.facts = dict(facts or {})
+        """What was found out before the refusal, as the report of a check has it."""
 
 
 class HandError(InputError):

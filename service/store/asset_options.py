@@ -49,6 +49,7 @@ ScaleSweepOption = Annotated[
         "--scale-to", help="Scale the longest extent to this many metres; 0.06,0.08,0.1: an object of each size."
     ),
 ]
+CompoundOption = Annotated[bool, typer.Option("--compound", help="Components that lie apart are one rigid body.")]
 KeepLargestOption = Annotated[bool, typer.Option("--keep-largest", help="Of several components keep the largest.")]
 AllowOpenOption = Annotated[bool, typer.Option("--allow-open", help="Take a mesh that is not watertight.")]
 DensityOption = Annotated[float | None, typer.Option("--density", help="Density in kg/m3.")]
@@ -102,6 +103,7 @@ def object_options(
     units: str | None = None,
     scale_to: float | None = None,
     keep_largest: bool = False,
+    compound: bool = False,
     allow_open: bool = False,
     density: float | None = None,
     mass: float | None = None,
@@ -111,6 +113,7 @@ def object_options(
         "units": units,
         "scale_to": scale_to,
         "keep_largest": keep_largest or None,
+        "compound": compound or None,
         "allow_open": allow_open or None,
         "density": density,
         "mass": mass,

@@ -12,6 +12,7 @@ from service.model.errors import GraspdError, InputError
 from service.model.states import AssetKind
 from service.store.asset_options import (
     AllowOpenOption,
+    CompoundOption,
     DensityOption,
     KeepLargestOption,
     MassOption,
@@ -37,6 +38,7 @@ def check(
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
+    compound: CompoundOption = False,
     allow_open: AllowOpenOption = False,
     density: DensityOption = None,
     mass: MassOption = None,
@@ -45,7 +47,13 @@ def check(
 ) -> None:
     """Say whether a mesh can be used, what was repaired, and how large it is. Needs no server."""
     options = object_options(
-        units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open, density=density, mass=mass
+        units=units,
+        scale_to=scale_to,
+        keep_largest=keep_largest,
+        compound=compound,
+        allow_open=allow_open,
+        density=density,
+        mass=mass,
     )
     if several := _several(file):
         if picture:

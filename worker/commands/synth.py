@@ -19,7 +19,14 @@ from service.model.errors import InputError
 from service.model.fidelity import FIDELITIES
 from service.model.robust import MODELS
 from service.model.scene_spec import parse_scene
-from service.store.asset_options import AllowOpenOption, KeepLargestOption, ScaleToOption, UnitsOption, object_options
+from service.store.asset_options import (
+    AllowOpenOption,
+    CompoundOption,
+    KeepLargestOption,
+    ScaleToOption,
+    UnitsOption,
+    object_options,
+)
 from service.store.shards import write_shard
 from worker.files.of_shard import id_of_columns
 from worker.files.synthesis import chosen_fidelity, synthesized
@@ -64,6 +71,7 @@ def synth(
     units: UnitsOption = None,
     scale_to: ScaleToOption = None,
     keep_largest: KeepLargestOption = False,
+    compound: CompoundOption = False,
     allow_open: AllowOpenOption = False,
     device: Annotated[str, typer.Option(help="cpu, cuda:0 or auto")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core", min=0)] = 0,
@@ -103,7 +111,9 @@ def synth(
             "friction": friction, "min_distance": min_distance, "fidelity": chosen_fidelity(fidelity, contact_solver),
         }
     )  # fmt: skip
-    mesh = object_options(units=units, scale_to=scale_to, keep_largest=keep_largest, allow_open=allow_open)
+    mesh = object_options(
+        units=units, scale_to=scale_to, keep_largest=keep_largest, compound=compound, allow_open=allow_open
+    )
     place = parse_scene(scene, faces=faces, touch=touch, beside=with_ or [])
     settings = engine_settings()
     with _bar(quiet=json) as progress:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.model.errors import InputError
+from service.model.errors import InputError, MeshError
 from worker.objects.options import ObjectOptions, parse_options
 from worker.objects.prepare import build, main_file, repaired_mesh
 from worker.objects.repair import Repaired
@@ -29,7 +29,7 @@ def check_object(
 
     Returns:
         verdict: accept, repair or refuse; message: one line; repairs: what was changed; facts: what was measured, in
-        SI units.
+        SI units; of a refusal for its size `units_suggested`, the likeliest first.
     """
     try:
         settings = parse_options(files, options)
@@ -37,7 +37,8 @@ def check_object(
         mesh = repaired_mesh(main, files[main], settings)
         facts = _facts(mesh, face_error_m, settings)
     except InputError as error:
-        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": {}}
+        facts = error.facts if isinstance(error, MeshError) else {}
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
     size = " x ".join(f"{1e3 * extent:.0f}" for extent in facts["extents_m"])
     parts = [
         f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3",

@@ -29,6 +29,7 @@ class ObjectOptions(BaseModel):
     units: Literal["m", "mm", "cm", "in"] = "m"
     scale_to: Positive | None = Field(None, description="longest extent after scaling [m]")
     keep_largest: bool = Field(False, description="of several components keep the largest")
+    compound: bool = Field(False, description="components that lie apart are one rigid body")
     allow_open: bool = Field(False, description="take a mesh that encloses no volume")
     density: Positive | None = Field(None, description="[kg/m^3]")
     mass: Positive | None = Field(None, description="[kg]")

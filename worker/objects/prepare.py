@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from service.model.digests import digest_files, digest_variant
-from service.model.errors import GraspdError, MeshError, NotFoundError
+from service.model.errors import MeshError, NotFoundError
 from service.model.states import AssetKind
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from worker.objects.formats import READERS, read_mesh
@@ -84,8 +84,8 @@ def _repaired(main: str, data: bytes, options_json: str) -> Repaired:
     soup = read_mesh(main, data)
     try:
         return repair(soup, ObjectOptions.model_validate_json(options_json))
-    except GraspdError as error:
-        raise type(error)(f"{main}: {error}") from None
+    except MeshError as error:
+        raise MeshError(f"{main}: {error}", facts=error.facts) from None
 
 
 def build(mesh: Repaired, face_error_m: float) -> ObjectModel:

@@ -5,6 +5,7 @@ Every change is named: what is repaired silently today is a mystery in a dataset
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -21,6 +22,11 @@ from worker.objects.topology import Floats, Indices
 
 MAX_EXTENT_M: Final = 3.0
 MIN_EXTENT_M: Final = 1e-3
+#: Extents of objects that hands are asked to grasp, and of the middle one of YCB's [m]: a hint of units follows them.
+HAND_SIZES_M: Final = (0.02, 0.6)
+TYPICAL_SIZE_M: Final = 0.12
+#: Parts with at most this gap between them are one rigid body [m]: assemblies leave such between parts that are joined.
+JOINED_M: Final = 1e-3
 #: Vertices closer than this share of the longest extent are one vertex.
 MERGE: Final = 1e-8
 #: A seam that did not close is welded at this share of the longest extent.
@@ -92,17 +98,28 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> Repaired:
         raise MeshError("the mesh encloses no volume: it is flat; give the surface a thickness")
     if options.scale_to is not None:
         vertices, extent = vertices * (options.scale_to / extent), options.scale_to
-    if extent > MAX_EXTENT_M:
+    if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
+        size = f"{extent:.4g} m long, too large" if extent > MAX_EXTENT_M else f"{1e3 * extent:.3g} mm long, too small"
+        fitting = _fitting_units(extent / UNITS[options.units])
+        hints = "; ".join(f"--units {unit} makes it {_length(metres)} long" for unit, metres in fitting.items())
         raise MeshError(
-            f"the mesh is {extent:.4g} m long, too large to grasp; if it is in millimetres say so: --units mm "
-            "(or give a size: --scale-to 0.1)"
-        )
-    if extent < MIN_EXTENT_M:
-        raise MeshError(
-            f"the mesh is {extent * 1e3:.3g} mm long, too small to grasp; check its units or give a size: "
-            "--scale-to 0.1"
+            f"the mesh is {size} to grasp; {hints or 'check its units'} (or give a size: --scale-to 0.1)",
+            facts={"units_suggested": list(fitting)},
         )
     return Repaired(vertices, faces)
+
+
+def _fitting_units(extent: float) -> dict[str, float]:
+    """Units that make a length of the file one of an object for a hand, and that length [m]; the likeliest first."""
+    sizes = {unit: extent * metres for unit, metres in UNITS.items()}
+    low, high = HAND_SIZES_M
+    fitting = {unit: size for unit, size in sizes.items() if low <= size <= high}
+    fitting = fitting or {unit: size for unit, size in sizes.items() if MIN_EXTENT_M <= size <= MAX_EXTENT_M}
+    return dict(sorted(fitting.items(), key=lambda item: abs(math.log(item[1] / TYPICAL_SIZE_M))))
+
+
+def _length(metres: float) -> str:
+    return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{1e2 * metres:.3g} cm"
 
 
 def _clean(mesh: Repaired) -> Repaired:
@@ -245,7 +262,6 @@ def _unite(
     """One solid of several shells: those wound against the largest are cavities if they lie inside it."""
     if turned:
         mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
-    touching = _touching(parts)
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
     main = int(np.argmax([signed_volume(*part) for part in parts]))
     cavity = [
@@ -262,17 +278,22 @@ def _unite(
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
     # A cavity is a shell of its own, of negative volume.
     pieces = [piece for piece in united.decompose() if piece.volume() > 0]
-    groups = len(pieces) if not touching else max(1, len(pieces) - touching)
-    if groups > 1:
+    groups = solid.groups(pieces, JOINED_M)
+    if len(groups) > 1 and not options.compound:
         if not options.keep_largest:
             raise MeshError(
-                f"the mesh has {groups} separate components; keep the largest with --keep-largest, or upload each alone"
+                f"the mesh has {len(groups)} separate components; keep the largest: --keep-largest, take them as one "
+                "rigid body: --compound, or upload each alone"
             )
-        best = max(pieces, key=lambda piece: piece.volume())
-        return mesh.but(*solid.from_manifold(united ^ best), f"kept the largest of {groups} components")
+        best = united ^ solid.union(groups[0])
+        return mesh.but(*solid.from_manifold(best), f"kept the largest of {len(groups)} components")
+    if len(pieces) > 1:
+        how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
+        mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
-    if abs(united.volume() - before) > 1e-6 * before:
-        return mesh.but(*solid.from_manifold(united), f"united {len(parts)} intersecting components")
+    # Parts that share a face have the same volume apart and united: their faces within the solid go.
+    if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
+        return mesh.but(*solid.from_manifold(united), f"united {len(parts)} touching or intersecting components")
     return replace(mesh, vertices=_join_oriented(positives, holes)[0], faces=_join_oriented(positives, holes)[1])
 
 
@@ -287,14 +308,6 @@ def _resolve_self_intersections(mesh: Repaired) -> Repaired:
         return replace(mesh, self_intersections=len(found), notes=(*mesh.notes, note))
     mesh = mesh.but(*united, f"united the mesh with itself where {len(found)} pairs of faces intersected")
     return replace(mesh, self_intersections=0)
-
-
-def _touching(parts: list[tuple[Floats, Indices]]) -> int:
-    """How many joints of shared vertices hold the parts together (0: none): parts less groups."""
-    vertices, faces = _join(parts)
-    extent = float(np.ptp(vertices, axis=0).max())
-    _, merged = topology.merge_vertices(vertices, faces, MERGE * extent)
-    return len(parts) - int(topology.components(merged).max() + 1)
 
 
 def _join(parts: list[tuple[Floats, Indices]]) -> tuple[Floats, Indices]:

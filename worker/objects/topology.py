@@ -12,6 +12,9 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+#: Faces at an edge whose angles differ by less are coincident [rad].
+_SAME_ANGLE = 1e-9
+
 
 def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[Floats, Indices]:
     """Vertices that round to the same point of a grid of `tolerance` become one; unused ones go."""
@@ -231,7 +234,9 @@ def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indice
     flat = apex - (apex @ axis)[:, None] * axis
     x = flat[0] / max(float(np.linalg.norm(flat[0])), 1e-300)
     angle = np.arctan2(flat @ np.cross(axis, x), flat @ x)
-    order = np.argsort(angle, kind="stable")
+    # Parts that touch have coincident faces: the one whose material lies before it comes first.
+    angle = np.round(np.where(angle <= -np.pi + _SAME_ANGLE, np.pi, angle) / _SAME_ANGLE)
+    order = np.lexsort((edges[half, 0] != a, angle))
     forward = edges[half[order], 0] == a
     # A face that runs a -> b has its material on the side of smaller angle: it closes with the face before it.
     closing = [k for k in range(len(order)) if forward[k] and not forward[k - 1]]

@@ -168,3 +168,60 @@ def test_an_unknown_format_is_refused_with_those_that_are_read() -> None:
 def test_continued_lines_and_negative_indices_of_obj() -> None:
     data = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf -4 \\\n-2 -3\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     assert read_mesh("m.obj", data).faces.tolist()[0] == [0, 2, 1]
+
+
+def quantised(normalized: bool, extensions: dict[str, object] | None = None) -> bytes:
+    """The box with positions of 16 bits: whole tenths of a millimetre, or shares of 10 cm; nodes scale them."""
+    vertices, faces = box()
+    scale = 0.1 if normalized else 1e-4
+    numbers = np.rint(vertices / scale * (32767 if normalized else 1)).astype("<i2")
+    padded = np.zeros((len(numbers), 4), "<i2")
+    padded[:, :3] = numbers
+    points, index = padded.tobytes(), faces.astype("<u2").tobytes()
+    document: dict[str, object] = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "scale": [scale] * 3}],
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5122, "count": len(vertices), "type": "VEC3", "normalized": normalized},
+            {"bufferView": 1, "componentType": 5123, "count": faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": len(points), "byteStride": 8},
+            {"buffer": 0, "byteOffset": len(points), "byteLength": len(index)},
+        ],
+        "buffers": [{"byteLength": len(points) + len(index)}], **(extensions or {}),
+    }  # fmt: skip
+    return pack_glb(document, points + index)
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_quantised_positions_of_a_glb_have_their_size(normalized: bool) -> None:
+    soup = read_mesh("m.glb", quantised(normalized))
+    # A step of the normalised ones is 3 micrometres.
+    np.testing.assert_allclose(soup.vertices, box()[0], atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"nodes": [{"mesh": 0, "skin": 0}]}, "skinned"),
+        (
+            {"extensionsRequired": ["EXT_meshopt_compression"]},
+            "EXT_meshopt_compression is not read; export without compr",
+        ),
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "export without compression"),
+        ({"extensionsRequired": ["ACME_warp"]}, "ACME_warp is not read; export without it"),
+        ({"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]}, "EXT_mesh_gpu_instancing"),
+        ({"meshes": [{"weights": [0.5], "primitives": []}]}, "morph targets"),
+        ({"buffers": [{"uri": "box.bin", "byteLength": 9}]}, "another file"),
+    ],
+)
+def test_a_glb_that_would_be_read_wrongly_is_refused_for_what_it_is(change: dict[str, object], told: str) -> None:
+    with pytest.raises(MeshError, match=told):
+        read_mesh("m.glb", quantised(False, change))
+
+
+def test_a_glb_with_variants_of_materials_is_read() -> None:
+    variants = {"extensionsUsed": ["KHR_materials_variants"]}
+    assert len(read_mesh("m.glb", quantised(False, variants)).faces) == 12

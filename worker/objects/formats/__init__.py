@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import struct
 from collections.abc import Callable
 from pathlib import PurePosixPath
 from typing import Final
@@ -12,6 +14,7 @@ from service.model.errors import GraspdError, MeshError
 from worker.objects.formats import dae, glb, obj, off, ply, stl
 from worker.objects.formats.mtl import Nearby, nothing_nearby
 from worker.objects.formats.soup import MAX_FACES, Soup, check_soup
+from worker.objects.stand_ins import refuse_stand_in
 
 __all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 
@@ -48,17 +51,28 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
         raise MeshError(f"{filename}: meshes of type {suffix or '(none)'} are not read; convert to one of {known}")
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
+    refuse_stand_in(filename, data, MeshError)
     try:
         # Wild numbers are found by the check below, not by NumPy's warnings.
         with np.errstate(all="ignore"):
             looks = _WITH_LOOKS.get(suffix)
-            return check_soup(looks(data, nearby) if looks else reader(data))
+            text = _marked_text(data)
+            return check_soup(looks(text, nearby) if looks else reader(text))
     except GraspdError as error:
         raise type(error)(f"{filename}: {error}") from None
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error):
         # Readers lean on NumPy and json for the odd cases: whatever they choke on is the file's fault.
-        raise MeshError(f"{filename}: not a readable {suffix[1:].upper()} file ({_one_line(error)})") from None
+        kind = suffix[1:].upper()
+        raise MeshError(
+            f"{filename}: not a readable {kind} file: a number or word in it is none that {kind} has there; export the "
+            "mesh again"
+        ) from None
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__
+def _marked_text(data: bytes) -> bytes:
+    """Data without the byte order mark of a text: editors write it, and formats do not have it."""
+    if data.startswith(codecs.BOM_UTF8):
+        return data[len(codecs.BOM_UTF8) :]
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16").encode()
+    return data

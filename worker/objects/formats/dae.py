@@ -17,7 +17,8 @@ from defusedxml.common import DefusedXmlException
 
 from service.model.errors import MeshError
 from worker.objects.formats.mtl import Nearby, colour_of, nothing_nearby
-from worker.objects.formats.soup import Soup, check_face_count, fan
+from worker.objects.formats.polygons import triangulate
+from worker.objects.formats.soup import Soup, check_face_count
 
 _MAX_DEPTH: Final = 32
 _MAX_NODES: Final = 10_000
@@ -113,7 +114,7 @@ class _Library:
                 corners = order[int(source.get("offset", "0")) :: stride]
                 if int(counts.sum()) != len(corners) or (counts < 0).any():
                     raise MeshError("a primitive promises other corners than it has; export the mesh again")
-                yield points, fan(counts, corners), primitive.get("material", "")
+                yield points, triangulate(points, counts, corners), primitive.get("material", "")
 
     def _points(self, reference: str | None) -> np.ndarray:
         source = self.named(reference)

@@ -14,20 +14,29 @@ from worker.objects.formats.glb_colours import material_colour
 from worker.objects.formats.soup import Soup, check_face_count
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
-_FLOAT, _TRIANGLES, _MAX_DEPTH = 5126, 4, 32
+#: Positions are floats, or with KHR_mesh_quantization whole numbers that nodes or `normalized` scale.
+_POSITION_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_TRIANGLES, _MAX_DEPTH = 4, 32
+#: Extensions that move no vertex; any other one that a file requires is refused by its name.
+_HARMLESS = ("KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_xmp_")
 _MAX_INSTANCES = 10_000
 
 
 def read(data: bytes) -> Soup:
     """Vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     document, binary = _chunks(data)
+    for name in _list(document, "extensionsRequired"):
+        _refuse_extension(str(name))
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colours: list[np.ndarray] = []
     looks: dict[tuple[int, int], np.ndarray] = {}
     total = 0
     for mesh, matrix in _instances(document):
-        for part, primitive in enumerate(_list(document, "meshes")[mesh]["primitives"]):
+        shown = _list(document, "meshes")[mesh]
+        if any(shown.get("weights", [])):
+            raise MeshError("a mesh has morph targets with weights; apply its shape keys and export it without")
+        for part, primitive in enumerate(shown["primitives"]):
             points, triangles = _primitive(document, binary, primitive)
             if np.linalg.det(matrix[:3, :3]) < 0:
                 triangles = triangles[:, ::-1]
@@ -78,6 +87,9 @@ def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
             raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
         node = nodes[index]
         matrix = parent @ _matrix(node)
+        _refuse_extensions(node)
+        if "skin" in node:
+            raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
         if "mesh" in node:
             found.append((int(node["mesh"]), matrix))
         stack += [(int(child), matrix, depth + 1) for child in node.get("children", [])]
@@ -98,8 +110,7 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 def _primitive(document: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
         raise MeshError("only triangles are read; export without points, lines, strips and fans")
-    if primitive.get("extensions"):
-        raise MeshError("compressed primitives are not read; export without Draco or quantisation")
+    _refuse_extensions(primitive)
     points = _accessor(document, binary, primitive["attributes"]["POSITION"], "VEC3")
     if "indices" in primitive:
         order = _accessor(document, binary, primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
@@ -114,11 +125,11 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
     accessor = _list(document, "accessors")[int(index)]
     if "sparse" in accessor or accessor.get("type") != shape or "bufferView" not in accessor:
         raise MeshError(f"an accessor is sparse, without data or not {shape}; export plain buffers")
-    kind = accessor["componentType"]
-    dtype = np.dtype("<f4") if shape == "VEC3" and kind == _FLOAT else np.dtype(_INDEX_TYPES[kind])
+    dtype = np.dtype((_POSITION_TYPES if shape == "VEC3" else _INDEX_TYPES)[accessor["componentType"]])
     width = 3 if shape == "VEC3" else 1
     view = _list(document, "bufferViews")[int(accessor["bufferView"])]
-    if view.get("buffer", 0) != 0:
+    _refuse_extensions(view)
+    if view.get("buffer", 0) != 0 or "uri" in (_list(document, "buffers") or [{}])[0]:
         raise MeshError("the data lie in another file; export one GLB that holds everything")
     count, item = int(accessor["count"]), dtype.itemsize * width
     stride = int(view.get("byteStride", item))
@@ -130,7 +141,21 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
     rows = np.lib.stride_tricks.as_strided(
         np.frombuffer(binary, np.uint8, offset=start), (count, item), (stride, 1), writeable=False
     )
-    return np.ascontiguousarray(rows).view(dtype).reshape(count, width)
+    found = np.ascontiguousarray(rows).view(dtype).reshape(count, width)
+    if accessor.get("normalized") and dtype.kind in "iu":
+        return np.maximum(found / np.iinfo(dtype).max, -1.0)
+    return found
+
+
+def _refuse_extensions(part: dict[str, Any]) -> None:
+    for name in part.get("extensions", {}):
+        _refuse_extension(name)
+
+
+def _refuse_extension(name: str) -> None:
+    if not name.startswith(_HARMLESS):
+        how = "without compression" if "draco" in name or "meshopt" in name else "without it"
+        raise MeshError(f"the glTF extension {name[:60]} is not read; export {how}")
 
 
 def _list(document: dict[str, Any], key: str) -> list[Any]:

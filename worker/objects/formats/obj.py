@@ -10,14 +10,15 @@ from service.model.errors import MeshError
 from service.store.mesh_looks import MAX_NAMES
 from worker.objects.formats import mtl
 from worker.objects.formats.mtl import Nearby, nothing_nearby
-from worker.objects.formats.soup import Soup, check_face_count, fan
+from worker.objects.formats.polygons import triangulate
+from worker.objects.formats.soup import Soup, check_face_count
 
 _SHADES = 8
 _NO_COLOUR = [b"nan", b"nan", b"nan"]
 
 
 def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
-    """Polygons cut into fans; negative indices count from the latest vertex. A face has its corners' mean colour, or
+    """Triangles of the polygons; negative indices count from the latest vertex. A face has its corners' mean colour, or
     where they have none that of its material."""
     vertices: list[list[bytes]] = []
     shades: list[list[bytes]] = []
@@ -44,7 +45,7 @@ def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
         elif line.startswith(b"mtllib ") and len(libraries) < MAX_NAMES:
             libraries.append(line[7:].strip())
     points = np.array(vertices, dtype="S40").astype(float).reshape(-1, 3)
-    faces = fan(np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64))
+    faces = triangulate(points, np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64))
     shown = _face_colours(shades, faces)
     if used and libraries:
         shown = _material_colours(used, libraries, nearby, np.array(counts, np.int64), shown)
@@ -70,7 +71,7 @@ def _material_colours(
     row = {name: 1 + number for number, name in enumerate(names)}
     palette = np.array([unknown, *(known.get(name, unknown) for name in names)])
     starts = np.array([first for first, _ in used])
-    # Polygons before the first `usemtl` have no material; each becomes as many triangles as `fan` makes of it.
+    # Polygons before the first `usemtl` have no material; each becomes as many triangles as `triangulate` makes of it.
     material = np.array([0, *(row[name] for _, name in used)])
     of_polygon = material[np.searchsorted(starts, np.arange(len(counts)), side="right")]
     colours = palette[np.repeat(of_polygon, np.maximum(counts - 2, 0))]
@@ -96,7 +97,11 @@ def _index(text: bytes, count: int) -> int:
 def _lines(data: bytes) -> Iterable[bytes]:
     pending = b""
     for raw in data.splitlines():
-        line = pending + raw.strip()
+        line = raw.strip()
+        if not line.startswith((b"usemtl", b"mtllib")):
+            # A comment may end in a backslash, a path say, and continues nothing.
+            line = line.partition(b"#")[0].rstrip()
+        line = pending + line
         if line.endswith(b"\\"):
             pending = line[:-1] + b" "
             if len(pending) > 2**20:

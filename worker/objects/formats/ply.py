@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.model.errors import MeshError
-from worker.objects.formats.soup import Soup, check_face_count, fan
+from worker.objects.formats.polygons import triangulate
+from worker.objects.formats.soup import Soup, check_face_count
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -36,11 +37,11 @@ def read(data: bytes) -> Soup:
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0 or end > 65536:
         raise MeshError("a PLY file begins with the word ply and a header of at most 64 KiB")
-    start = data.find(b"\n", end) + 1
+    start = data.index(_line_end(data), end) + len(_line_end(data))
     order, elements = _header(data[:end].decode("ascii", "replace").splitlines()[1:])
     body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
     vertices = np.zeros((0, 3))
-    faces = np.zeros((0, 3), dtype=np.int64)
+    polygons = (np.zeros(0, np.int64), np.zeros(0, np.int64))
     for element in elements:
         scalars, lists = body.read(element)
         if element.name == "vertex":
@@ -49,8 +50,14 @@ def read(data: bytes) -> Soup:
             name = next((p.name for p in element.properties if p.count_type and p.name.startswith("vertex_ind")), None)
             if name is None:
                 raise MeshError("the faces have no list vertex_indices")
-            faces = fan(*lists[name])
-    return Soup(vertices, faces)
+            polygons = lists[name]
+    return Soup(vertices, triangulate(vertices, *polygons))
+
+
+def _line_end(data: bytes) -> bytes:
+    """How lines of the header end: what follows `end_header` may be binary and begin with any byte."""
+    line = data[: data.find(b"end_header")]
+    return next((end for end in (b"\r\n", b"\n", b"\r") if end in line), b"\n")
 
 
 def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:

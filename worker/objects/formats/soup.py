@@ -58,16 +58,3 @@ def check_face_count(count: int) -> None:
     """LimitError for more faces than are taken."""
     if count > MAX_FACES:
         raise LimitError(f"{count} faces; at most {MAX_FACES} are taken: decimate the mesh first")
-
-
-def fan(counts: NDArray[np.int64], corners: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles (F, 3) of polygons with `counts` corners each, laid out one after another in `corners`.
-
-    Faces with fewer than three corners are dropped.
-    """
-    triangles = np.maximum(counts - 2, 0)
-    check_face_count(int(triangles.sum()))
-    starts = np.cumsum(counts) - counts
-    start = np.repeat(starts, triangles)
-    step = np.arange(len(start)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
