@@ -38,6 +38,11 @@ def asset_check(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/check.json"
 
 
+def hand_expanded(digest: str) -> str:
+    """The URDF that a hand's xacro file expanded to when it was first read."""
+    return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.urdf"
+
+
 def asset_model(kind: AssetKind, digest: str) -> str:
     """The prepared hand or object as binary glTF, for viewers."""
     return f"{ASSETS}/{kind.value}/{digest}/model.glb"

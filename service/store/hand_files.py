@@ -118,13 +118,16 @@ def _named_by(path: Path, root: Path, seen: frozenset[Path] = frozenset()) -> se
 
 
 def _names(reference: str, base: str, folders: Iterable[str]) -> set[str]:
-    """Names that a reference may mean: the folders of a ROS package, and those above it, may be there or not."""
-    scheme, separator, rest = reference.partition("://")
-    inside = rest if separator else reference
+    """Names that a reference may mean: the folders of a ROS package, and those above it, may be there or not.
+
+    `worker.hands.references.find_mesh` chooses among them.
+    """
+    scheme, separator, rest = reference.replace("\\", "/").partition("://")
+    inside = (rest.lstrip("/") if scheme == "file" else rest) if separator else scheme
     if not inside or inside.startswith("/") or "\0" in inside:
         return set()
     parts = inside.split("/")
-    tails = ["/".join(parts[start:]) for start in range(len(parts) if scheme == "package" else 1)]
+    tails = ["/".join(parts[start:]) for start in range(len(parts) if separator else 1)]
     names = {posixpath.normpath(posixpath.join(base, folder, tail)) for tail in tails for folder in folders}
     return {name for name in names | set(map(posixpath.normpath, tails)) if not name.startswith("..")}
 

@@ -16,7 +16,7 @@ from worker.hands.options import HandOptions, parse_options
 from worker.hands.read import read_robot
 from worker.hands.robot import Robot
 from worker.hands.surface import sample_surface
-from worker.hands.tree import joints_above
+from worker.hands.tree import build_tree, joints_above, passed_limits
 
 #: Points with which the outer surface is measured.
 _SURFACE_POINTS = 512
@@ -53,7 +53,7 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     if (jaws := jaws_of(hand)) is not None:
         facts["opening_m"] = round(jaws.opening, 6)
         message += f"; opens {1e3 * jaws.opening:.0f} mm"
-    notes = [*robot.notes, *_tendons(hand), *_left_out(robot, hand, settings)]
+    notes = [*robot.notes, *_tendons(hand), *_limits(robot, settings), *_left_out(robot, hand, settings)]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
 
@@ -64,6 +64,14 @@ def _tendons(hand: HandModel) -> list[str]:
     return (
         [f"{', '.join(pairs)} on one tendon each" if len(pairs) > 1 else f"{pairs[0]} on one tendon"] if pairs else []
     )
+
+
+def _limits(robot: Robot, settings: HandOptions) -> list[str]:
+    """What a user must know of joints that their limits do not hold, or hold in one place."""
+    tree = build_tree(robot, settings)
+    passed = passed_limits(robot, tree, settings)
+    notes = [f"limits of {', '.join(passed)} are not used, as in ROS: they follow other joints"] if passed else []
+    return notes + ([f"{', '.join(tree.still)} cannot move: the limits leave one value"] if tree.still else [])
 
 
 def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from service.model.digests import digest_files, digest_variant
 from service.model.errors import HandError, InputError, NotFoundError
 from service.model.states import AssetKind
+from service.model.suggestions import did_you_mean
 from service.model.transforms import compose
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack, without_common_folder
 from service.store.hand_files import files_of_hand
@@ -230,8 +231,9 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
     if not path.is_file() and str(path) in builtin_names(AssetKind.HAND):
         return str(path), builtin_files(AssetKind.HAND, str(path)), {}
     if not path.exists():
-        known = ", ".join(builtin_names(AssetKind.HAND))
-        raise NotFoundError(f"{path} is neither a file nor a built-in hand ({known})")
+        known = builtin_names(AssetKind.HAND)
+        meant = did_you_mean(str(path), known)
+        raise NotFoundError(f"{path} is neither a file nor a built-in hand ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
         from service.settings import Settings
 

@@ -47,7 +47,13 @@ def follow_loops(model: Any, found: dict[int, Mimic | float], name: Callable[[in
             drivers = [j for j in joints if j in found and not isinstance(found[j], float)]
         if len(drivers) != 1:
             held = ", ".join(name(j) for j in joints)
-            raise HandError(f"the loop of {held} has {len(drivers)} drivers; give one of them an actuator")
+            if not drivers:
+                raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
+            many = " and ".join(name(j) for j in drivers)
+            raise HandError(
+                f"the loop of {held} has {len(drivers)} drivers ({many}), and only loops of one are solved; leave one "
+                "actuator in it, or write equalities of joints instead of the loop"
+            )
         values, followers = _solve(model, group, drivers[0], passive, name)
         worst = 0.0
         for joint, follower in zip(passive, followers.T, strict=True):

@@ -65,6 +65,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
         if element.tag == "default":
             # MuJoCo refuses what else stands there; others pass over it.
             element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
+    notes = _spatial_drives(root)
     _prune(root)
     _prune_actuators(root)
     compiler = root.find("compiler")
@@ -73,11 +74,22 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     # Frames without mass are common in hands and stop MuJoCo's reader.
     compiler.set("boundmass", compiler.get("boundmass", "1e-9"))
     compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
-    notes = []
     if _means_radians(root):
         compiler.set("angle", "radian")
         notes.append('angles read as radians: in degrees no joint would turn (say so: <compiler angle="degree"/>)')
     return ElementTree.tostring(root, encoding="unicode"), assets, notes
+
+
+def _spatial_drives(root: Element) -> list[str]:
+    """What a user must know of actuators on tendons that run over sites: these are not modelled."""
+    spatial = {tendon.get("name") for tendon in root.iter("spatial")}
+    names = [
+        f"{one.get('name') or one.get('tendon')}" for one in root.iterfind("actuator/*") if one.get("tendon") in spatial
+    ]
+    if not names:
+        return []
+    shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return [f"{shown} on spatial tendons, which are passed over: joints are planned as if each had a drive of its own"]
 
 
 def _means_radians(root: Element) -> bool:

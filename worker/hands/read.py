@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from service.model.errors import HandError
 from service.store.hand_main import format_of
 from worker.hands.robot import Robot
 from worker.hands.urdf import read_urdf
 from worker.hands.xacro import expand
+from worker.objects.stand_ins import refuse_stand_in
 
 
 def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
@@ -21,6 +23,7 @@ def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, st
     Raises:
         HandError, LimitError: see the readers.
     """
+    refuse_stand_in(main, files[main], HandError)
     match format_of(main, files[main]):
         case "mjcf":
             from worker.hands.mjcf import read_mjcf

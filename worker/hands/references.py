@@ -19,11 +19,11 @@ def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -
     Raises:
         HandError: it is not there, or lies outside the upload.
     """
-    scheme, separator, rest = filename.partition("://")
-    path = rest if separator else filename
+    scheme, separator, rest = filename.replace("\\", "/").partition("://")
+    path = rest if separator else scheme
     if separator and scheme not in ("package", "model", "file"):
         raise HandError(f"mesh {filename!r} of link {link!r} is no file of this hand; put it beside the URDF")
-    path = path.lstrip("/") if scheme == "file" else path.replace("\\", "/")
+    path = path.lstrip("/") if scheme == "file" else path
     try:
         # A package is no folder of the URDF's: dots in its path count from the package.
         path = _inside(path, "" if separator else base) if ".." in path else check_path(path)

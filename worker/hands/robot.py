@@ -6,7 +6,7 @@ Every value was checked by the reader, so that nothing behind it has to.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -64,7 +64,7 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint; the axis has length 1, limits are finite and ordered for moving joints."""
+    """A joint; the axis has length 1, limits are finite and ordered for joints that move."""
 
     name: str
     type: str
@@ -77,6 +77,8 @@ class Joint:
     effort: float
     """[N m or N]; 0: not stated."""
     mimic: Mimic | None
+    """What it follows. The limits of a URDF's follower do not count, as in ROS: in most published grippers they are
+    junk."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""
     stiffness: float = 0.0
@@ -85,6 +87,13 @@ class Joint:
     """Inertia that the drive adds [kg m^2 or kg]; 0: not stated."""
     dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)
     """[N m or N]; 0: not stated."""
+    fault: str = field(default="", metadata=TOLD_IF_SET)
+    """Refusal of a hand that moves by this joint; above a hand it stands still, and does not matter."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is a joint that a hand can have, and none that is fixed."""
+        return self.type in MOVING and not self.fault
 
 
 @dataclass(frozen=True)
@@ -130,8 +139,11 @@ def build_robot(
     if len(link_of) > MAX_LINKS or sum(len(link.shapes) for link in link_of.values()) > MAX_SHAPES:
         raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
     root = _check_tree(link_of, joint_of, filename)
-    _check_mimics(joint_of, filename)
-    if not any(joint.type in MOVING for joint in joint_of.values()):
+    _check_limits(joint_of.values(), filename)
+    joint_of = {name: _checked_mimic(joint, joint_of, filename) for name, joint in joint_of.items()}
+    if not any(joint.moves for joint in joint_of.values()):
+        if faults := [joint.fault for joint in joint_of.values() if joint.fault]:
+            raise HandError(faults[0])
         raise HandError(f"{filename}: no moving joint; a hand needs at least one revolute or prismatic joint")
     if not any(link.shapes for link in link_of.values()):
         add = "add <collision> elements" if fmt == "URDF" else "give geoms a contype and conaffinity"
@@ -161,6 +173,13 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
         parent_of[joint.child] = joint.parent
     roots = [name for name in links if name not in parent_of]
     if len(roots) != 1:
+        if not links:
+            raise HandError(
+                f"{filename}: it expands to no link at all: it only defines macros (give the file that calls them), or "
+                "an <include> lacks its xacro: prefix"
+                if filename.endswith(".xacro")
+                else f"{filename}: it holds no link; give the description of a hand"
+            )
         found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
         raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
     for link in links:
@@ -173,14 +192,26 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
     return roots[0]
 
 
-def _check_mimics(joints: dict[str, Joint], filename: str) -> None:
-    for joint in joints.values():
-        seen, at = {joint.name}, joint
-        while at.mimic is not None:
-            target = joints.get(at.mimic.joint)
-            if target is None or target.type not in MOVING:
-                raise HandError(f"{filename}: joint {at.name!r} mimics {at.mimic.joint!r}, which is no moving joint")
-            if target.name in seen:
-                raise HandError(f"{filename}: joint {target.name!r} mimics itself through a cycle; free one joint")
+def _check_limits(joints: Iterable[Joint], filename: str) -> None:
+    """Exporters of CAD programs leave limits at zero where nobody states them."""
+    limited = [joint for joint in joints if joint.moves and joint.type != "continuous" and joint.mimic is None]
+    if limited and all(joint.lower == joint.upper == 0 for joint in limited):
+        many = f"all {len(limited)} joints have" if len(limited) > 1 else f"joint {limited[0].name!r} has"
+        raise HandError(f"{filename}: {many} limits 0 .. 0: the exporter left them empty; fill them in")
+
+
+def _checked_mimic(joint: Joint, joints: dict[str, Joint], filename: str) -> Joint:
+    """The joint; one that follows nothing that moves has that as its fault."""
+    seen, at = {joint.name}, joint
+    while at.mimic is not None:
+        target = joints.get(at.mimic.joint)
+        if target is None or not (target.moves or target.fault):
+            fault = f"{filename}: joint {at.name!r} mimics {at.mimic.joint!r}, which is no moving joint"
+        elif target.name in seen:
+            fault = f"{filename}: joint {target.name!r} mimics itself through a cycle; free one joint"
+        else:
             seen.add(target.name)
             at = target
+            continue
+        return replace(joint, fault=fault, mimic=None)
+    return joint

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +16,9 @@ from worker.hands.options import HandOptions
 from worker.hands.robot import UNLIMITED_M, Joint, Mimic, Robot, chain_to
 from worker.hands.roots import pick_root
 from worker.hands.tendons import check_tendons
+
+#: A joint with a smaller range stands still [rad or m].
+LEAST_RANGE: Final = 1e-5
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,8 @@ class Tree:
     lower: Floats
     upper: Floats
     velocity: Floats
+    still: tuple[str, ...]
+    """Joints that their limits leave one value, in which they stand."""
     known: frozenset[str]
     """Names of all joints and links of the robot, dropped and frozen ones too."""
 
@@ -64,7 +71,12 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     mimics |= {name: Mimic(c.of, c.multiplier, c.offset) for name, c in options.couplings.items()}
     root = pick_root(robot, options)
     kept = _kept_joints(robot, root, set(options.drop))
-    drives = {j.name: _resolve(j.name, mimics, robot, options) for j in kept if j.type != "fixed"}
+    for joint in kept:
+        if joint.fault and joint.name not in options.fix:
+            raise HandError(joint.fault)
+    still = {name: robot.joints[name].lower for name in _still(kept, mimics) if name not in options.fix}
+    fixed = still | options.fix
+    drives = {j.name: _resolve(j.name, mimics, fixed) for j in kept if j.type != "fixed"}
     frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
     moving = {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
     for name, drive in moving.items():
@@ -74,11 +86,13 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
         raise HandError("no moving joint is left; fix or drop less")
     names = tuple(name for name in robot.joints if name in moving)
     dofs = tuple(name for name in names if moving[name].dof == name)
-    lower, upper = np.array([_fold_limits(dof, moving, robot) for dof in dofs]).T
+    lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
     velocity = np.array([_fold_velocity(dof, moving, robot) for dof in dofs])
     known = frozenset(robot.joints) | frozenset(robot.links)
     bodies, parents, joints, origins, links = _walk(robot, root, kept, frozen)
-    return Tree(bodies, parents, joints, origins, links, moving, names, dofs, lower, upper, velocity, known)
+    return Tree(
+        bodies, parents, joints, origins, links, moving, names, dofs, lower, upper, velocity, tuple(still), known
+    )
 
 
 def _check_names(robot: Robot, options: HandOptions) -> None:
@@ -113,7 +127,16 @@ def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     return [joint for joint in robot.joints.values() if joint.name in kept]
 
 
-def _resolve(name: str, mimics: dict[str, Mimic | None], robot: Robot, options: HandOptions) -> Drive | float:
+def _still(kept: Iterable[Joint], mimics: Mapping[str, Mimic | None]) -> list[str]:
+    """Joints that follow nothing and whose limits leave them one value."""
+    return [
+        joint.name
+        for joint in kept
+        if joint.moves and mimics[joint.name] is None and joint.upper - joint.lower < LEAST_RANGE
+    ]
+
+
+def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Drive | float:
     """The drive of a joint through a chain of mimics, or its constant value if the chain ends at a fixed joint.
 
     q = m1 (m2 (... ) + o2) + o1, so the multipliers multiply and each offset is scaled by those before it.
@@ -121,8 +144,8 @@ def _resolve(name: str, mimics: dict[str, Mimic | None], robot: Robot, options: 
     multiplier, offset, at = 1.0, 0.0, name
     seen = {name}
     while True:
-        if at in options.fix:
-            return multiplier * options.fix[at] + offset
+        if at in fixed:
+            return multiplier * fixed[at] + offset
         mimic = mimics[at]
         if mimic is None:
             break
@@ -135,22 +158,47 @@ def _resolve(name: str, mimics: dict[str, Mimic | None], robot: Robot, options: 
     return Drive(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
 
 
-def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot) -> tuple[float, float]:
-    """Range of a dof in which every joint that follows it stays inside its own limits."""
+def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: HandOptions) -> tuple[float, float]:
+    """Range of a dof in which every joint that follows it stays inside its own limits; see `_binds`."""
     lower, upper = -math.inf, math.inf
+    narrowest = dof
     for name, drive in moving.items():
         if drive.dof != dof:
             continue
         joint = robot.joints[name]
+        if not _binds(joint, drive, robot, options):
+            continue
         if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
             raise HandError(f"joint {name!r} slides without a range; give it one, or fix it: --fix {name}=0")
         ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
+        if ends[0] > lower or ends[1] < upper:
+            narrowest = name
         lower, upper = max(lower, ends[0]), min(upper, ends[1])
-    if lower > upper:
+    if upper - lower < LEAST_RANGE and narrowest != dof:
+        joint, drive = robot.joints[narrowest], moving[narrowest]
         raise HandError(
-            f"the limits of the joints that follow {dof!r} leave it no room; correct the coupling or limits"
+            f"joint {narrowest!r} may only go {joint.lower:g} .. {joint.upper:g}, but follows {dof!r} with "
+            f"{drive.multiplier:g}, which leaves {dof!r} no room; correct the coupling or its limits"
         )
     return lower, upper
+
+
+def _binds(joint: Joint, drive: Drive, robot: Robot, options: HandOptions) -> bool:
+    """Whether a joint's own limits hold it. Those of a URDF's follower do not, as in ROS: most of them are junk."""
+    return joint.name == drive.dof or robot.format != "URDF" or joint.name in options.couplings
+
+
+def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
+    """Joints that follow another farther than their own limits, which do not bind them."""
+    found = []
+    for name in tree.joint_names:
+        joint, drive = robot.joints[name], tree.drives[name]
+        if not _binds(joint, drive, robot, options):
+            at = tree.dof_names.index(drive.dof)
+            ends = sorted(drive.multiplier * end + drive.offset for end in (tree.lower[at], tree.upper[at]))
+            if ends[0] < joint.lower - LEAST_RANGE or ends[1] > joint.upper + LEAST_RANGE:
+                found.append(name)
+    return found
 
 
 def _fold_velocity(dof: str, moving: dict[str, Drive], robot: Robot) -> float:

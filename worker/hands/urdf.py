@@ -18,7 +18,7 @@ from defusedxml.common import DefusedXmlException
 
 from service.model.errors import HandError, LimitError
 from service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
-from worker.hands.robot import MAX_LENGTH_M, MOVING, Joint, Link, Mimic, Robot, Shape, build_robot
+from worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
 #: Visual elements beyond this many are not drawn.
@@ -137,16 +137,32 @@ def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
     name = _name(element, "joint")
     what = f"joint {name!r}"
     kind = element.get("type", "")
-    if kind != "fixed" and kind not in MOVING:
-        raise HandError(f"{what}: type {kind[:40]!r} cannot be used; a hand has revolute, prismatic and fixed joints")
     ends = [element.find(tag) for tag in ("parent", "child")]
     parent, child = ("" if end is None else end.get("link", "") for end in ends)
     origin = _origin(element, what)
+    still = Joint(name, kind, parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
     if kind == "fixed":
-        return Joint(name, kind, parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
-    lower, upper, effort = _limits(element, kind, what)
-    return Joint(
-        name, kind, parent, child, origin, _axis(element, what, notes), lower, upper, effort, _mimic(element, what),
+        return still
+    try:
+        return _moving(element, still, what, notes)
+    except HandError as error:
+        # It only matters where the hand moves by it.
+        return replace(still, fault=str(error))
+
+
+def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[str]) -> Joint:
+    """The joint with its axis and limits; HandError where no hand can have it."""
+    if still.type not in MOVING:
+        raise HandError(
+            f"{what}: type {still.type[:40]!r} cannot be used; a hand has revolute, prismatic and fixed joints"
+        )
+    mimic = _mimic(element, what)
+    if mimic is None:
+        lower, upper, effort = _limits(element, still.type, what)
+    else:
+        lower, upper, effort = _follower_limits(element, still.type, what)
+    return replace(
+        still, axis=_axis(element, what, notes), lower=lower, upper=upper, effort=effort, mimic=mimic,
         velocity=_velocity(element),
     )  # fmt: skip
 
@@ -188,6 +204,15 @@ def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, 
     if max(abs(lower), abs(upper)) > (4 * math.pi if kind == "revolute" else MAX_LENGTH_M):
         raise HandError(f"{what}: limits {lower:g} .. {upper:g} are too large; give radians and metres")
     return lower, upper, effort
+
+
+def _follower_limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
+    """The limits of a joint that follows another, which do not bind it: where they are junk, none."""
+    try:
+        return _limits(element, kind, what)
+    except HandError:
+        most = UNLIMITED_M if kind == "prismatic" else math.pi
+        return -most, most, 0.0
 
 
 def _mimic(element: ElementTree.Element, what: str) -> Mimic | None:

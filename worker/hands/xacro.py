@@ -51,8 +51,8 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
     command = [sys.executable, "-m", "worker.hands.xacro_child"]
     try:
         done = subprocess.run(
-            command, input=json.dumps(given).encode(), capture_output=True, timeout=_WALL_LIMIT_S, check=False,
-            env=passed_on,
+            command, input=json.dumps(given).encode(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            timeout=_WALL_LIMIT_S, check=False, env={**passed_on, "PYTHONHASHSEED": "0"},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise HandError(f"{main}: expanding it does not end; expand it yourself and give the URDF") from None

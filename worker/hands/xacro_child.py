@@ -35,11 +35,19 @@ class Refused(Exception):
 def main() -> None:
     """Expand the given xacro file on standard output."""
     given = json.loads(sys.stdin.buffer.read())
+    # The library prints what a file tells it to print, without end; only the answer is of interest.
+    answers, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    # `$(cwd)` tells nothing of this machine.
+    os.chdir("/")
     try:
         answer = {"urdf": _expand(given), "error": ""}
     except Exception as error:
         answer = {"urdf": "", "error": _told(error)}
-    os.write(1, json.dumps(answer).encode())
+    data = memoryview(json.dumps(answer).encode())
+    while data:
+        data = data[os.write(answers, data) :]
     os._exit(0)
 
 
@@ -107,6 +115,8 @@ def _expand(given: dict[str, Any]) -> str:
     text = document.toxml()
     if len(text) > given["limit"]:
         raise Refused(f"it expands to {len(text)} characters; at most {given['limit']} are taken")
+    if " object at 0x" in text:
+        raise Refused("an expression gives an object where a text belongs, and another one each time; write list(...)")
     return text
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from service.model.digests import digest_files, digest_variant
 from service.model.errors import MeshError, NotFoundError
 from service.model.states import AssetKind
+from service.model.suggestions import did_you_mean
 from service.store.assets import UNPACK_FACTOR, builtin_files, builtin_names, unpack
 from worker.objects.formats import READERS, read_mesh
 from worker.objects.kept import kept_or_made
@@ -154,8 +155,9 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
     if not path.is_file():
         if str(path) in builtin_names(AssetKind.OBJECT):
             return str(path), builtin_files(AssetKind.OBJECT, str(path)), {}
-        known = ", ".join(builtin_names(AssetKind.OBJECT))
-        raise NotFoundError(f"{path} is neither a file nor a built-in object ({known})")
+        known = builtin_names(AssetKind.OBJECT)
+        meant = did_you_mean(str(path), known)
+        raise NotFoundError(f"{path} is neither a file nor a built-in object ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
         from service.settings import Settings
 

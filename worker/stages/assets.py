@@ -24,6 +24,7 @@ from worker.hands.load import load_hand
 from worker.hands.model import HandModel
 from worker.objects.model import ObjectModel
 from worker.planners.learned.known import keep
+from worker.stages.hand_files import load_hand_files
 from worker.stages.models import SHOWN_ERROR_M, publish_model
 from worker.stages.pieces import pieces_of
 from worker.stages.prepared import prepared_object
@@ -40,7 +41,7 @@ def hand_of(store: Store, message: TaskMessage) -> HandModel:
     key = (store.url, AssetKind.HAND, name, digest)
 
     def load() -> HandModel:
-        hand = load_hand(load_asset_files(store, AssetKind.HAND, digest), name=name, digest=digest)
+        hand = load_hand(load_hand_files(store, digest), name=name, digest=digest)
         publish_model(store, AssetKind.HAND, hand)
         return hand
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.model import names
+from service.model.errors import HandError
 from service.model.messages import IngestMessage
 from service.model.states import AssetKind
 from service.store.assets import pack, unpack
@@ -40,13 +41,23 @@ _MODEL_CPU_S: Final = 8.0
 
 def run(message: IngestMessage, context: TaskContext) -> None:
     """Check the asset and write `check.json`, whatever is found; a refusal is a finding too."""
-    files = load_asset_files(context.store, message.kind, message.digest)
+    files = _files(message, context)
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
         found["facts"]["self_test"] = _self_test(message, files, context)
     if model:
         context.store.put(names.asset_model(message.kind, message.digest), model)
     context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+
+
+def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
+    if message.kind is AssetKind.HAND:
+        from worker.stages.hand_files import load_hand_files
+
+        # What cannot be expanded is refused by the check, which says why.
+        with contextlib.suppress(HandError):
+            return load_hand_files(context.store, message.digest)
+    return load_asset_files(context.store, message.kind, message.digest)
 
 
 def _self_test(message: IngestMessage, files: dict[str, bytes], context: TaskContext) -> dict[str, Any]:
@@ -87,7 +98,9 @@ def check_in_child(
         ) as child:
             code = _wait(child, context, wall_s)
             complaint = (child.stderr.read() if child.stderr else b"")[-4000:].decode(errors="replace")
-        if code == 0 and target.is_file() and target.stat().st_size <= _FINDING_BYTES:
+        if code == 0 and target.is_file() and target.stat().st_size > _FINDING_BYTES:
+            complaint = f"it has more to say than {_FINDING_BYTES >> 20} MiB"
+        elif code == 0 and target.is_file():
             model = target.with_name(_MODEL)
             return dict(json.loads(target.read_bytes())), model.read_bytes() if model.is_file() else b""
         if os.strerror(errno.ENOSPC) in complaint:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import resource
 import subprocess
 import sys
 import zipfile
@@ -13,10 +14,13 @@ import pytest
 from api.uploads import files_of_upload
 from service.model.errors import HandError, InputError
 from service.model.states import AssetKind
+from service.store.library import publish_asset
+from service.store.store import open_store
 from worker.commands.hands import report_hand
 from worker.hands.check import check_hand
 from worker.hands.load import hand_from_path
 from worker.hands.xacro import expand
+from worker.stages.hand_files import load_hand_files
 
 CLAW = """<?xml version="1.0"?>
 <robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -165,3 +169,32 @@ def test_of_several_descriptions_one_is_named(tmp_path: Path) -> None:
         options = f'{{"file": "{said}"}}'
         files = files_of_upload(AssetKind.HAND, "h.zip", packed.getvalue(), limit_bytes=1 << 20, options=options)
         assert b'"urdf/right.urdf"' in files["asset.json"]
+
+
+def test_what_a_file_prints_without_end_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = CLAW.replace("</robot>", "${[xacro.warning('x' * 10**6) for i in range(300)]}</robot>")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert b"<robot" in expand({**FILES, "urdf/claw.urdf.xacro": text.encode()}, "urdf/claw.urdf.xacro", {})
+    # 300 MB are printed; KiB.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
+
+
+def test_the_working_directory_does_not_show_in_an_expansion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = CLAW.replace("<robot", '<robot note="$(cwd)"', 1).encode()
+    monkeypatch.chdir(tmp_path)
+    assert tmp_path.name.encode() not in expand({**FILES, "urdf/claw.urdf.xacro": text}, "urdf/claw.urdf.xacro", {})
+
+
+def test_what_differs_from_expansion_to_expansion_is_refused() -> None:
+    text = CLAW.replace("<robot", '<robot note="${str(map(str, [1]))}"', 1).encode()
+    with pytest.raises(HandError, match="another one each time"):
+        expand({**FILES, "urdf/claw.urdf.xacro": text}, "urdf/claw.urdf.xacro", {})
+
+
+def test_a_hand_in_the_store_is_expanded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    store = open_store("memory://")
+    asset = publish_asset(store, AssetKind.HAND, "claw", {**FILES, "asset.json": b'{"file": "urdf/claw.urdf.xacro"}'})
+    first = load_hand_files(store, asset.digest)
+    assert first["urdf/claw.urdf.xacro"] == expand(FILES, "urdf/claw.urdf.xacro", {})
+    monkeypatch.setattr("worker.stages.hand_files.expand", lambda *_: pytest.fail("expanded again"))
+    assert load_hand_files(store, asset.digest) == first

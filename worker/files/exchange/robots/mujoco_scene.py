@@ -71,7 +71,7 @@ def _restore_digits(tree: Element, spec: Any) -> None:
             source = getattr(spec, tag)(element.get("name")) if element.get("name") else None
             for key, text in element.attrib.items():
                 values = getattr(source, _SPEC_NAMES.get(key, key), None)
-                if not isinstance(values, str) and np.ndim(values) == 1:
+                if values is not None and not isinstance(values, str) and np.ndim(values) == 1:
                     written = text.split()
                     exact = np.asarray(values, float)[: len(written)]
                     if np.allclose(exact, np.array(written, float), rtol=1e-5, atol=1e-9):

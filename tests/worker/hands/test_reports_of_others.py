@@ -1,0 +1,160 @@
+"""Robots as others publish them: what does not matter is passed over, what is wrong is told for what it is."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.worker.hands.mjcfs import FOUR_BAR
+from tests.worker.hands.urdfs import joint, link, robot
+from worker.commands.hands import report_hand
+from worker.hands.check import check_hand
+from worker.hands.load import load_hand
+from worker.hands.model import HandModel
+
+LIMIT = '<limit lower="0" upper="0.04"/>'
+
+
+def jaws(follower: str = LIMIT, drive: str = LIMIT, *more: str) -> bytes:
+    """Two jaws that open 80 mm; the right one follows the left one."""
+    pad = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.01 0.02 0.06"/></geometry></collision>'
+    base = '<collision><geometry><box size="0.12 0.04 0.04"/></geometry></collision>'
+    return robot(
+        *more, link("base", base), link("left", pad), link("right", pad),
+        joint("jl", "base", "left", kind="prismatic", axis="1 0 0", origin="-0.045 0 0", limit=drive),
+        joint("jr", "base", "right", kind="prismatic", axis="1 0 0", origin="0.045 0 0", limit=follower,
+              extra='<mimic joint="jl" multiplier="-1"/>'),
+    )  # fmt: skip
+
+
+def hand(data: bytes, **options: object) -> HandModel:
+    return load_hand({"h.urdf": data}, name="h", digest="0" * 32, options=options)
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        '<limit lower="0" upper="0.04"/>',
+        '<limit lower="0" upper="0"/>',
+        '<limit lower="0" upper="-0.001"/>',
+        '<limit lower="0.04" upper="-0.04"/>',
+        '<limit effort="1" velocity="1"/>',
+        '<limit lower="nan" upper="inf"/>',
+    ],
+    ids=["turned round", "zero", "a sliver", "reversed", "absent", "no numbers"],
+)
+def test_limits_of_a_follower_do_not_hold_its_drive(limit: str) -> None:
+    report = check_hand({"h.urdf": jaws(limit)}, "h")
+    assert report["verdict"] == "accept", report["message"]
+    assert report["facts"]["opening_m"] == pytest.approx(0.08, abs=1e-4)
+    assert hand(jaws(limit)).upper == pytest.approx([0.04])
+
+
+def test_limits_of_a_follower_that_would_bind_are_told() -> None:
+    report = check_hand({"h.urdf": jaws('<limit lower="-0.01" upper="0"/>')}, "h")
+    assert "limits of jr are not used, as in ROS" in report["message"]
+    assert "not used" not in check_hand({"h.urdf": jaws('<limit lower="-0.04" upper="0"/>')}, "h")["message"]
+
+
+def test_a_coupling_of_ones_own_that_leaves_no_room_names_both_joints() -> None:
+    free = jaws().replace(b'<mimic joint="jl" multiplier="-1"/>', b"")
+    report = check_hand({"h.urdf": free}, "h", {"couplings": {"jr": {"of": "jl", "multiplier": -1.0}}})
+    assert report["verdict"] == "refuse"
+    assert "joint 'jr' may only go 0 .. 0.04, but follows 'jl' with -1" in report["message"]
+
+
+def test_a_joint_whose_limits_leave_one_value_stands_still_and_is_told() -> None:
+    wrist = joint("wrist", "left", "tip", limit='<limit lower="0.2" upper="0.2"/>')
+    report = check_hand({"h.urdf": jaws().replace(b"</robot>", (link("tip") + wrist + "</robot>").encode())}, "h")
+    assert report["verdict"] == "accept" and report["facts"]["dofs"] == ["jl"]
+    assert "wrist cannot move: the limits leave one value" in report["message"]
+
+
+@pytest.mark.parametrize("limit", ['<limit lower="0" upper="0"/>', '<limit lower="0.0" upper="-0.0"/>'])
+def test_limits_that_were_left_empty_are_told_as_that(limit: str) -> None:
+    message = check_hand({"h.urdf": jaws(limit, limit)}, "h")["message"]
+    assert "joint 'jl' has limits 0 .. 0: the exporter left them empty" in message
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+@pytest.mark.parametrize("root", [None, "base"])
+def test_a_free_joint_above_the_hand_does_not_matter_and_is_told(kind: str, root: str | None) -> None:
+    above = f'<joint name="free" type="{kind}"><parent link="world"/><child link="base"/></joint>'
+    data = jaws(LIMIT, LIMIT, '<link name="world"/>', above)
+    report = check_hand({"h.urdf": data}, "h", {"root": root} if root else {})
+    assert report["verdict"] == "accept" and report["facts"]["root"] == "base"
+    assert ("free above the palm left out" in report["message"]) == (root is None)
+
+
+def test_a_free_joint_within_the_hand_is_refused_by_its_name() -> None:
+    loose = '<link name="ball"/><joint name="loose" type="floating"><parent link="base"/><child link="ball"/></joint>'
+    message = check_hand({"h.urdf": jaws().replace(b"</robot>", (loose + "</robot>").encode())}, "h")["message"]
+    assert "joint 'loose': type 'floating' cannot be used" in message
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "meshes\\pad.stl", ".\\meshes\\pad.stl", "package://any/meshes/pad.stl", "model:\\\\any\\meshes\\pad.stl",
+        "file:///meshes/pad.stl", "model://meshes/pad.stl",
+    ],
+)  # fmt: skip
+def test_a_file_and_its_folder_are_read_by_one_rule(written: str, tmp_path: Path, box_stl: bytes) -> None:
+    mesh = f'<collision><geometry><mesh filename="{written}"/></geometry></collision>'
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "pad.stl").write_bytes(box_stl)
+    (tmp_path / "h.urdf").write_bytes(jaws().replace(b'<link name="left">', f'<link name="left">{mesh}'.encode()))
+    reports = [report_hand(str(path)) for path in (tmp_path / "h.urdf", tmp_path)]
+    assert [report["verdict"] for report in reports] == ["accept", "accept"], reports[0]["message"]
+
+
+@pytest.fixture
+def box_stl() -> bytes:
+    import trimesh
+
+    return bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
+
+
+@pytest.mark.parametrize("name", ["h.urdf", "h.xacro", "h.xml"])
+def test_a_pointer_to_a_description_is_told_for_what_it_is(name: str) -> None:
+    data = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"
+    report = check_hand({name: data}, "h", {"file": name})
+    assert report["verdict"] == "refuse"
+    assert f"{name} is a Git LFS pointer, not the file itself: git lfs pull" in report["message"]
+
+
+def test_a_xacro_that_only_defines_macros_is_told_as_that() -> None:
+    text = b'<robot name="h" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:macro name="m" params=""/></robot>'
+    message = check_hand({"h.xacro": text}, "h")["message"]
+    assert "expands to no link at all: it only defines macros" in message and "cycle" not in message
+
+
+@pytest.mark.parametrize(
+    ("drives", "told"),
+    [
+        (("drive", "back"), "has 2 drivers (drive and back), and only loops of one are solved"),
+        ((), "has no driver; give one of its joints an actuator"),
+    ],
+)
+def test_drivers_of_a_loop_are_counted_truly(drives: tuple[str, ...], told: str) -> None:
+    actuators = "".join(f'<position joint="{name}" kp="5"/>' for name in (*drives, "thumb"))
+    text = re.sub("<actuator>.*</actuator>", f"<actuator>{actuators}</actuator>", FOUR_BAR, flags=re.DOTALL)
+    assert told in check_hand({"h.xml": text.encode()}, "h")["message"]
+
+
+def test_actuators_on_spatial_tendons_are_told() -> None:
+    thumb = '<body name="thumb" pos="-0.02 0 0.01">'
+    sites = FOUR_BAR.replace(thumb, f'<site name="a"/>{thumb}<site name="b" pos="0 0 0.03"/>')
+    tendon = '<tendon><spatial name="cord"><site site="a"/><site site="b"/></spatial></tendon><actuator>'
+    text = sites.replace("<actuator>", tendon)
+    text = text.replace('<position joint="thumb" kp="5"/>', '<motor name="pull" tendon="cord"/>')
+    report = check_hand({"h.xml": text.encode()}, "h")
+    assert report["verdict"] == "accept"
+    assert any("pull on spatial tendons, which are passed over" in note for note in report["facts"]["notes"])
+    assert not any("spatial" in note for note in check_hand({"h.xml": FOUR_BAR.encode()}, "h")["facts"]["notes"])
+
+
+def test_a_name_that_is_nearly_a_built_in_is_answered_with_that() -> None:
+    assert report_hand("alegro")["message"].endswith("; did you mean allegro?")
