@@ -63,6 +63,12 @@ def old_include(folder: Path, _: Path) -> None:
     refused(report_hand(str(folder / "urdf" / "three.urdf.xacro")), "expands to no link at all", "xacro: prefix")
 
 
+def radial_palm(folder: Path, _: Path) -> None:
+    facts = accepted(report_hand(str(folder / "three.urdf")))["facts"]
+    assert facts["palm_approach"] == [0, 0, 1] and facts["palm_centre"] == pytest.approx([0, 0, 0], abs=1e-6)
+    assert set(facts["closing"].values()) == {1}
+
+
 def glued_header(folder: Path, _: Path) -> None:
     facts = [
         accepted(report_object(str(folder / f"{name}.off")))["facts"] for name in ("monitor_like", "same_with_newline")
@@ -108,6 +114,7 @@ CASES: dict[str, Callable[[Path, Path], None]] = {
     "H04_follower_limits_junk": follower_limits,
     "H06_backslashes": backslashes,
     "H12b_xacro_old_include": old_include,
+    "H16_radial_palm": radial_palm,
     "O01_off_header_glued": glued_header,
     "O02_concave_ngon": concave_polygons,
     "O04b_inline_comment": inline_comment,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.model.errors import InputError
+from worker.hands.guess import approach_is_tied
 from worker.hands.jaws import jaws_of
 from worker.hands.load import assemble, assumed_efforts, main_file
 from worker.hands.model import HandModel
@@ -53,7 +54,13 @@ def check_hand(files: Mapping[str, bytes], name: str, options: Mapping[str, Any]
     if (jaws := jaws_of(hand)) is not None:
         facts["opening_m"] = round(jaws.opening, 6)
         message += f"; opens {1e3 * jaws.opening:.0f} mm"
-    notes = [*robot.notes, *_tendons(hand), *_limits(robot, settings), *_left_out(robot, hand, settings)]
+    notes = [
+        *robot.notes,
+        *_tie(hand, settings),
+        *_tendons(hand),
+        *_limits(robot, settings),
+        *_left_out(robot, hand, settings),
+    ]
     facts["notes"] = notes
     return {"verdict": "accept", "message": "; ".join([message, *notes]), "repairs": [], "facts": facts}
 
@@ -64,6 +71,14 @@ def _tendons(hand: HandModel) -> list[str]:
     return (
         [f"{', '.join(pairs)} on one tendon each" if len(pairs) > 1 else f"{pairs[0]} on one tendon"] if pairs else []
     )
+
+
+def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
+    """What a user must know of a guess that could have gone either way."""
+    stated = settings.approach or (settings.palm and settings.palm.approach)
+    if stated or jaws_of(hand) is not None or not approach_is_tied(hand):
+        return []
+    return ["the palm may face either way along its axis, a tie: say which with --approach"]
 
 
 def _limits(robot: Robot, settings: HandOptions) -> list[str]:

@@ -23,6 +23,11 @@ PRESHAPE_SHARE = 0.25
 #: Fingertips that end so many times as far from each other as they began have opened; those that close end at 0.2 to
 #: 0.8 of it.
 PARTED = 1.3
+#: Fingertips whose ways across the hand sum to less than this share of their lengths close around an axis: 0 of three
+#: like fingers, .4 and more of hands with a thumb or with two fingers that oppose one.
+RADIAL = 0.25
+#: Tips that are no farther ahead of where their fingers begin than this share of these places' spread are beside them.
+LEAST_AHEAD = 0.1
 #: A wrist or a rim that stands so far above the palm between the fingers is not the palm [m].
 RIM_M = 0.02
 
@@ -182,24 +187,65 @@ def _guess_approach(hand: HandModel) -> Floats:
 
     Two witnesses: the mean way of the fingertips as the hand closes, which points out of a human-like palm but sideways
     where two fingers oppose one; and where the tips of the half-closed hand are, which is ahead of the palm on a
-    gripper but also far along the fingers of a human-like hand. Their sum errs least.
+    gripper but also far along the fingers of a human-like hand. Their sum errs least. Where fingers stand around an
+    axis, the ways of their tips cancel, and what is left of them is rounding noise: see `_around_axis`.
     """
-    way = (_tips(hand, posture(hand, 0.4)) - _tips(hand, posture(hand, 0.05))).sum(axis=0)
-    body = _carriers(hand)[-1]
-    pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
-    palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
-    ahead = _tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3])
-    mean = _unit(way) + _unit(ahead)
+    ways, ahead = _ways(hand), _tips_ahead(hand)
+    if _cancelling(ways, ahead) < RADIAL:
+        return _around_axis(hand)[0]
+    mean = _unit(ways.sum(axis=0)) + _unit(ahead)
     if np.linalg.norm(mean) < 1e-6:
         return np.array([0.0, 0, 1])
     return _snapped(mean)
 
 
-def _snapped(mean: Floats) -> Floats:
-    """The direction as a unit vector, on a root axis where it is within 40 degrees of one."""
+def approach_is_tied(hand: HandModel) -> bool:
+    """Whether nothing tells on which side of its fingers a hand takes hold."""
+    return _cancelling(_ways(hand), _tips_ahead(hand)) < RADIAL and _around_axis(hand)[1]
+
+
+def _ways(hand: HandModel) -> Floats:
+    """(T, 3) ways of the fingertips as the hand closes."""
+    return _tips(hand, posture(hand, 0.4)) - _tips(hand, posture(hand, 0.05))
+
+
+def _tips_ahead(hand: HandModel) -> Floats:
+    """(3,) from the middle of the palm to that of the tips of the half-closed hand."""
+    body = _carriers(hand)[-1]
+    pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
+    palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
+    return np.asarray(_tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3]))
+
+
+def _cancelling(ways: Floats, ahead: Floats) -> float:
+    """Share of the tips' ways across `ahead` that their sum keeps: 0 where fingers close around an axis, 1 where all go
+    the same way."""
+    axis = _unit(ahead)
+    across = ways - np.outer(ways @ axis, axis)
+    return float(np.linalg.norm(across.sum(axis=0)) / max(np.linalg.norm(across, axis=1).sum(), 1e-12))
+
+
+def _around_axis(hand: HandModel) -> tuple[Floats, bool]:
+    """Direction out of the palm of a hand whose fingers stand around it: from where they begin to their half-closed
+    tips; and whether that is a tie, since they lie in the plane in which they begin."""
+    body = _carriers(hand)[-1]
+    q = posture(hand, 0.5)
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
+    bases, tips = poses[hand.parent == body, :3], _tips(hand, q)
+    along = tips.mean(axis=0) - bases.mean(axis=0)
+    spread = float(np.linalg.norm(bases - bases.mean(axis=0), axis=1).max())
+    if np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6):
+        # The plane's normal is known, its side is not: one is taken, and told.
+        normal = np.linalg.svd(np.vstack([bases, tips]) - bases.mean(axis=0))[2][-1]
+        return _snapped(normal * np.sign(normal[np.argmax(np.abs(normal))]), within=5.0), True
+    return _snapped(along, within=5.0), False
+
+
+def _snapped(mean: Floats, within: float = 40.0) -> Floats:
+    """The direction as a unit vector, on a root axis where it is `within` so many degrees of one."""
     mean = _unit(mean)
     axis = int(np.argmax(np.abs(mean)))
-    if abs(mean[axis]) > np.cos(np.deg2rad(40)):
+    if abs(mean[axis]) > np.cos(np.deg2rad(within)):
         return np.sign(mean[axis]) * np.eye(3)[axis]
     return mean
 
