@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select, update
@@ -18,7 +19,7 @@ from service.index.write_turns import take_turn_of_ends
 from service.model.clock import timestamp
 from service.model.errors import NotFoundError
 from service.model.projects import EVERYTHING, Reach
-from service.model.webhooks import MOST_WAITING, Webhook
+from service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 
 #: Ends and deliveries older than this are forgotten [s].
 KEPT_S: Final = 30 * 86400.0
@@ -32,6 +33,8 @@ class Due:
     hook: WebhookView
     end: EndView
     attempts: int
+    failed_last: bool = False
+    """Whether the last attempt at this address, of this delivery or another, failed."""
 
 
 def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
@@ -161,9 +164,13 @@ class Outgoing:
             with self.database.writing() as connection:
                 waiting = select(func.count()).where(deliveries.c.webhook == hook.id, deliveries.c.state == "waiting")
                 room = MOST_WAITING - int(connection.scalar(waiting) or 0)
+                resting = select(func.max(deliveries.c.due)).where(
+                    deliveries.c.webhook == hook.id, deliveries.c.state == "waiting"
+                )
+                rest_until = float(connection.scalar(resting) or 0.0)
                 wanted = [row.seq for row in found if row.state in hook.states]
                 rows = [
-                    {"webhook": hook.id, "seq": seq, "state": "waiting", "attempts": 0, "due": 0.0, "detail": ""}
+                    {"webhook": hook.id, "seq": seq, "state": "waiting", "attempts": 0, "due": rest_until, "detail": ""}
                     if place < room
                     else {
                         "webhook": hook.id,
@@ -179,14 +186,14 @@ class Outgoing:
                 seen = update(webhooks).where(webhooks.c.id == hook.id).values(seen=found[-1].seq)
                 connection.execute(seen)
 
-    def due(self, now: float, *, limit: int) -> list[Due]:
-        """Deliveries to try now, the oldest of each webhook."""
+    def due(self, now: float) -> list[Due]:
+        """Deliveries to try now, the oldest of each webhook: projects in turn, in each first who was not tried for the
+        longest time."""
         hooks = {hook.id: hook for hook in self.hooks()}
         first = (
             select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
             .where(deliveries.c.state == "waiting", deliveries.c.due <= now)
             .group_by(deliveries.c.webhook)
-            .limit(limit)
             .subquery()
         )
         query = (
@@ -194,32 +201,48 @@ class Outgoing:
             .join(first, first.c.seq == ends.c.seq)
             .join(deliveries, (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook))
         )
+        tried = select(deliveries.c.webhook, deliveries.c.tried, deliveries.c.state).where(
+            deliveries.c.tried.in_(
+                select(func.max(deliveries.c.tried)).group_by(deliveries.c.webhook).scalar_subquery()
+            )
+        )
         with self.database.reading() as connection:
             rows = connection.execute(query).mappings().all()
-        return [
-            Due(hooks[row["webhook"]], EndView(**{name: row[name] for name in EndView.model_fields}), row["attempts"])
-            for row in rows
-            if row["webhook"] in hooks
-        ]
+            last = {
+                row.webhook: (row.tried, row.state != "delivered")
+                for row in sorted(connection.execute(tried), key=lambda row: row.tried)
+            }
+        found: dict[str, list[Due]] = {}
+        for row in sorted(rows, key=lambda row: last.get(row["webhook"], ("", False))[0]):
+            if (hook := hooks.get(row["webhook"])) is not None:
+                end = EndView(**{name: row[name] for name in EndView.model_fields})
+                failed = last.get(hook.id, ("", False))[1]
+                found.setdefault(hook.project, []).append(Due(hook, end, row["attempts"], failed))
+        return [due for turn in zip_longest(*found.values()) for due in turn if due is not None]
 
-    def settle(self, due: Due, *, status: int | None, detail: str, wait_s: float | None, done: bool) -> None:
-        """How an attempt ended.
+    def settle(self, due: Due, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
+        """How an attempt ended. After a failure all that waits for the address rests as long as this delivery does;
+        after a success it is due.
 
         Args:
-            wait_s: until the next attempt [s]; None: there is none.
+            final: there is no other attempt, of whatever waits for the address.
         """
-        state = "delivered" if done else "waiting" if wait_s is not None else "failed"
+        last = final or due.attempts >= len(WAITS_S)
+        rest_until = 0.0 if done else time.time() + WAITS_S[min(due.attempts, len(WAITS_S) - 1)]
         values = {
-            "state": state,
+            "state": "delivered" if done else "failed" if last else "waiting",
             "attempts": due.attempts + 1,
-            "due": time.time() + (wait_s or 0.0),
+            "due": rest_until,
             "tried": timestamp(),
             "status": status,
             "detail": detail[:300].replace("\0", ""),
         }
         same = (deliveries.c.webhook == due.hook.id, deliveries.c.seq == due.end.seq)
+        waiting = (deliveries.c.webhook == due.hook.id, deliveries.c.state == "waiting")
         with self.database.writing() as connection:
             connection.execute(update(deliveries).where(*same).values(**values))
+            others = {"due": rest_until} | ({"state": "failed", "detail": values["detail"]} if final else {})
+            connection.execute(update(deliveries).where(*waiting).values(**others))
 
     def forget_old(self) -> None:
         """Take away ends and deliveries that are older than `KEPT_S`."""

@@ -1,4 +1,9 @@
-"""Tells webhooks what ended: signed, tried again with longer and longer waits, one at a time to each address."""
+"""Tells webhooks what ended: signed, tried again with longer and longer waits, one at a time to each address.
+
+An address that does not take a delivery rests, with all that waits for it. Projects take turns, and within one the
+address that was tried last comes last; addresses that failed last share half of the room, so that silent ones keep
+nobody else waiting.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +13,20 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Final
 
 from service.index.outgoing import Due
 from service.index.views import EndView
 from service.model.errors import UnavailableError
-from service.model.webhooks import SIGNATURE, WAITS_S, secret_of, signature
+from service.model.webhooks import SIGNATURE, secret_of, signature
 from service.pipeline.backends import Parts
 from service.pipeline.posting import Answer, Networks, networks, post
 
 log = logging.getLogger(__name__)
-_AT_ONCE: Final = 8
+#: Deliveries under way at once, and of them those to addresses that failed last.
+AT_ONCE: Final = 32
+SLOW_AT_ONCE: Final = AT_ONCE // 2
 _PAUSE_S: Final = 1.0
 #: To sum up a large dataset takes a while.
 _DATASETS_EVERY_S: Final = 5.0
@@ -42,6 +49,9 @@ class Courier:
         self._master = secret.get_secret_value() if secret else ""
         self._allowed: Networks = networks(parts.settings.webhook_networks or "")
         self._forget_again = -math.inf
+        self._lock = threading.Lock()
+        self._under_way: dict[str, Due] = {}
+        self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="webhooks")
 
     def run(self) -> None:
         """Rounds until told to stop."""
@@ -51,26 +61,38 @@ class Courier:
                 if time.monotonic() > look_again:
                     self.tell_datasets()
                     look_again = time.monotonic() + _DATASETS_EVERY_S
-                self.deliver()
+                self.start_deliveries()
             except UnavailableError as error:
                 log.warning("webhooks wait: %s", error)
             except Exception:
                 log.exception("a round of webhooks broke off")
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
     def deliver(self, *, now: float | None = None) -> int:
-        """Make deliveries of what is new, and try those that are due; how many were tried."""
+        """Start deliveries and wait for their ends; how many were tried."""
+        started = self.start_deliveries(now=now)
+        wait(started)
+        return len(started)
+
+    def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
+        """Make deliveries of what is new, and begin those that are due and have room."""
         out = self._parts.index.outgoing
         if time.monotonic() > self._forget_again:
             out.forget_old()
             self._forget_again = time.monotonic() + _FORGET_EVERY_S
         if not self._master:
-            return 0
+            return []
         out.plan()
-        due = out.due(time.time() if now is None else now, limit=_AT_ONCE)
-        if due:
-            with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="webhooks") as pool:
-                list(pool.map(self._try, due))
-        return len(due)
+        started = []
+        for due in out.due(time.time() if now is None else now):
+            with self._lock:
+                slow = sum(one.failed_last for one in self._under_way.values())
+                full = len(self._under_way) >= AT_ONCE or (due.failed_last and slow >= SLOW_AT_ONCE)
+                if full or due.hook.id in self._under_way:
+                    continue
+                self._under_way[due.hook.id] = due
+            started.append(self._pool.submit(self._try, due))
+        return started
 
     def tell_datasets(self) -> None:
         """Put datasets that ended into the feed."""
@@ -82,6 +104,17 @@ class Courier:
             self._parts.index.outgoing.tell_dataset(name, untold[name], row)
 
     def _try(self, due: Due) -> None:
+        try:
+            self._deliver(due)
+        except UnavailableError as error:
+            log.warning("a webhook waits: %s", error)
+        except Exception:
+            log.exception("a delivery broke off")
+        finally:
+            with self._lock:
+                del self._under_way[due.hook.id]
+
+    def _deliver(self, due: Due) -> None:
         body = body_of(due.end)
         at = int(time.time())
         headers = {
@@ -91,9 +124,8 @@ class Courier:
             SIGNATURE: signature(secret_of(self._master, due.hook.id), at, body),
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
-        wait_s = None if answer.is_taken or due.attempts >= len(WAITS_S) else WAITS_S[due.attempts]
         self._parts.index.outgoing.settle(
-            due, status=answer.status, detail=answer.detail, wait_s=wait_s, done=answer.is_taken
+            due, status=answer.status, detail=answer.detail, done=answer.is_taken, final=answer.is_final
         )
 
 

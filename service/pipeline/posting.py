@@ -14,16 +14,22 @@ import ssl
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from service.model.errors import InputError
 
 #: For the whole exchange [s].
 PATIENCE_S: Final = 10.0
+#: For looking the host up [s].
+LOOK_UP_S: Final = 5.0
+#: Public addresses that clouds answer their own machines at, about these machines.
+_METADATA: Final = frozenset({ipaddress.ip_address("168.63.129.16"), ipaddress.ip_address("192.0.0.192")})
 #: Of the answer no more is read than its status line, its headers and so many bytes.
 _READ_BYTES: Final = 1024
+#: Prefixes under which IPv4 addresses are reached: the well-known one, and those of a network's own.
 _NAT64: Final = ipaddress.ip_network("64:ff9b::/96")
+_LOCAL_NAT64: Final = ipaddress.ip_network("64:ff9b:1::/48")
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Networks = tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
 
@@ -38,6 +44,8 @@ class Answer:
 
     status: int | None
     detail: str = ""
+    is_final: bool = False
+    """Whether another attempt is of no use: the address is one that may not be reached."""
 
     @property
     def is_taken(self) -> bool:
@@ -62,9 +70,9 @@ def is_public(address: Address) -> bool:
             inner = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
         if inner is not None:
             return is_public(inner)
-        if address.is_site_local:
+        if address.is_site_local or address in _LOCAL_NAT64:
             return False
-    return address.is_global and not address.is_multicast and not address.is_reserved
+    return address.is_global and not address.is_multicast and not address.is_reserved and address not in _METADATA
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
@@ -77,13 +85,30 @@ def reachable(host: str, port: int, allowed: Networks) -> list[str]:
         Refused: one of them may not.
         OSError: it has none.
     """
-    found = list(dict.fromkeys(str(info[4][0]) for info in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
+    found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
         if not is_public(address) and not any(address in network for network in allowed):
             raise Refused(
-                f"{host} is at {one}, which is no public address; the operator may allow it: GRASPD_WEBHOOK_NETWORKS"
+                "the address is not one of the public internet; the operator may allow it: GRASPD_WEBHOOK_NETWORKS"
             )
+    return found
+
+
+def _looked_up(host: str, port: int) -> list[Any]:
+    """Addresses of a host; OSError if there is none, or the look-up takes longer than `LOOK_UP_S`."""
+    found: list[Any] = []
+
+    def look_up() -> None:
+        with contextlib.suppress(OSError, ValueError):
+            found.extend(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
+
+    # The system's resolver takes no time limit: a thread that it holds is left to it.
+    thread = threading.Thread(target=look_up, daemon=True, name="look-up")
+    thread.start()
+    thread.join(LOOK_UP_S)
+    if not found:
+        raise OSError("no address")
     return found
 
 
@@ -99,9 +124,9 @@ def post(
         addresses = reachable(host, port, allowed)
         connection = _connection(parts.scheme, host, port, addresses, patience_s)
     except Refused as error:
-        return Answer(None, str(error))
-    except (OSError, ValueError) as error:
-        return Answer(None, f"{host} has no address: {error}")
+        return Answer(None, str(error), is_final=True)
+    except (OSError, ValueError):
+        return Answer(None, "the host of the address cannot be looked up")
     # The time-out of a socket begins anew with each byte; this ends the whole.
     end = threading.Timer(patience_s, _cut, [connection])
     end.daemon = True

@@ -17,10 +17,11 @@ from starlette.testclient import TestClient
 from api.access.keys import KeyFile, Scope
 from api.app import create_app
 from service.index.index import Index
+from service.index.outgoing import note_ends
 from service.index.rebuild import rebuild
-from service.model.webhooks import MOST_HOOKS, WAITS_S
+from service.model.webhooks import MOST_HOOKS, WAITS_S, Webhook
 from service.pipeline.backends import Parts
-from service.pipeline.courier import Courier
+from service.pipeline.courier import AT_ONCE, SLOW_AT_ONCE, Courier
 from service.pipeline.posting import Answer
 from service.settings import Settings
 from tests.api.factories import add_job, finish_all
@@ -152,7 +153,7 @@ def test_webhooks_are_in_the_store_and_tell_nothing_old_after_a_rebuild(
         rebuild(fresh, parts.store)
         assert [one.id for one in fresh.outgoing.hooks()] == [hook["id"]]
         fresh.outgoing.plan()
-        assert fresh.outgoing.due(time.time(), limit=10) == []
+        assert fresh.outgoing.due(time.time()) == []
     finally:
         fresh.close()
     rebuild(parts.index, parts.store)
@@ -204,3 +205,92 @@ def test_a_project_is_told_of_its_own_ends_alone(
     assert client.get("/v1/webhooks", headers=people["ann"]).json() == []
     assert client.get(f"{address}/deliveries", headers=people["ann"]).status_code == 404
     assert client.delete(address, headers=people["ann"]).status_code == 404
+
+
+def hooks(parts: Parts, count: int, project: str, host: str) -> None:
+    for number in range(count):
+        hook = Webhook(id=f"{project}{number:031}", url=f"https://{host}/{number}", states=("succeeded",),
+                       created=f"2026-01-01T00:00:{number % 60:02}Z", project=project)  # fmt: skip
+        parts.index.outgoing.add(hook)
+
+
+def end_jobs_of(parts: Parts, projects: str, seq: str = "") -> None:
+    with parts.index.database.writing() as connection:
+        rows = [
+            {"kind": "job", "subject": f"{p}{seq}", "state": "succeeded", "project": p, "owner": ""} for p in projects
+        ]
+        note_ends(connection, rows)
+
+
+class Silent(Ear):
+    """Addresses of `dead` do not answer until they are let go."""
+
+    def __init__(self, parts: Parts) -> None:
+        super().__init__(parts)
+        self.asked: list[str] = []
+        self.let_go = threading.Event()
+        self.good = threading.Event()
+
+    def send(self, url: str, body: bytes, headers: dict[str, str], **_: Any) -> Answer:
+        if "//dead" in url:
+            self.asked.append(url)
+            self.let_go.wait(60)
+            return Answer(None, "no answer in time")
+        self.heard.append((url, body, headers))
+        self.good.set()
+        return Answer(200)
+
+
+@pytest.mark.parametrize(("dead", "theirs"), [(20, "a"), (20, "b"), (3 * AT_ONCE, "a")])
+def test_silent_addresses_keep_no_other_waiting(parts: Parts, dead: int, theirs: str) -> None:
+    ear = Silent(parts)
+    hooks(parts, dead, theirs, "dead")
+    hooks(parts, 1, "b", "good") if theirs != "b" else parts.index.outgoing.add(
+        Webhook(id="c" * 32, url="https://good/", states=("succeeded",), created="2026-02-01T00:00:00Z", project="b")
+    )
+    end_jobs_of(parts, "ab")
+    try:
+        ear.courier.start_deliveries()
+        assert ear.good.wait(30)
+        # What is silent is not asked again while it is asked.
+        end_jobs_of(parts, "ab", "again")
+        ear.courier.start_deliveries()
+        assert len(set(ear.asked)) == len(ear.asked)
+    finally:
+        ear.let_go.set()
+
+
+def test_an_address_that_failed_rests_with_all_that_waits_for_it(parts: Parts, ear: Ear) -> None:
+    hooks(parts, 1, "a", "busy")
+    ear.answer = Answer(503, "answered 503")
+    for number in range(3):
+        end_jobs_of(parts, "a", str(number))
+    assert ear.round() == 1 and ear.round() == 0
+    end_jobs_of(parts, "a", "new")
+    assert ear.round() == 0
+    ear.answer = Answer(200)
+    assert [ear.round(WAITS_S[0] + 1), ear.round(), ear.round(), ear.round(), ear.round()] == [1, 1, 1, 1, 0]
+    assert [json.loads(body)["subject"] for _, body, _ in ear.heard] == ["a0", "a0", "a1", "a2", "anew"]
+
+
+def test_addresses_that_failed_leave_half_of_the_room_to_the_others(parts: Parts) -> None:
+    ear = Silent(parts)
+    hooks(parts, AT_ONCE, "a", "dead")
+    end_jobs_of(parts, "a")
+    ear.let_go.set()
+    assert ear.courier.deliver() == AT_ONCE
+    ear.let_go.clear()
+    try:
+        started = ear.courier.start_deliveries(now=time.time() + WAITS_S[0] + 1)
+        assert len(started) == SLOW_AT_ONCE
+    finally:
+        ear.let_go.set()
+
+
+def test_an_address_that_may_not_be_reached_is_given_up_at_once(parts: Parts, ear: Ear) -> None:
+    hooks(parts, 1, "a", "inside")
+    end_jobs_of(parts, "a", "1")
+    end_jobs_of(parts, "a", "2")
+    ear.answer = Answer(None, "the address is not one of the public internet", is_final=True)
+    assert ear.round() == 1 and ear.round(10 * WAITS_S[-1]) == 0
+    assert {one.state for one in parts.index.outgoing.log(f"a{0:031}")} == {"failed"}

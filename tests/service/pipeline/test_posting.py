@@ -60,7 +60,9 @@ def ear() -> Iterator[tuple[str, list[Any]]]:
         ("255.255.255.255", False), ("192.0.2.1", False), ("240.0.0.1", False),
         ("::1", False), ("::", False), ("fe80::1", False), ("fd00::1", False), ("fec0::1", False), ("ff02::1", False),
         ("::ffff:127.0.0.1", False), ("::ffff:169.254.169.254", False), ("2002:7f00:1::", False),
-        ("64:ff9b::a9fe:a9fe", False), ("2001:0:1::1", False),
+        ("64:ff9b::a9fe:a9fe", False), ("64:ff9b:1::808:808", False),
+        ("168.63.129.16", False),
+        ("::ffff:168.63.129.16", False), ("100.100.100.200", False), ("192.0.0.192", False), ("fd00:ec2::254", False), ("2001:0:1::1", False),
     ],
 )  # fmt: skip
 def test_only_machines_of_the_internet_are_public(address: str, public: bool) -> None:
@@ -131,3 +133,27 @@ def test_an_address_that_never_answers_is_given_up() -> None:
 def test_what_is_no_address_is_refused_when_it_is_made(url: str) -> None:
     with pytest.raises(InputError):
         check_url(url)
+
+
+def test_a_refusal_tells_nothing_of_what_a_name_means_inside(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [(socket.AF_INET, 1, 6, "", ("10.20.30.40", 80))]
+    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: found)
+    answer = post("http://db.internal/", b"{}", {})
+    assert answer.is_final and "10.20" not in answer.detail
+
+    def unknown(*_: object, **__: object) -> None:
+        raise OSError("resolver 10.0.0.2: NXDOMAIN")
+
+    monkeypatch.setattr(posting.socket, "getaddrinfo", unknown)
+    answer = post("http://nothing.internal/", b"{}", {})
+    assert not answer.is_final and answer.detail == "the host of the address cannot be looked up"
+
+
+def test_a_look_up_that_does_not_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go = threading.Event()
+    monkeypatch.setattr(posting, "LOOK_UP_S", 0.05)
+    monkeypatch.setattr(posting.socket, "getaddrinfo", lambda *_, **__: let_go.wait(60) and [])
+    try:
+        assert post("http://slow.example/", b"{}", {}).status is None
+    finally:
+        let_go.set()
