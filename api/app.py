@@ -70,6 +70,8 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         lifespan=lifespan,
+        # A redirect would go where the Host header says.
+        redirect_slashes=False,
     )
     app.state.settings = settings
     app.state.keys, app.state.proxy = keys, proxy

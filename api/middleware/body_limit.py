@@ -1,13 +1,16 @@
-"""Limits on what a stranger may send: bytes of a body, while they arrive, and the time they may take."""
+"""Limits on what a stranger may send: who may send a body at all, its bytes while they arrive, and their time."""
 
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import Final
 
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from api.access.auth import authorize
+from api.access.keys import Scope as KeyScope
 from api.problems import ApiError, answer
 from service.model.errors import LimitError
 
@@ -15,6 +18,8 @@ from service.model.errors import LimitError
 MAX_BODY_BYTES: Final = 1 << 20
 #: Longest wait for the next piece of a body [s].
 PIECE_S: Final = 30.0
+#: A body that comes slower is given up: a byte now and then would hold a connection for ever [bytes/s].
+LEAST_BYTES_S: Final = 16 << 10
 #: Multipart framing and the other fields of an upload.
 _FORM_SLACK_BYTES: Final = 64 << 10
 #: Of a Content-Length: Python takes long to read a number of thousands, or refuses it.
@@ -55,10 +60,24 @@ class BodyLimit:
         if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
             await _refuse(_too_large(limit), scope, receive, send)
             return
+        if declared != b"0" or b"transfer-encoding" in given:
+            try:
+                self._authorize(scope, is_upload)
+            except ApiError as error:
+                await _refuse(error, scope, receive, send)
+                return
         await self._watch(scope, receive, send, limit)
 
+    @staticmethod
+    def _authorize(scope: Scope, is_upload: bool) -> None:
+        """Nothing is read, and nothing kept, of a body that somebody sends who may not; routes ask for more."""
+        if is_upload:
+            authorize(Request(scope), KeyScope.SUBMIT)
+        elif scope["path"].startswith("/v1/"):
+            authorize(Request(scope), KeyScope.READ)
+
     async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
-        received = 0
+        received, began = 0, time.monotonic()
         is_whole = is_answered = False
         refusal: Exception | None = None
 
@@ -73,6 +92,10 @@ class BodyLimit:
                 return {"type": "http.disconnect"}
             is_whole = not message.get("more_body", False)
             received += len(message.get("body", b""))
+            late = time.monotonic() - began - self.piece_s
+            if not is_whole and received < late * LEAST_BYTES_S:
+                refusal = ApiError(408, f"the body comes at less than {LEAST_BYTES_S >> 10} KiB/s; send it again")
+                return {"type": "http.disconnect"}
             if received > limit:
                 refusal = _too_large(limit)
                 # The application sees a client that went away and stops; its answer is replaced below.

@@ -46,6 +46,14 @@ class SameOrigin:
         origin = headers.get("origin")
         if site not in (None, "same-origin", "none"):
             return ApiError(403, "the request comes from another web site; open the dashboard itself and try again")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and _place(origin) != host:
             return ApiError(403, f"the request comes from {origin}; open the dashboard itself and try again")
+        return None
+
+
+def _place(origin: str) -> str | None:
+    """Host and port of an origin; None where it is no address at all."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
         return None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.clock import timestamp
-from service.model.errors import DamagedShard, InputError
+from service.model.errors import DamagedShard, InputError, NotFoundError
 from service.model.version import PACKAGE_VERSION
 from service.store.attributes import Attribute, check_attributes
 from service.store.columns import SCHEMAS, ShardKind
@@ -25,6 +25,11 @@ from service.store.integrity import check_file
 Arrays = Mapping[str, NDArray[np.generic]]
 #: Attribute of each dataset: SHA-256 of its values, so that a file that left the store still shows damage.
 _DIGEST: Final = "sha256"
+#: A shard has some fifty datasets and groups.
+_MOST_ITEMS: Final = 1000
+#: No byte of deflate becomes more than so many; and what a dataset may claim without having been written [bytes].
+_MOST_DEFLATED: Final = 1032
+_FREE_BYTES: Final = 1 << 16
 #: What h5py and the filters of HDF5 raise where they meet bytes that make no sense.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
@@ -140,13 +145,39 @@ def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterat
         check_file(source)
     try:
         file = h5py.File(io.BytesIO(source) if isinstance(source, bytes) else source, "r")
-    except OSError as error:
-        raise InputError(f"{name} is not a readable HDF5 file: {error}") from None
+    except OSError:
+        if isinstance(source, Path) and not source.is_file():
+            raise NotFoundError(f"{name} does not exist, or is no file") from None
+        raise InputError(f"{name} is not a readable HDF5 file; give a shard of graspd (.h5)") from None
     with file:
         try:
+            _check_contents(file, name)
             yield file
         except _UNREADABLE as error:
             raise DamagedShard(f"{name} is damaged and cannot be read: {_line(error)}") from error
+
+
+def _check_contents(file: h5py.File, name: str) -> None:
+    """InputError where a file has its values from elsewhere, or says that it has more than can lie in it.
+
+    HDF5 follows links into other files, reads raw bytes of any file as a dataset's, and makes up what was never written.
+    """
+    seen, waiting = 0, [(file, "")]
+    while waiting:
+        group, place = waiting.pop()
+        for key in group:
+            path, seen = f"{place}{key}", seen + 1
+            if seen > _MOST_ITEMS:
+                raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, which no shard does")
+            if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+                raise InputError(f"{name}: {path} is a link; a shard holds its own values")
+            item = group[key]
+            if isinstance(item, h5py.Group):
+                waiting.append((item, f"{path}/"))
+            elif not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
+                raise InputError(f"{name}: {path} has its values in another file; a shard holds its own")
+            elif item.nbytes > _MOST_DEFLATED * item.id.get_storage_size() + _FREE_BYTES:
+                raise InputError(f"{name}: {path} claims {item.nbytes} bytes, which the file does not hold")
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:

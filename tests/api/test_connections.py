@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +15,7 @@ import uvicorn
 from fastapi import FastAPI, Request
 
 from api.access.keys import KeyFile, Scope
+from api.app import create_app
 from api.catalog import events
 from api.middleware.protocol import TimedProtocol
 from api.server import bind, configuration
@@ -171,3 +174,60 @@ def test_a_stream_of_events_ends_with_its_key(
                 await anext(stream)
 
     asyncio.run(watch())
+
+
+@pytest.fixture
+def closed(settings: Settings, parts: Parts) -> tuple[FastAPI, dict[Scope, str]]:
+    """The application of a service that has keys, and a key of each scope."""
+    keys = KeyFile(settings.resolved_keys_file)
+    made = {scope: keys.add(scope.value, scope) for scope in Scope}
+    return create_app(settings, parts), made
+
+
+def upload(length: int, *more: bytes, path: bytes = b"/v1/objects") -> bytes:
+    lines = [b"POST %s HTTP/1.1" % path, b"Host: 127.0.0.1", b"Content-Type: multipart/form-data; boundary=b", *more]
+    return b"\r\n".join([*lines, b"Content-Length: %d" % length, b"", b""])
+
+
+@pytest.mark.parametrize(
+    "path", [b"/v1/objects", b"/v1/hands", b"/v1/networks", b"/submit", b"/v1/jobs", b"/v1/datasets"]
+)
+def test_a_body_without_a_key_is_refused_before_any_of_it_is_sent(
+    path: bytes, connect: Connect, closed: tuple[FastAPI, dict[Scope, str]]
+) -> None:
+    length = 40_000_000 if path not in (b"/v1/jobs", b"/v1/datasets") else 900_000
+    connection = connect(upload(length, b"Expect: 100-continue", path=path), app=closed[0])
+    assert rest(connection).startswith(b"HTTP/1.1 401 ")
+
+
+def test_a_key_that_may_not_upload_is_refused_before_the_body(
+    connect: Connect, closed: tuple[FastAPI, dict[Scope, str]]
+) -> None:
+    key = b"Authorization: Bearer " + closed[1][Scope.READ].encode()
+    assert rest(connect(upload(40_000_000, key), app=closed[0])).startswith(b"HTTP/1.1 403 ")
+
+
+def test_twelve_uploads_without_a_key_leave_nothing_on_disk(
+    connect: Connect, closed: tuple[FastAPI, dict[Scope, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spooled: list[Any] = []
+    make = tempfile.SpooledTemporaryFile
+    monkeypatch.setattr(
+        "starlette.formparsers.SpooledTemporaryFile", lambda *a, **k: spooled.append(1) or make(*a, **k)
+    )
+    part = b'--b\r\nContent-Disposition: form-data; name="file"; filename="m.stl"\r\n\r\n'
+    first = connect(upload(40_000_000) + part, app=closed[0])
+    others = [socket.create_connection(first.getpeername(), timeout=PATIENCE_S) for _ in range(11)]
+    for connection in others:
+        connection.sendall(upload(40_000_000) + part)
+    answers = [rest(connection) for connection in (first, *others)]
+    for connection in others:
+        connection.close()
+    assert all(answer.startswith(b"HTTP/1.1 401 ") for answer in answers) and not spooled
+
+
+def test_a_redirect_does_not_go_where_the_host_header_says(
+    connect: Connect, closed: tuple[FastAPI, dict[Scope, str]]
+) -> None:
+    answer = rest(connect(b"GET /v1/jobs/ HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n", app=closed[0]))
+    assert b"evil.example" not in answer and answer.split()[1] == b"404"

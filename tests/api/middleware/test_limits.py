@@ -246,3 +246,28 @@ def test_a_body_that_stops_coming_is_given_up() -> None:
     scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
     asyncio.run(limit(scope, silent, send))
     assert sent[0]["status"] == 408
+
+
+def test_a_body_that_trickles_in_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[dict[str, Any]] = []
+    pieces = 0
+
+    async def reads_all(scope: Any, receive: Any, send: Any) -> None:
+        while (await receive()).get("more_body"):
+            pass
+
+    async def trickling() -> dict[str, Any]:
+        nonlocal pieces
+        pieces += 1
+        clock[0] += 20.0
+        return {"type": "http.request", "body": b"x", "more_body": True}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    clock = [0.0]
+    monkeypatch.setattr("api.middleware.body_limit.time.monotonic", lambda: clock[0])
+    limit = BodyLimit(reads_all, upload_paths=frozenset(), upload_bytes=1)
+    scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": [], "query_string": b"", "server": None}
+    asyncio.run(limit(scope, trickling, send))
+    assert sent[0]["status"] == 408 and pieces == 2

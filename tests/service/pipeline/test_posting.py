@@ -62,7 +62,8 @@ def ear() -> Iterator[tuple[str, list[Any]]]:
         ("::ffff:127.0.0.1", False), ("::ffff:169.254.169.254", False), ("2002:7f00:1::", False),
         ("64:ff9b::a9fe:a9fe", False), ("64:ff9b:1::808:808", False),
         ("168.63.129.16", False),
-        ("::ffff:168.63.129.16", False), ("100.100.100.200", False), ("192.0.0.192", False), ("fd00:ec2::254", False), ("2001:0:1::1", False),
+        ("::ffff:168.63.129.16", False), ("100.100.100.200", False), ("192.0.0.192", False),
+        ("fd00:ec2::254", False), ("2001:0:1::1", False),
     ],
 )  # fmt: skip
 def test_only_machines_of_the_internet_are_public(address: str, public: bool) -> None:
