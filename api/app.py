@@ -32,6 +32,7 @@ from service.model.errors import InputError, UnavailableError
 from service.model.states import AssetKind
 from service.model.version import PACKAGE_VERSION
 from service.pipeline.backends import Parts
+from service.pipeline.identity import identify_if_redis_answers
 from service.queue.address import redis_url
 from service.settings import Settings
 
@@ -45,6 +46,7 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     Raises:
         InputError: the address to bind is reachable from elsewhere and no key exists; or what the settings say of a
             proxy cannot be read.
+        BusyError: store, index or Redis belong to another service.
         StoreUnavailable, IndexUnavailable: where the parts cannot be opened.
     """
     proxy = Proxy(settings)
@@ -52,6 +54,8 @@ def create_app(settings: Settings, parts: Parts | None = None) -> FastAPI:
     if not proxy.is_on:
         check_exposure(settings.host, keys)
     opened = parts or Parts.open(settings)
+    if parts is None:
+        identify_if_redis_answers(opened)
     with suppress(UnavailableError):
         complete_if_new(opened.index, opened.store)
     rates = Rates(redis_url(settings))
