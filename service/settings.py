@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.model.keeper_shards import MOST_SHARDS
+
+if TYPE_CHECKING:
+    from sqlalchemy import URL
 
 
 class Settings(BaseSettings):
@@ -133,7 +136,14 @@ class Settings(BaseSettings):
         return self.keys_file or self.data_dir.resolve() / "keys.json"
 
     @cached_property
-    def resolved_index_url(self) -> str:
+    def resolved_index_url(self) -> str | URL:
         if self.index_url is not None:
             return self.index_url.get_secret_value()
-        return f"sqlite:///{self.data_dir.resolve() / 'index.sqlite'}"
+        return sqlite_url(self.data_dir.resolve() / "index.sqlite")
+
+
+def sqlite_url(path: Path) -> URL:
+    """SQLAlchemy's URL of a file, whatever its path holds: as a text, it would end at a question mark."""
+    from sqlalchemy import URL  # only API and keeper need it, and it takes long to import
+
+    return URL.create("sqlite", database=str(path))

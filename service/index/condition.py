@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy import make_url, text
+from sqlalchemy import URL, make_url, text
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
 from service.index.database import connect_postgres, mapped, newest_revision
@@ -37,7 +37,7 @@ class IndexCondition:
         return bool(self.revision) and self.revision == self.newest
 
 
-def look(url: str) -> IndexCondition | None:
+def look(url: str | URL) -> IndexCondition | None:
     """None where the file of an SQLite index does not exist yet.
 
     Raises:
@@ -77,7 +77,7 @@ def _look_at_file(path: Path) -> IndexCondition | None:
     return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", newest_revision())
 
 
-def _look_at_postgres(url: str) -> IndexCondition:
+def _look_at_postgres(url: str | URL) -> IndexCondition:
     engine = connect_postgres(url)
     try:
         with mapped(), engine.connect() as connection:

@@ -17,7 +17,7 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from alembic.util import CommandError
-from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from service.index.metric_columns import add_missing
@@ -40,7 +40,7 @@ _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 class Database:
     """An engine, with reads and writes as context managers."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str | URL) -> None:
         """Connect and migrate.
 
         Raises:
@@ -156,7 +156,7 @@ def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
-def _file_of(url: str) -> SqliteFile | None:
+def _file_of(url: str | URL) -> SqliteFile | None:
     """The file of an SQLite index; None for another database, and for one in memory."""
     try:
         parsed = make_url(url)
@@ -166,7 +166,7 @@ def _file_of(url: str) -> SqliteFile | None:
     return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
-def _engine(url: str) -> Engine:
+def _engine(url: str | URL) -> Engine:
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":
@@ -178,7 +178,7 @@ def _engine(url: str) -> Engine:
         ) from None
 
 
-def connect_postgres(url: str) -> Engine:
+def connect_postgres(url: str | URL) -> Engine:
     """An engine that refuses a database whose encoding is not UTF-8, and migrates nothing."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
@@ -195,7 +195,7 @@ def connect_postgres(url: str) -> Engine:
     return engine
 
 
-def _sqlite_engine(url: str, database: str | None) -> Engine:
+def _sqlite_engine(url: str | URL, database: str | None) -> Engine:
     if database and database != ":memory:":
         try:
             Path(database).parent.mkdir(parents=True, exist_ok=True)
@@ -214,7 +214,7 @@ def _sqlite_engine(url: str, database: str | None) -> Engine:
     return engine
 
 
-def downgrade(url: str, revision: str) -> None:
+def downgrade(url: str | URL, revision: str) -> None:
     """Take the schema back to an earlier revision, before an older graspd is installed that knows no later one.
 
     Raises:

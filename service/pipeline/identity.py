@@ -67,10 +67,7 @@ class Identity:
         if not self.chain or self.is_same or take_over:
             return ""
         if self.index is not None and self.index not in self.chain:
-            return (
-                f"the index belongs to another graspd service than the store {store}; name the index of that store, or "
-                "run `graspd index rebuild` to make this one from it"
-            )
+            return _others_index(store)
         known = {self.index, self.redis, self.folder} & set(self.chain)
         what = "was taken over by" if known else "belongs to"
         return (
@@ -108,6 +105,9 @@ def identify(
     chain = services(parts.store)
     index = parts.index.notes.service()
     if not chain:
+        # An index that was never filled is left of a start that was killed here.
+        if index is not None and not take_over and parts.index.notes.completeness() is not None:
+            raise BusyError(_others_index(parts.store.url))
         index = parts.index.notes.name_service(index or secrets.token_hex(_BYTES))
         if redis not in (None, index) and not holds_redis:
             raise BusyError(_REDIS)
@@ -163,6 +163,13 @@ def services(store: Store) -> list[str]:
 def recorded(folder: Path) -> str | None:
     """Id of the service that last ran in a data folder."""
     return _read(folder)
+
+
+def _others_index(store: str) -> str:
+    return (
+        f"the index belongs to another graspd service than the store {store}; name the index of that store, or run "
+        "`graspd index rebuild` to make this one from it"
+    )
 
 
 def _add(store: Store, number: int, identity: str) -> None:

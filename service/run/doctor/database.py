@@ -59,7 +59,8 @@ def _absent(name: str, settings: Settings) -> Finding:
 
 
 def _judge(name: str, settings: Settings, found: IndexCondition) -> Finding:
-    url = make_url(settings.resolved_index_url).render_as_string(hide_password=True).partition("?")[0]
+    parsed = make_url(settings.resolved_index_url)
+    url = parsed.set(query={}).render_as_string(hide_password=True)
     line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
     if not found.may_write:
         return bad(name, f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")

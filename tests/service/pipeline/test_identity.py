@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from service.index.index import Index
-from service.model import names
 from service.model.errors import BusyError
 from service.pipeline.backends import Parts
 from service.pipeline.identity import check_queue, identify, services
@@ -92,11 +91,18 @@ def test_a_store_in_the_data_folder_is_that_folders_own(first: Parts, tmp_path: 
     assert identify(service(tmp_path / "moved")) == first.index.notes.service()
 
 
-def test_a_store_without_an_identity_gets_the_one_of_its_index(first: Parts) -> None:
-    """A graspd that knew no identities made it, or the first start was killed half-way."""
-    before = first.index.notes.service()
-    first.store.delete(names.service(1))
-    assert identify(first) == before == services(first.store)[-1]
+def test_a_first_start_that_was_killed_half_way_goes_on(tmp_path: Path) -> None:
+    begun = service(tmp_path)
+    begun.index.notes.name_service("begun")
+    assert identify(begun) == "begun" == services(begun.store)[-1]
+
+
+def test_a_second_store_under_one_index_is_refused(first: Parts, tmp_path: Path) -> None:
+    first.index.notes.set_complete()
+    second = Parts(first.settings, open_store((tmp_path / "other").as_uri()), first.index, MemoryQueue())
+    with pytest.raises(BusyError, match="the index belongs to another graspd service"):
+        identify(second)
+    assert not services(second.store)
 
 
 def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Parts, tmp_path: Path) -> None:
