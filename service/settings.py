@@ -19,7 +19,9 @@ class Settings(BaseSettings):
     """Settings of all processes of one graspd. Defaults run everything on one machine inside `data_dir`."""
 
     # Compose and Kubernetes hand on variables that nobody set as empty ones.
-    model_config = SettingsConfigDict(env_prefix="GRASPD_", env_ignore_empty=True, frozen=True)
+    model_config = SettingsConfigDict(
+        env_prefix="GRASPD_", env_ignore_empty=True, frozen=True, hide_input_in_errors=True
+    )
 
     data_dir: Path = Field(Path("graspd-data"), description="folder of everything graspd keeps on this machine")
     redis_url: SecretStr | None = Field(None, description="Redis of the queue; unset: `graspd up` starts one")

@@ -22,7 +22,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final, Self
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
 from service.model.projects import PATTERN, Project
@@ -91,6 +91,8 @@ class Key(BaseModel):
 
 
 class _Document(BaseModel):
+    model_config = ConfigDict(hide_input_in_errors=True)
+
     session_secret: str
     keys: list[Key] = []
     projects: dict[str, ProjectLimits] = {}

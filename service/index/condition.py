@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from sqlalchemy import URL, make_url, text
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
-from service.index.database import connect_postgres, mapped, newest_revision
-from service.model.errors import IndexDamaged, IndexUnavailable, InputError
+from service.index.database import UNUSABLE, connect_postgres, mapped, newest_revision, unusable
+from service.model.errors import IndexDamaged, IndexUnavailable
 
 _TIMEOUT_S: Final = 5.0
 
@@ -50,10 +49,8 @@ def look(url: str | URL) -> IndexCondition | None:
         if parsed.get_backend_name() == "sqlite":
             return _look_at_file(Path(str(parsed.database)))
         return _look_at_postgres(url)
-    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
-        raise InputError(
-            f"the index URL cannot be used ({error}); give sqlite:///PATH or postgresql+psycopg://..."
-        ) from None
+    except UNUSABLE as error:
+        raise unusable(error) from None
 
 
 def _look_at_file(path: Path) -> IndexCondition | None:

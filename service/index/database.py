@@ -33,6 +33,8 @@ MIGRATIONS: Final = Path(__file__).parent / "migrations"
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that lets one process migrate at a time: the letters "grsp".
 _MIGRATION_LOCK: Final = 0x67727370
+#: What SQLAlchemy raises for a URL.
+UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file whose content makes no sense.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -160,7 +162,7 @@ def _file_of(url: str | URL) -> SqliteFile | None:
     """The file of an SQLite index; None for another database, and for one in memory."""
     try:
         parsed = make_url(url)
-    except ArgumentError:
+    except UNUSABLE:
         return None
     is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
     return SqliteFile(Path(str(parsed.database))) if is_file else None
@@ -172,10 +174,18 @@ def _engine(url: str | URL) -> Engine:
         if parsed.get_backend_name() == "sqlite":
             return _sqlite_engine(url, parsed.database)
         return connect_postgres(url)
-    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
-        raise InputError(
-            f"the index URL cannot be used ({_line(error)}); give sqlite:///PATH or postgresql+psycopg://..."
-        ) from None
+    except UNUSABLE as error:
+        raise unusable(error) from None
+
+
+def unusable(error: Exception) -> InputError:
+    """What is told of an index URL that cannot be used. What SQLAlchemy says of how it is written may hold a part of
+    the password."""
+    why = f" ({_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
+    return InputError(
+        f"GRASPD_INDEX_URL cannot be used{why}; give sqlite:///PATH or postgresql+psycopg://HOST/NAME, and in a "
+        "password %2F for / and %40 for @"
+    )
 
 
 def connect_postgres(url: str | URL) -> Engine:

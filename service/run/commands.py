@@ -17,6 +17,7 @@ from service.cli import JsonFlag, emit, keep_private, load_settings, log_to_stde
 from service.heartbeat_file import HeartbeatFile
 from service.model import names
 from service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError
+from service.model.redaction import without_secrets
 from service.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -232,7 +233,8 @@ def path(data_dir: DataDir = None) -> None:
     """Print where the index is; a password in the URL is left out."""
     from sqlalchemy import make_url
 
-    typer.echo(make_url(load_settings(data_dir=data_dir).resolved_index_url).render_as_string(hide_password=True))
+    url = make_url(load_settings(data_dir=data_dir).resolved_index_url)
+    typer.echo(without_secrets(url.render_as_string(hide_password=True)))
 
 
 def _check_rooms(workers: int) -> None:
