@@ -68,7 +68,11 @@ def test_a_process_that_got_the_number_of_a_child_lives_on(
         assert not file.exists()
 
 
-@pytest.mark.parametrize("pid", [os.getpid(), os.getppid(), 0, -1, 1, "1", None, 10**30, True])
+@pytest.mark.parametrize(
+    "pid",
+    [os.getpid(), os.getppid(), 0, -1, 1, "1", None, 10**30, True],
+    ids=["itself", "parent", "0", "-1", "1", "text", "none", "huge", "true"],
+)
 def test_up_ends_neither_itself_nor_its_parent_nor_nonsense(pid: object, tmp_path: Path) -> None:
     started = start_of(pid) if isinstance(pid, int) else ""
     pid_file(tmp_path, [pid, started, ""])
