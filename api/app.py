@@ -19,6 +19,7 @@ from api.dashboard.rendering import STATIC, problem_page
 from api.hosts import host_name, is_loopback
 from api.metrics import Metrics
 from api.middleware.body_limit import BodyLimit
+from api.middleware.head import Head
 from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
 from api.middleware.same_origin import SameOrigin
@@ -106,6 +107,7 @@ def check_exposure(host: str, keys: KeyFile) -> None:
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
     """Innermost first: limits on bodies, who asks and how often, foreign web pages, request ids around everything."""
+    app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
     app.add_middleware(Turnstile, keys=keys, proxy=proxy, settings=settings, rates=rates)
@@ -141,5 +143,5 @@ def _of_everybody(path: str, method: str) -> list[int]:
     if path.startswith(("/v1/", "/metrics")):
         statuses += [401, 403, 429, 503]
     if method not in ("get", "head"):
-        statuses += [403, 408, 413]
+        statuses += [403, 408, 413, 415]
     return statuses

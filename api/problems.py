@@ -152,7 +152,10 @@ def _allowed_methods(request: Request) -> list[str]:
     return [
         method
         for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
-        if any(route.matches(dict(request.scope) | {"method": method})[0] is Match.FULL for route in routes)
+        if any(
+            route.matches(dict(request.scope) | {"method": "GET" if method == "HEAD" else method})[0] is Match.FULL
+            for route in routes
+        )
     ]
 
 

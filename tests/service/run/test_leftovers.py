@@ -14,6 +14,7 @@ import pytest
 from service.run.address import record_address, recorded_address
 from service.run.children import Child, end_leftovers
 from service.run.processes import start_of
+from tests.waiting import until
 
 _WAIT = "import signal; signal.pause()"
 
@@ -31,8 +32,11 @@ def stranger(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
 def child(tmp_path: Path) -> Iterator[Child]:
     made = Child("worker-0", (sys.executable, "-c", _WAIT), {}, tmp_path)
     made.start()
-    yield made
     assert made.process is not None
+    # While it becomes its program, its environment cannot be read.
+    command = Path(f"/proc/{made.process.pid}/cmdline")
+    until(lambda: _WAIT in command.read_text() and "launch" not in command.read_text(), "the child runs")
+    yield made
     made.process.kill()
     made.process.wait()
 
