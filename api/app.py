@@ -22,6 +22,7 @@ from api.middleware.body_limit import BodyLimit
 from api.middleware.head import Head
 from api.middleware.rates import Rates
 from api.middleware.request_context import RequestContext
+from api.middleware.root_path import RootPath
 from api.middleware.same_origin import SameOrigin
 from api.middleware.turnstile import Turnstile
 from api.routes import datasets, grasps, hand_corrections, jobs, shards, system, tags, usage, webhooks
@@ -114,6 +115,11 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Prox
     allowed = _LOOPBACK_NAMES | {host_name(settings.host)} if keys.is_open else None
     app.add_middleware(SameOrigin, allowed_hosts=allowed)
     app.add_middleware(RequestContext, metrics=app.state.metrics)
+    if prefix := settings.api_root_path:
+        first = prefix.split("/")[1]
+        if first in {str(getattr(route, "path", "/")).split("/")[1] for route in app.routes}:
+            raise InputError(f"GRASPD_API_ROOT_PATH: the service has a path /{first} itself; take another, say /graspd")
+        app.add_middleware(RootPath, prefix=prefix)
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
@@ -133,6 +139,8 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                     answers["422"] = problems.responses(422)[422]
                 for status, answer in problems.responses(*_of_everybody(path, method)).items():
                     answers.setdefault(str(status), answer)
+        if app.state.settings.api_root_path:
+            document["servers"] = [{"url": app.state.settings.api_root_path}]
         app.openapi_schema = document
     return app.openapi_schema
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field, SecretStr
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.model.keeper_shards import MOST_SHARDS
@@ -32,6 +33,9 @@ class Settings(BaseSettings):
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address the API binds")
     port: int = Field(8000, ge=0, le=65535, description="port the API binds; 0: any free one")
+    api_root_path: str = Field(
+        "", description="path below which a proxy shows the API and the dashboard, such as /graspd; unset: the root"
+    )
     api_url: str = Field(
         "http://127.0.0.1:8000",
         description="where the client commands find the API; unset: the service of data_dir, if it runs",
@@ -128,6 +132,14 @@ class Settings(BaseSettings):
     log_format: Literal["auto", "json", "text"] = Field(
         "auto", description="log lines; auto: text on a terminal, else json"
     )
+
+    @field_validator("api_root_path")
+    @classmethod
+    def _is_path(cls, value: str) -> str:
+        found = f"/{value.strip('/')}".rstrip("/")
+        if not re.fullmatch(r"(/[A-Za-z0-9._~-]+)*", found) or {".", ".."} & set(found.split("/")):
+            raise ValueError("write a path such as /graspd, of letters, digits, dots, dashes and underscores")
+        return found
 
     @cached_property
     def resolved_store_url(self) -> str:
