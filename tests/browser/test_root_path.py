@@ -111,11 +111,7 @@ def test_every_part_of_the_dashboard_works_below_the_path(page: Any, parts: Part
     page.wait_for_selector("#head .cancelled")
 
     page.goto(f"{address}/submit")
-    mesh = {
-        "name": "mine.stl",
-        "mimeType": "model/stl",
-        "buffer": builtin_files(AssetKind.OBJECT, "block")["block.stl"],
-    }
+    block = builtin_files(AssetKind.OBJECT, "block")["block.stl"]
     with page.expect_response(f"**{PREFIX}/v1/objects") as sent:
         page.set_input_files("#file", {"name": "mine.stl", "mimeType": "model/stl", "buffer": block})
     assert sent.value.ok
